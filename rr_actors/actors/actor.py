@@ -12,7 +12,7 @@ __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", 
 
 
 class LoopActor(BaseActor):
-    """An actor of the framework: its handlers run on the loop and must not block. `async def` ones hold up only it."""
+    """An actor of the framework: its handlers run on the loop and must not block. An `async def` one delays only it."""
 
     _lives_on_loop = True
 

@@ -1,7 +1,7 @@
-"""Driver: what lets an actor's life go on. The life is one coroutine; a driver sends it on by hand, where it belongs.
+"""Driver: runs the life of an actor. The life is one coroutine; a driver resumes it, on the loop or in a worker.
 
-So the life reads from top to bottom and still holds no thread while the mailbox is empty. It awaits REST, PAUSE and
-Await, nothing else, and does not know where it goes on.
+So the life reads from top to bottom, and still needs no thread while the mailbox is empty. It awaits only REST, PAUSE
+and Await, and does not know in which thread it is resumed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ logger = logging.getLogger("rr_actors")
 
 
 class Request:
-    """What a life awaits from its driver."""
+    """A request that a life awaits from its driver."""
 
     def __await__(self) -> Generator[Request, Any, Any]:
         return (yield self)
 
 
 class Await(Request):
-    """Run a coroutine: a user's where the user's coroutines run, a hook on the framework's loop."""
+    """The request to run a coroutine: on the framework's loop for hooks and LoopActors, else on the users' loop."""
 
     def __init__(self, coroutine: Coroutine[Any, Any, Any], *, on_loop: bool = False) -> None:
         self.coroutine = coroutine
@@ -37,24 +37,24 @@ class Await(Request):
 
 
 REST = Request()
-"""There is nothing to do until the next message comes."""
+"""The request to rest until the next message comes."""
 
 PAUSE = Request()
-"""Let others have their turn on the loop. In worker threads they have it anyway."""
+"""The request to let other callbacks run on the loop. In worker threads it has no effect."""
 
 
 class Driver:
-    """Drives one life, in one context from its beginning to its end, as a thread of its own would have.
+    """Drives one life in one context from its beginning to its end, like the context of a thread.
 
-    To schedule or start it raises MailboxFull if there is no thread for it and it is not urgent, and Unavailable if the
+    schedule() and start() raise MailboxFull if no thread is free and the call is not urgent, and Unavailable if the
     loop has ended.
 
     Args:
-        life: what is driven; it begins with start().
-        mailbox: the actor's; its `schedule` should be the driver's.
-        name: the actor's, for the log.
-        on_loop: whether the life goes on on the framework's loop, and must not block there. Otherwise it goes on in
-            worker threads, whichever is free.
+        life: the coroutine to drive; it begins with start().
+        mailbox: the actor's mailbox; its `schedule` should be the driver's.
+        name: the actor's name, for the log.
+        on_loop: whether the life runs on the framework's loop, and must not block. Otherwise it runs in whichever
+            worker thread is free.
     """
 
     def __init__(
@@ -72,14 +72,14 @@ class Driver:
         self._name = name
         self._on_loop = on_loop
         self._context = Context()
-        self._task: asyncio.Task[Any] | None = None  # on the loop, that is, which keeps only a weak reference
+        self._task: asyncio.Task[Any] | None = None  # kept here: the loop has only a weak reference to it
 
     def schedule(self, urgent: bool) -> None:
-        """Have the life go on, soon: what its mailbox calls. `urgent`: whatever limits there are. Twice is as once."""
+        """Resume the life soon; the mailbox calls this. `urgent`: ignore the limit of threads. Twice acts as once."""
         self._submit(self._turn, urgent=urgent)
 
     def start(self) -> None:
-        """Have the life begin, soon."""
+        """Begin the life soon."""
         self._submit(self.drive, urgent=False)
 
     def _submit(self, fn: Callable[[], None], *, urgent: bool) -> None:
@@ -93,7 +93,7 @@ class Driver:
             self.drive()
 
     def drive(self, result: Any = None, error: BaseException | None = None) -> None:
-        """Let the life go on, with the outcome of what it waited for, until it waits again."""
+        """Resume the life with the result or error that it waited for, and run it until it waits again."""
         while True:
             try:
                 if error is None:
@@ -115,7 +115,7 @@ class Driver:
                 return
 
     def close(self) -> None:
-        """Give up a life that has not begun."""
+        """Close a life that has not begun."""
         self._life.close()
 
     def _resume(self, result: Any, error: BaseException | None) -> None:

@@ -1,4 +1,4 @@
-"""The life of an actor, whatever it runs on: one coroutine that begins, handles messages until stopped, and ends."""
+"""The life of an actor: one coroutine that begins, handles messages until the actor is stopped, and ends."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ logger = logging.getLogger("rr_actors")
 
 MAILBOX_LIMIT = 100_000
 BATCH = 256
-"""How many messages an actor on the loop handles before the loop sees to others."""
+"""How many messages an actor on the loop handles before other callbacks have their turn."""
 
 
 class BaseActor(pykka.Actor):
-    """What both types share: life, mailbox, exit report. Pykka documents how actors behave."""
+    """The base of both actor types: life, mailbox, exit report. Pykka documents how actors behave."""
 
     mailbox_limit: ClassVar[int] = MAILBOX_LIMIT
-    """How many messages wait at most; one more raises MailboxFull at its sender."""
+    """How many messages may wait; the sender of one more gets MailboxFull."""
 
     _lives_on_loop: ClassVar[bool] = False
     """Whether its handlers run on the framework's loop, and not in worker threads."""
@@ -60,10 +60,10 @@ class BaseActor(pykka.Actor):
     _report: ExitReport
     _final: bool
     _stop_replies: list[pykka.Future[Any]]
-    _monitors: set[Monitor]  # those it holds
+    _monitors: set[Monitor]  # the monitors that this actor has set
 
     def __new__(cls, *_args: Any, **_kwargs: Any) -> Self:
-        # Here and not in __init__, so that a subclass's __init__ need not call it.
+        # In __new__, and not in __init__: so a subclass's __init__ need not call this one.
         self = super().__new__(cls)
         birth = exit_reports.take()
         self.actor_urn = uuid.uuid4().urn if birth.path is None else urn_of_path(birth.path)
@@ -83,7 +83,7 @@ class BaseActor(pykka.Actor):
         return self
 
     def __init__(self, *_args: Any, **_kwargs: Any) -> None:
-        """Takes anything and does nothing: a subclass may call it, and need not."""
+        """Accept any arguments and do nothing: a subclass may call this, and need not."""
 
     @classmethod
     def start(  # pyright: ignore[reportIncompatibleMethodOverride]  # ActorRef is invariant; Pykka's own is no better
@@ -94,8 +94,8 @@ class BaseActor(pykka.Actor):
         If on_start returns IGNORE, the reference is to an actor that has ended.
 
         Raises:
-            UsageError: called on the loop, or in an `async def` callback, where waiting would hold up all others.
-            BaseException: what `__init__` or on_start raised; the actor is gone then.
+            UsageError: called on the loop, or in an `async def` callback, where waiting would delay all others.
+            BaseException: the error that `__init__` or on_start raised; the actor has ended then.
         """
         check_may_block(f"{cls.__name__}.start()")
         actor = cls(*args, **kwargs)
@@ -113,17 +113,17 @@ class BaseActor(pykka.Actor):
         place: Any = None,
         on_exit: OnExit | None = None,
     ) -> ActorRef[Self] | Ignore:
-        """Start an actor from the loop, for code that hosts actors: start(), awaited, with what a host has to say.
+        """Start an actor from the loop, and wait until its on_start has returned; for code that hosts actors.
 
-        Cancelled while it waits, it stops the actor as soon as that is possible, and on_exit is not called.
+        If this call is cancelled, it stops the actor as soon as possible, and on_exit is not called.
 
         Args:
-            path: the actor's path in its tree; its URN follows from it and stays the same when it is started again.
+            path: the actor's path in its tree; its URN follows from it and stays the same after a restart.
             place: handed to the hook _before_start.
             on_exit: called on the loop, once, when the actor has ended.
 
         Raises:
-            Exception: what `__init__` or on_start raised.
+            Exception: the error that `__init__` or on_start raised.
         """
         dispatcher = acquire()
         try:
@@ -144,10 +144,10 @@ class BaseActor(pykka.Actor):
         return IGNORE if answer is IGNORE else actor.actor_ref
 
     def on_start(self) -> Any:
-        """Yours: what is to be done before the first message. May be `async def`; may return IGNORE."""
+        """Override this to act before the first message. It may be `async def`, and may return IGNORE."""
 
     def on_stop(self) -> Any:
-        """Yours: what is to be done when the actor has been asked to stop. May be `async def`."""
+        """Override this to act when the actor has been asked to stop. It may be `async def`."""
 
     def on_failure(
         self,
@@ -155,39 +155,39 @@ class BaseActor(pykka.Actor):
         exception_value: BaseException | None,
         traceback: TracebackType | None,
     ) -> Any:
-        """Yours: what is to be done, in place of on_stop, when an exception ends the actor. May be `async def`."""
+        """Override this to act, in place of on_stop, when an exception ends the actor. It may be `async def`."""
 
     def monitor(self, ref: Any) -> Monitor:
-        """Have the message Down sent to this actor, once, when the actor that `ref` leads to has ended.
+        """Send the message Down to this actor, once, when the actor of `ref` has ended.
 
-        It is about the actor's present life: one that is dead, or is being started again, is down at once ("noproc").
-        Down overtakes the messages that wait; of several monitors each tells. In an `async def` handler an actor of
-        another process is watched from a moment later on; if it ends before, it is "noproc", too.
+        The monitor is of the actor's present life. An actor that is dead, or is being respawned, is down at once
+        ("noproc"). Down overtakes the waiting messages; each of several monitors sends one. In an `async def` handler,
+        the watch of an actor in another process begins a moment later; if it ends before, it is "noproc", too.
 
         Args:
-            ref: a reference or proxy, or a SupervisorRef; to an actor in any process of the system.
+            ref: a reference or proxy, or a SupervisorRef, to an actor in any process of the system.
         """
         made = Monitor(ref, deliver_to(self._mailbox), self._monitors.discard)
-        self._monitors.add(made)  # first: its Down takes it out
+        self._monitors.add(made)  # first: its Down removes it
         begin(made)
         return made
 
     def stop(self, reason: Literal["normal", "shutdown"] = "normal") -> None:
-        """Stop this actor when it has handled the messages that wait already; "shutdown": before them."""
+        """Stop this actor when it has handled the waiting messages; with "shutdown", before it handles them."""
         self._mailbox.put(Envelope(Stop(reason)))
 
-    # -- for hosts: overridden by what has more to do than the user's on_start and on_stop -----------------------------
+    # -- hooks for hosts: a subclass overrides them to do more than the user's on_start and on_stop --------------------
 
     async def _before_start(self, place: Any) -> None:
-        """On the loop, before on_start."""
+        """Prepare the start, on the loop, before on_start."""
 
     async def _after_start(self) -> None:
-        """On the loop, when on_start has succeeded and before anybody hears of it."""
+        """Complete the start, on the loop, when on_start has succeeded; the creator gets the reference after this."""
 
     async def _after_stop(self, final: bool) -> None:
-        """On the loop, after on_stop or on_failure, if _before_start had succeeded. `final`: it will not come back."""
+        """Clean up, on the loop, after on_stop or on_failure, if _before_start succeeded. `final`: no restart."""
 
-    # -- what Pykka asks of actor types --------------------------------------------------------------------------------
+    # -- methods that Pykka calls --------------------------------------------------------------------------------------
 
     @staticmethod
     def _create_actor_inbox() -> Mailbox:
@@ -213,14 +213,14 @@ class BaseActor(pykka.Actor):
         shielded(self._enter_life)
 
     def _enter_life(self) -> None:
-        self._dispatcher = acquire()  # released when it has ended
+        self._dispatcher = acquire()  # released when the actor has ended
         self._life_driver = Driver(
             self._dispatcher, self._live(), self._mailbox, self._target.name, on_loop=self._lives_on_loop
         )
         self._mailbox.begin(self._life_driver.schedule)
         death_watch.begin(self.actor_stopped)
-        running[self.actor_urn] = self.actor_ref  # what keeps the actor alive while it has no thread
-        if self.actor_ref.path is None:  # a supervised actor is its supervisor's, not ActorRegistry.stop_all()'s
+        running[self.actor_urn] = self.actor_ref  # this reference keeps the actor alive while it has no thread
+        if self.actor_ref.path is None:  # ActorRegistry.stop_all() must not stop a supervised actor
             ActorRegistry.register(self.actor_ref)
         try:
             self._life_driver.start()
@@ -291,7 +291,7 @@ class BaseActor(pykka.Actor):
             if type(message) is Packed:
                 try:
                     message = message.open()
-                except Exception as error:  # its sender's fault, not this actor's
+                except Exception as error:  # an error of the sender, not of this actor
                     self._not_opened(error, reply)
                     return
             if is_stop(message):
@@ -340,7 +340,7 @@ class BaseActor(pykka.Actor):
             self._note_failure(error)
 
     async def _leave(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
-        """SystemExit, or the like, in a handler: this actor's end, and no other's."""
+        """End this actor, and no other, after SystemExit or the like in a handler."""
         if reply is not None:
             dead = Ended(f"{self._target.name} ended while it handled the message: {error!r}", self._target.name)
             dead.__cause__ = error
@@ -407,5 +407,5 @@ class BaseActor(pykka.Actor):
 
     async def _hook(self, hook: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
         mine = getattr(type(self), hook.__name__)
-        if mine is not hook:  # the loop is worth the way only if there is something to do
+        if mine is not hook:  # go to the loop only if a subclass has overridden the hook
             await Await(mine(self, *args), on_loop=True)

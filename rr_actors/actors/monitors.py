@@ -28,7 +28,7 @@ logger = logging.getLogger("rr_actors")
 _numbers = itertools.count(1)
 
 Deliver = Callable[["Monitor", Down], None]
-"""Brings the Down to those who want it; may raise ActorDeadError or Unavailable if there is nobody any more."""
+"""Delivers the Down to the receiver; may raise ActorDeadError or Unavailable if the receiver has ended."""
 
 
 class Monitor:
@@ -46,7 +46,7 @@ class Monitor:
         self._called_off = over
         self._lock = threading.Lock()
         self._down: Down | None = None
-        self._over = False  # delivered, or called off
+        self._over = False  # delivered, or cancelled
         self._told = Flag()
         self._unwatch: Callable[[], None] | None = None
 
@@ -83,7 +83,7 @@ class Monitor:
         return self._down
 
     def _take(self) -> Down | None:
-        """The Down, to be handled now; None if it is not wanted any more."""
+        """Return the Down, which the caller must handle; None if the monitor is over already."""
         with self._lock:
             if self._over:
                 return None
@@ -147,7 +147,7 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
 
     def over(monitor: Monitor) -> None:
         try:
-            dispatcher.call(release)  # there, as a worker would wait for itself
+            dispatcher.call(release)  # on the loop: a worker would wait for itself
         except Unavailable:
             logger.debug("%r is over after its loop", monitor)
 
@@ -164,7 +164,7 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
 
 
 def deliver_to(mailbox: Mailbox) -> Deliver:
-    """How a Down comes to an actor: as a message."""
+    """Return a function that delivers a Down to an actor, as a message in its mailbox."""
     return lambda monitor, down: mailbox.put(Notice(down, monitor))
 
 

@@ -191,7 +191,7 @@ class ActorRef(pykka.ActorRef[A]):
         """Return the actor's public attributes, for its proxies.
 
         Raises:
-            pykka.ActorDeadError: it has ended.
+            pykka.ActorDeadError: the actor has ended.
         """
         actor = self._actor_weakref()
         if actor is None or not self.is_alive():
@@ -202,7 +202,7 @@ class ActorRef(pykka.ActorRef[A]):
         return Reply(self._target)
 
     def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
-        """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
+        """Send a message, or set the error on `reply`. Return what to call when nobody waits for the reply any more."""
         try:
             _put(self, Envelope(message, reply, chain), self._target.name)
         except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
@@ -235,25 +235,25 @@ class DistantRef(ActorRef[A]):
     """A reference that looks for the actor each time: in this process, or in another one.
 
     Args:
-        where: its path, or its URN and the address of its process.
+        where: the actor's path, or its URN and the address of its process.
     """
 
     def __init__(self, where: Whereabouts) -> None:
-        # Not super().__init__: that keeps hold of one actor of this process.
+        # Not super().__init__: it would keep a reference to one actor of this process.
         self._where = where
         self._class: type[A] | None = None
-        self._line: Line | None = None  # the way to its process, when last asked
+        self._line: Line | None = None  # the line to its process at the last ask
         self._target = where.target
         self.path = where.path
         self.actor_urn = where.target.urn
 
     @property
     def actor_class(self) -> type[A]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The actor's class; asked for, and waited for, the first time.
+        """The actor's class. The first use asks the actor's process, and waits.
 
         Raises:
-            pykka.ActorDeadError, ActorUnavailable: the actor is not there.
-            NotSerializable: its class does not pickle.
+            pykka.ActorDeadError, ActorUnavailable: the actor has ended, or is being respawned.
+            NotSerializable: the class cannot be pickled.
         """
         local = self._local()
         if local is not None:
@@ -264,13 +264,13 @@ class DistantRef(ActorRef[A]):
 
     @property
     def actor_inbox(self) -> ActorInbox:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Takes envelopes for the actor."""
+        """The actor's inbox, or an object that sends envelopes to it."""
         local = self._local()
         return DistantInbox(self) if local is None else local.actor_inbox
 
     @property
     def actor_stopped(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Its is_set() says whether the actor has ended."""
+        """An object whose is_set() returns whether the actor has ended."""
         local = self._local()
         return DistantStopped(self) if local is None else local.actor_stopped
 
@@ -294,9 +294,9 @@ class DistantRef(ActorRef[A]):
             raise said from None
 
     def is_alive(self) -> bool:
-        """Whether the actor is alive. Its process is asked; False if that does not answer.
+        """Return whether the actor is alive. This asks its process; False if the process does not answer.
 
-        On the loop and in an `async def` handler, where nothing may wait, it is what the directory says.
+        On the loop and in an `async def` handler, which must not wait, this asks only the directory.
         """
         local = self._local()
         if local is not None:
@@ -305,7 +305,7 @@ class DistantRef(ActorRef[A]):
             return bool(self._inquire("alive"))
         except (ActorDeadError, Unavailable, pykka.Timeout):
             return False
-        except UsageError:  # waiting is refused here: what the directory says has to do
+        except UsageError:  # waiting is refused here: only the directory can be asked
             return self._hub().may_be_alive(self._where)
 
     @property
@@ -323,10 +323,10 @@ class DistantRef(ActorRef[A]):
         return DistantProxy(actor_ref=self, inquire=self.attributes)
 
     def attributes(self) -> Attributes:
-        """Return the actor's public attributes, for its proxies; they are asked for, and waited for.
+        """Return the actor's public attributes, for its proxies. This asks the actor's process, and waits.
 
         Raises:
-            pykka.ActorDeadError, ActorUnavailable: the actor is not there.
+            pykka.ActorDeadError, ActorUnavailable: the actor has ended, or is being respawned.
             UsageError: waiting is refused here.
         """
         local = self._local()
@@ -412,12 +412,12 @@ class DistantRef(ActorRef[A]):
 
 
 def watch(ref: DistantRef[Any], fire: Callable[[str, str], None]) -> Callable[[], None]:
-    """Call fire(reason, detail) when an actor of another process has ended; returns what calls it off."""
+    """Call fire(reason, detail) when an actor of another process has ended; return a function that ends the watch."""
     return ref._hub().watch(ref._where, fire)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def ref_to(path: str) -> ActorRef[Any]:
-    """The reference to the supervised actor at `path`, "root/cameras", whether or not it runs now."""
+    """Return the reference to the supervised actor at `path`, "root/cameras", whether or not it runs now."""
     return DistantRef(Whereabouts(Target(urn_of_path(path), path), path, ""))
 
 
@@ -448,25 +448,25 @@ def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[A
 
 
 def local_of(ref: pykka.ActorRef[Any]) -> pykka.ActorRef[Any] | None:
-    """The reference to the actor itself, if it lives in this process, or lived here and is dead."""
+    """Return the reference to the actor itself, if it lives in this process, or lived here and is dead."""
     return ref._local() if isinstance(ref, DistantRef) else ref  # pyright: ignore[reportPrivateUsage]
 
 
 def ref_in(what: Any) -> pykka.ActorRef[Any] | None:
-    """Return the reference a user has given: itself, or that of a proxy, an actor or a SupervisorRef; else None."""
+    """Return `what` if it is a reference, or the reference of a proxy, an actor or a SupervisorRef; else None."""
     try:
         ref = getattr(what, "actor_ref", what)
-    except Exception:  # of the object's own code
+    except Exception:  # raised by the object's own code
         return None
     return cast("pykka.ActorRef[Any]", ref) if is_a(ref, pykka.ActorRef) else None
 
 
 def _put(ref: pykka.ActorRef[Any], envelope: Envelope, name: str) -> None:
-    """Put it into the mailbox of an actor of this process.
+    """Put an envelope into the mailbox of an actor of this process.
 
     Raises:
-        Ended: it is dead.
-        MailboxFull: its mailbox is full.
+        Ended: the actor is dead.
+        MailboxFull: the mailbox is full.
     """
     if ref.actor_stopped.is_set():
         raise Ended(f"{name} not found", name)
@@ -480,4 +480,4 @@ def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> 
 
 
 def _nothing() -> None:
-    """What takes back a message to an actor of this process: it looks at the reply before it handles the message."""
+    """Do nothing: an actor of this process checks that the reply is not cancelled before it handles the message."""

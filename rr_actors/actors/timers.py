@@ -1,4 +1,4 @@
-"""Timers: a message to an actor after some time, which can be called off (OTP: send_after, cancel_timer)."""
+"""Timers: a message to an actor after some time, which can be cancelled (OTP: send_after, cancel_timer)."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Timer:
             logger.warning("the message of a timer was not sent to %s: %s", self._ref, error)
         finally:
             try:
-                self._dispatcher.call(release)  # there, as a worker would wait for itself
+                self._dispatcher.call(release)  # on the loop: a worker would wait for itself
             except Unavailable:
                 logger.debug("%r is over after its loop", self)
 

@@ -1,6 +1,6 @@
-"""A link that its own thread writes and reads: one message there, one back, with no loop on this side.
+"""A link that the calling thread itself writes and reads: one message out, one back, with no event loop on this side.
 
-For a thread that waits for the answer it saves two hand-overs between threads. The other end is an ordinary link.
+A thread that waits for its answer saves two hand-overs between threads. The other end is an ordinary link.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rr_actors.wire.unix_link import Wire
 from rr_actors.wire.unix_sockets import SocketDir
 
 _CHUNK_BYTES = 65536
-_DONT_WAIT = int(socket.MSG_DONTWAIT)  # a plain number: an enum's member is turned into one for each call
+_DONT_WAIT = int(socket.MSG_DONTWAIT)  # a plain number: an enum's member is converted in each call
 
 
 class BlockingLink:
@@ -29,12 +29,12 @@ class BlockingLink:
 
     Args:
         sockets: the directory of the system's sockets. It stays open: an interrupted thread loses no descriptor.
-        key: as for UnixTransport.
-        address: of the transport to connect to.
+        key: the system's 32 secret bytes.
+        address: the address of the transport to connect to.
         timeout_s: how long the handshake may take.
 
     Raises:
-        RrError: what the other side refused with. Unavailable: nobody is there.
+        RrError: the error with which the other side refused. Unavailable: no transport listens at the address.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class BlockingLink:
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
         frame = framed(message, self._limit)
         sent = self._send(frame)
-        if sent < len(frame):  # seldom: nothing else is on its way
+        if sent < len(frame):  # seldom: the buffer of the socket is empty before
             timeout_s = self._send_rest(memoryview(frame)[sent:], timeout_s)
         messages = self._reader.feed(self._receive_soon(timeout_s))
         if not messages:
@@ -90,14 +90,14 @@ class BlockingLink:
         return messages[0]
 
     def _send(self, data: bytes | memoryview) -> int:
-        """Write what the kernel takes at once; returns how much that was."""
+        """Write as much as the kernel takes at once; return the number of bytes."""
         try:
             return self._socket.send(data, _DONT_WAIT)
         except BlockingIOError:
             return 0
 
     def _send_rest(self, rest: memoryview, timeout_s: float | None) -> float | None:
-        """Write as the other side reads; returns what is left of the time."""
+        """Write the rest as the other side reads it; return the time that is left."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         poll = select.poll()
         poll.register(self._socket, select.POLLOUT)
@@ -109,7 +109,7 @@ class BlockingLink:
         return None if deadline is None else max(0.0, deadline - time.monotonic())
 
     def _rest(self, timeout_s: float | None) -> list[Any]:
-        """Read until a message is complete."""
+        """Read until a message is complete, and return all messages that are then complete."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             if self._reader.error is not None or self._reader.ended:
@@ -119,7 +119,7 @@ class BlockingLink:
                 return messages
 
     def _receive_soon(self, timeout_s: float | None) -> bytes:
-        """As _receive(), for what may come sooner than this thread could fall asleep and be woken."""
+        """Wait for data as _receive() does, but spin first: a quick answer comes before a thread could wake up."""
         if timeout_s is not None and timeout_s < SPIN_LIMIT_S:
             return self._receive(timeout_s)
         spin = self._spin
@@ -129,9 +129,9 @@ class BlockingLink:
             spin.parked(time.monotonic() - began)
             return data
         while True:
-            os.sched_yield()  # to the thread that is to answer, if it waits for this core
+            os.sched_yield()  # for the thread that answers, if it waits for this core
             try:
-                data = self._read(_DONT_WAIT)  # which lets other threads of this process have Python's lock
+                data = self._read(_DONT_WAIT)  # this call releases Python's lock for other threads
             except BlockingIOError:
                 data = b""
             took_s = time.monotonic() - began
@@ -141,7 +141,7 @@ class BlockingLink:
         return data or self._receive(None if timeout_s is None else timeout_s - took_s)
 
     def _receive(self, timeout_s: float | None) -> bytes:
-        # not recv() alone: it is woken, too, when the other side has read what was sent, which costs both a wake-up
+        # not recv() alone: it also wakes up when the other side has read the question, which costs both sides time
         if not self._readable(None if timeout_s is None else max(0.0, timeout_s * 1e3)):
             raise TimeoutError
         return self._read()
@@ -153,16 +153,16 @@ class BlockingLink:
         return data
 
     def fileno(self) -> int:
-        """The descriptor of the connection."""
+        """Return the descriptor of the connection."""
         return self._socket.fileno()
 
     def leave(self) -> None:
-        """Write and want no more. The connection ends from the other side when all that was written is read."""
-        with contextlib.suppress(OSError):  # it is lost
+        """Write nothing any more. The other side ends the connection when it has read all that was written."""
+        with contextlib.suppress(OSError):  # the connection is lost
             self._socket.shutdown(socket.SHUT_WR)
 
     def has_ended(self) -> bool:
-        """Read what comes without waiting; whether the connection has ended."""
+        """Read and drop all data that has arrived; return whether the connection has ended."""
         try:
             while self._socket.recv(_CHUNK_BYTES, _DONT_WAIT):
                 pass
@@ -173,23 +173,23 @@ class BlockingLink:
         return True
 
     def cut(self) -> None:
-        with contextlib.suppress(OSError):  # it is lost, or its thread has let it go
+        with contextlib.suppress(OSError):  # the connection is lost, or its thread has closed it
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the connection."""
         self._socket.close()
 
 
 # -- spin, then park ---------------------------------------------------------------------------------------------------
 #
-# To be woken costs more than a quick answer takes. To look for it meanwhile takes a core, and is in vain if the answer
-# takes longer, or if others have got the core or Python's lock. So the thread remembers what it was good for lately, as
+# Waking a thread takes longer than a quick answer. Spinning instead occupies a core, and is in vain if the answer takes
+# longer, or if other threads have the core or Python's lock. So the thread remembers how useful spinning was lately, as
 # adaptive mutexes do.
 
 SPIN_LIMIT_S = 200e-6
 
-_QUICK_S = 2 * SPIN_LIMIT_S  # a parked thread hears of the answer when it has been woken
+_QUICK_S = 2 * SPIN_LIMIT_S  # a parked thread sees the answer only when it has been woken
 _EARNED_SPINNING_S = 50e-6  # two wake-ups are saved
 _EARNED_PARKED_S = 6e-6
 _BUDGET_MAX_S = 2 * SPIN_LIMIT_S
@@ -197,12 +197,12 @@ _BUDGET_MIN_S = -20e-3
 
 
 class AdaptiveSpin:
-    """The spinning of one thread at a time, for answers that come one at a time.
+    """Decides for one thread at a time whether to spin for the next answer.
 
-    An account of time. What was spun in vain is taken from it, with all that others took meanwhile; an answer that came
-    while spinning earns 50 µs, one that came quickly to a parked thread 6 µs, one that took long nothing. Nobody spins
-    who has nothing left. So answers that take long cost SPIN_LIMIT_S twice, and no more however many come; those that
-    are always a little late, or that wait for others each time that somebody spins, cost 6 µs each.
+    It keeps an account of time. Spinning in vain costs the time it took, including what other threads took meanwhile.
+    An answer that comes while spinning earns 50 µs, a quick one to a parked thread 6 µs, a slow one nothing. With
+    nothing left, a thread does not spin. So any number of slow answers cost SPIN_LIMIT_S twice in all. Answers that are
+    always a little late, or always wait for other threads during the spinning, cost 6 µs each.
 
     Attributes:
         worthwhile: whether to spin for the next answer, for SPIN_LIMIT_S at most.
@@ -215,7 +215,7 @@ class AdaptiveSpin:
         self.worthwhile = True
 
     def spun(self, took_s: float, answered: bool) -> None:
-        """Note the end of spinning: after how many seconds, and whether the answer was there by then."""
+        """Note that spinning has ended after `took_s` seconds, and whether the answer had come by then."""
         if answered and took_s <= SPIN_LIMIT_S:
             if self._budget_s < _BUDGET_MAX_S:
                 self._budget_s = min(_BUDGET_MAX_S, self._budget_s + _EARNED_SPINNING_S)
@@ -224,7 +224,7 @@ class AdaptiveSpin:
             self.worthwhile = self._budget_s > 0
 
     def parked(self, took_s: float) -> None:
-        """Note that an answer has come after so many seconds to a thread that found it not worthwhile to spin."""
+        """Note that an answer has come after `took_s` seconds to a thread that did not spin."""
         if took_s <= _QUICK_S:
             self._budget_s += _EARNED_PARKED_S
             self.worthwhile = self._budget_s > 0

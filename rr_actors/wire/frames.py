@@ -16,7 +16,7 @@ from rr_actors.base.errors import NotSerializable, Unavailable
 T = TypeVar("T")
 
 FRAME_LIMIT_BYTES = 16 * 1024 * 1024
-"""What a frame's body may hold where the configuration says nothing else."""
+"""The default limit for the body of a frame."""
 
 _LENGTH = struct.Struct(">I")
 _pack_length = _LENGTH.pack
@@ -30,7 +30,7 @@ class FrameReader(Generic[T]):
     """Cuts a stream into messages, whatever pieces it arrives in.
 
     Attributes:
-        error: what was wrong with the stream; it is not read any further.
+        error: the error in the stream, if there was one; the rest of the stream is not read.
         ended: the peer has said goodbye.
     """
 
@@ -40,7 +40,7 @@ class FrameReader(Generic[T]):
         self._decode = decoder.decode
         self._limit = limit
         self._buffer = bytearray()  # an incomplete frame
-        self._wanted = 0  # the bytes it needs to be complete, as far as known
+        self._wanted = 0  # the length of that frame, as far as it is known
         self.error: Unavailable | None = None
         self.ended = False
 
@@ -50,7 +50,7 @@ class FrameReader(Generic[T]):
         return bool(self._buffer)
 
     def feed(self, data: bytes) -> list[T]:
-        """Return the messages that `data` completes; none after an error or a goodbye, see the attributes."""
+        """Return the messages that `data` completes; none after an `error`, or when the stream has `ended`."""
         if self.error is not None or self.ended:
             return []
         length = len(data) - 4
@@ -105,7 +105,7 @@ def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
     """Return a message's frame.
 
     Raises:
-        NotSerializable: it has no MessagePack form, or a longer one than `limit`, which the setting `key` sets.
+        NotSerializable: it has no MessagePack form, or one longer than `limit`, which is the setting `key`.
     """
     try:
         body = _encode(message)

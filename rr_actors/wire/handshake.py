@@ -1,13 +1,13 @@
 """The handshake: how both sides of a connection prove that they are of one system, without any I/O.
 
-They prove that they know the system's key in blocks of fixed size, so that nothing of a stranger's is ever parsed; only
-then come frames::
+Both prove that they know the system's key, in blocks of fixed size: no data of a stranger is ever parsed. Frames come
+only then::
 
     acceptor                              dialler
       magic, version, nonce          ─→
                                      ←─  magic, version, nonce, HMAC(key, "dialler", both nonces)
-      HMAC(key, "acceptor", both)    ─→                                       (the dialler knows its peer from here on)
-                                     ←─  frame: Hello, at most 4 KiB          (the acceptor did since the proof)
+      HMAC(key, "acceptor", both)    ─→                                       (now the dialler trusts its peer)
+                                     ←─  frame: Hello, at most 4 KiB          (the acceptor has since the proof)
       frame: Welcome or a refusal    ─→
 
 The key is never sent, and a proof can be neither replayed (nonces) nor reflected (the role is in it).
@@ -43,13 +43,13 @@ _LENGTH = struct.Struct(">I")
 
 
 class Welcomed(msgspec.Struct, frozen=True, array_like=True, tag="welcome"):
-    """The link is open."""
+    """The acceptor's answer that opens the link."""
 
     welcome: Welcome
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag="refused"):
-    """The acceptor does not want the link."""
+    """The acceptor's answer that refuses the link."""
 
     failure: Failure
 
@@ -59,10 +59,10 @@ _decode_reply = msgspec.msgpack.Decoder(Welcomed | Refused).decode
 
 
 def check_key(key: bytes) -> bytes:
-    """Return a system's key.
+    """Return a system's key if it has the right length.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: the key is shorter or longer.
     """
     if len(key) != KEY_BYTES:
         raise ConfigError(f"a system's key has {KEY_BYTES} bytes, got {len(key)}", expected=KEY_BYTES, got=len(key))
@@ -70,7 +70,7 @@ def check_key(key: bytes) -> bytes:
 
 
 class _Step(msgspec.Struct, frozen=True):
-    """What is to come next: a block of `size` bytes, or a frame of at most `limit`, and who takes it."""
+    """The next block of `size` bytes, or the next frame of at most `limit`, and the function that takes it."""
 
     what: str
     take: Callable[[bytes], bytes]
@@ -79,10 +79,10 @@ class _Step(msgspec.Struct, frozen=True):
 
 
 class _Handshake:
-    """Gathers each step's block and hands it to the step; the two roles are below.
+    """Collects the block of each step and hands it to the step; the two roles are below.
 
     Attributes:
-        rest: what came after the last block, once `done`; it belongs to the link.
+        rest: the bytes after the last block, once `done`; they belong to the link.
     """
 
     _step: _Step
@@ -95,10 +95,10 @@ class _Handshake:
         self.rest = b""
 
     def receive(self, data: bytes) -> bytes:
-        """Take what arrived; return what to send.
+        """Take the bytes that arrived, and return the bytes to send.
 
         Raises:
-            Unavailable: the peer is not who it should be, or does not speak like it. Close the connection.
+            Unavailable: the peer is not of this system, or breaks the protocol. Close the connection.
         """
         self._buffer += data
         reply = b""
@@ -112,11 +112,11 @@ class _Handshake:
 
     @property
     def waits_for(self) -> str:
-        """What should come next, for the message about a peer that does not send it."""
+        """The name of the next block, for the error about a peer that does not send it."""
         return self._step.what
 
     def _block_size(self) -> int | None:
-        """Return the length of the next block if all of it is there."""
+        """Return the length of the next block if all of it has arrived, else None."""
         size = self._step.size
         if not size:
             if len(self._buffer) < _LENGTH.size:
@@ -133,7 +133,7 @@ class _Handshake:
 
 
 class AcceptorHandshake(_Handshake):
-    """The side that was connected to. Send `greeting` first; once `done`, answer `hello` with `welcome` or `refuse`."""
+    """The side that accepts. Send `greeting` first; once `done`, answer `hello` with `welcome` or `refuse`."""
 
     hello: Hello
 
@@ -162,11 +162,11 @@ class AcceptorHandshake(_Handshake):
 
     @staticmethod
     def refuse(error: Exception) -> bytes:
-        """Return the answer that makes the dialler's connect raise `error`."""
+        """Return the answer that makes connect() of the dialler raise `error`."""
         failure = failure_of(error)
         try:
             return framed(Refused(failure), REPLY_LIMIT_BYTES)
-        except NotSerializable:  # too long, or a text that is not Unicode: what matters still fits
+        except NotSerializable:  # too long, or not Unicode: the first 1000 bytes of the text still fit
             text = failure.message.encode("utf-8", "replace")[:1000].decode("utf-8", "ignore")
             return framed(Refused(Failure(failure.kind, text)), REPLY_LIMIT_BYTES)
 

@@ -1,6 +1,6 @@
-"""Links within one process: the message objects themselves, handed over by the loop, a batch at a time.
+"""Links within one process: the event loop hands over the message objects themselves, a batch at a time.
 
-A Receiver is never called from within another's `send` or `flush`: each flush becomes one call the loop makes later.
+A Receiver is never called from within the `send` or `flush` of another: the loop delivers each flush by a later call.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class LocalLink:
         self._receiver: Receiver | None = None
 
     def attach(self, attach: Attach) -> None:
-        """Give it its receiver; from then on it will hear `lost`."""
+        """Set the receiver of the link; from now on the link calls its `lost` at the end."""
         self._receiver = attach(self)
         self._links.add(self)
 
@@ -105,7 +105,7 @@ class LocalLink:
         self.flush()
 
     def close(self) -> None:
-        """Send what is queued and close; both ends hear `lost` when it has arrived."""
+        """Send the queued messages and close; when they have arrived, `lost` is called at both ends."""
         self._close(None)
 
     def _close(self, reason: Exception | None) -> None:
@@ -116,7 +116,7 @@ class LocalLink:
             self._loop.call_soon(self.lose, reason)
 
     def deliver(self, batch: list[Any]) -> None:
-        """Take a batch of the other end."""
+        """Hand the receiver a batch of messages from the other end."""
         if self._receiver is None:
             return
         received = self._receiver.received
@@ -133,7 +133,7 @@ class LocalLink:
                 self._close(error)
 
     def lose(self, reason: Exception | None) -> None:
-        """Tell the receiver, once."""
+        """Call `lost` of the receiver, unless it was called before."""
         self._open = False
         if self.closed.is_set():
             return

@@ -1,17 +1,17 @@
-"""Who is where: one name a registrar or actor, in a private directory that every process of the system can read.
+"""The names and addresses of registrars and actors, in a private directory that each process of the system can read.
 
-An entry is a symbolic link whose target is its content, "up:4711-0a1b2c3d.sock" or "stopped": replacing it is one
-atomic rename, looking it up one readlink, and a process killed at any instruction leaves the old entry or the new.
+An entry is a symbolic link whose target is its content, "up:4711-0a1b2c3d.sock" or "stopped". Replacing it is one
+atomic rename, reading it one readlink. A process that is killed at any instruction leaves the old entry or the new.
 
     <state_dir>/            0700
-      system.lock           held (flock) by the living system; its content is that one's pid
-      run/<incarnation>/    0700; gone when the system is, cleared by the next one if it was killed
+      system.lock           held (flock) by the living system; contains the pid of its process
+      run/<incarnation>/    0700; removed when the system ends, or by the next system after a kill
         names/              the entries
         4711-0a1b2c3d.sock  the processes' sockets
 
-Each incarnation has a directory of its own: what a straggler of a dead system still writes is seen by nobody. All is
-reached through descriptors of the directories (folder.py). A cleaner of temporary files finds them used within the
-hour, and locked, as systemd-tmpfiles respects; what is removed all the same, the processes of the system make again.
+Each incarnation has a directory of its own: nobody reads what a process of a dead system still writes. The files are
+reached through descriptors of the directories (folder.py). The system marks them as used within each hour, and locks
+them, which systemd-tmpfiles respects. If they are removed all the same, the system's processes make them again.
 """
 
 from __future__ import annotations
@@ -49,25 +49,25 @@ from rr_actors.base.steps import Steps
 
 _log = logging.getLogger(__name__)
 
-_REGISTRAR = "r."  # what the names of their entries begin with
-_CLASSES = "c."  # and of those that say of what classes a manager is
-_BELOW = "~"  # what stands for "/" in those of actors
+_REGISTRAR = "r."  # the prefix of a registrar's entry
+_CLASSES = "c."  # the prefix of an entry with the classes of a manager
+_BELOW = "~"  # stands for "/" in the name of an actor's entry
 _LOCK = "system.lock"
 _KEY_BYTES = 32
 _INCARNATION_BYTES = 4
 _INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
-_SHOWN = 10  # names in an error
-_CONTENT_BYTES = 4000  # a link's content has less than a page
+_SHOWN = 10  # names in an error at most
+_CONTENT_BYTES = 4000  # the content of a symbolic link is shorter than a page
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
 
 PATH_BYTES = 482
-"""How long the state directory's path may be: SQLite opens files of 504 bytes, such as "/a/catalog.sqlite3.new" in it.
-A registrar of a longer name needs more; that is checked when its catalog is opened."""
+"""The limit for the path of the state directory. SQLite opens paths of 504 bytes: this, and "/a/catalog.sqlite3.new".
+A registrar with a longer name needs a shorter path; that is checked when its catalog is opened."""
 
 
 class Status(enum.StrEnum):
-    """Where a registrar or actor is in its life: UP at an address; STARTING or being respawned; STOPPED, restartable;
-    GONE for good; DORMANT, a registrar of a process that died, with a catalog nobody has open."""
+    """The state of a registrar or actor: UP at an address; STARTING or being respawned; STOPPED, can be restarted; GONE
+    for good; DORMANT, a registrar whose process died and whose catalog nobody has open."""
 
     UP = "up"
     STARTING = "starting"
@@ -77,11 +77,11 @@ class Status(enum.StrEnum):
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there.
+    """The entry of one name; the address is "" unless the status is UP, or STARTING with a running process.
 
-    `why` says for people what made it STOPPED or GONE, or how the last processes of one that is STARTING died; ""
-    where that is not known.
-    `once`: it is UP, and will not be started again when it ends.
+    `why` is a text for people: the reason for STOPPED or GONE, or how the last processes died while STARTING; "" if
+    the reason is not known.
+    `once`: the actor is UP, and will not be started again when it ends.
     """
 
     status: Status
@@ -91,7 +91,7 @@ class Entry(msgspec.Struct, frozen=True):
 
     @property
     def because(self) -> str:
-        """Why, as the end of a sentence: ": killed (SIGKILL)", or nothing."""
+        """The reason as the end of a sentence: ": killed (SIGKILL)"; "" if it is not known."""
         return f": {self.why}" if self.why else ""
 
 
@@ -104,19 +104,19 @@ _WHY_BYTES = 900  # some file systems have links of at most 1023
 
 
 def _fitting(why: str) -> str:
-    """What of a text there is room for in a link."""
+    """Return as much of a reason as fits into a symbolic link."""
     whole = why.replace("\0", " ").encode("utf-8", "backslashreplace")
     return whole.decode() if len(whole) <= _WHY_BYTES else whole[:_WHY_BYTES].decode("utf-8", "ignore") + "…"
 
 
 def registrar_key(name: str) -> str:
-    """Return the entry's name of a registrar."""
+    """Return the name of a registrar's entry."""
     return _REGISTRAR + check_name(name, "registrar name")
 
 
-@functools.lru_cache(1024)  # it is looked up for each message to an actor of another process
+@functools.lru_cache(1024)  # called for each message to an actor of another process
 def actor_key(path: str) -> str:
-    """Return the entry's name of an actor, from its path in the tree, "root/inner/cameras"."""
+    """Return the name of an actor's entry, from its path in the tree, "root/inner/cameras"."""
     for part in path.split("/"):
         check_name(part, "child id")
     key = path.replace("/", _BELOW)
@@ -126,13 +126,13 @@ def actor_key(path: str) -> str:
 
 
 class Directory:
-    """The names of one running system. Any process and thread of it may use its own Directory of the same `run_dir`.
+    """The names of one running system. Each process and thread may have its own Directory of the same `run_dir`.
 
     A method that writes raises ConfigError if the directory cannot be written: it was removed, or the disk is full.
 
     Args:
         run_dir: StateDir.run_dir.
-        keeps: make it again when it was removed; for those who know that the system runs.
+        keeps: make the directory again if it was removed; only for a caller that knows that the system runs.
     """
 
     def __init__(self, run_dir: Path, *, keeps: bool = False) -> None:
@@ -140,7 +140,7 @@ class Directory:
         self._keeps = keeps
         self._draft = f".{os.urandom(4).hex()}."
         self._numbers = itertools.count()
-        self._written: dict[str, str] = {}  # by this object
+        self._written: dict[str, str] = {}  # the entries that this object wrote
         self._names = self._open()
 
     def _open(self) -> Folder:
@@ -150,15 +150,15 @@ class Directory:
                 return run.inner("names")
 
     def close(self) -> None:
-        """Look nothing up, and write nothing any more."""
+        """Close the directory: later look-ups find nothing, and writes fail."""
         self._names.close()
 
     def restore(self) -> bool:
-        """Make the directory again, with what was written by this object, if it was removed; whether it was."""
+        """Make the directory again if it was removed, with this object's entries; return whether it was removed."""
         names = self._names
         if names.fd < 0 or (names.is_there() and (self.run_dir / "names").exists()):
             return False
-        self._names = self._open()  # the old one stays open for threads that are just using it, until it is collected
+        self._names = self._open()  # the old folder stays open, until it is collected, for threads that use it
         weakref.finalize(names, os.close, names.fd)
         for name, content in list(self._written.items()):
             if content.startswith(_UP) or self.lookup(name) is None:
@@ -166,7 +166,7 @@ class Directory:
         return True
 
     def touch(self) -> None:
-        """Let all of it look used, for those who remove what is old."""
+        """Mark all files as used now, so that no cleaner of temporary files removes them as old."""
         for path in (self.run_dir.parent, self.run_dir, self.run_dir / "names", *self.run_dir.iterdir()):
             with contextlib.suppress(OSError):
                 os.utime(path, follow_symlinks=False)
@@ -175,15 +175,15 @@ class Directory:
                 os.utime(name, dir_fd=self._names.fd, follow_symlinks=False)
 
     def publish(self, name: str, address: str, *, once: bool = False) -> None:
-        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again."""
+        """Write that `name` is UP at `address`; `once`: when it ends, it will not be started again."""
         self._put(name, (_UP_ONCE if once else _UP) + address)
 
     def announce(self, name: str, address: str) -> None:
-        """Say that `name`, which is STARTING, will be UP at `address`: its process is there."""
+        """Write that `name` is STARTING and will be UP at `address`: its process runs."""
         self._put(name, _OPENING + address)
 
     def mark(self, name: str, status: Status, why: str = "") -> None:
-        """Say that `name` is where it cannot be reached, and `why`, of which some hundred characters are kept."""
+        """Write a status in which `name` has no address, and `why`, of which at most 900 bytes are kept."""
         if status is Status.UP:
             raise UsageError(f"{name}: UP needs an address; use publish")
         self._put(name, f"{status.value}{_WHY}{_fitting(why)}" if why else status.value)
@@ -214,7 +214,7 @@ class Directory:
         """Return the entry, or None if there is none. One system call."""
         try:
             content = os.readlink(name, dir_fd=self._names.fd)
-        except OSError:  # not there, or not ours
+        except OSError:  # no such entry, or no symbolic link
             return None
         if content.startswith(_UP):
             return Entry(Status.UP, content[len(_UP) :])
@@ -227,22 +227,22 @@ class Directory:
         return entry if entry is None or not why else Entry(entry.status, "", why)
 
     def names(self) -> list[str]:
-        """Return every name there is, sorted."""
+        """Return the names of all entries, sorted."""
         try:
             return sorted(name for name in self._names.names() if not name.startswith("."))
         except OSError:
             return []
 
     def registrars(self) -> list[str]:
-        """Return the name of every registrar there is an entry of, sorted."""
+        """Return the names of all registrars that have an entry, sorted."""
         return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
 
     def put_classes(self, registrar: str, classes: Sequence[str]) -> None:
-        """Say of what classes the manager is that has this registrar."""
+        """Write the names of the classes of the manager that has this registrar."""
         self._put(_CLASSES + check_name(registrar, "registrar name"), _joined(classes))
 
     def manager_classes(self) -> dict[str, list[str]]:
-        """Return, by its registrar's name, of what classes each manager is that has been in the system."""
+        """Return the classes of each manager that has been in the system, by the name of its registrar."""
         found: dict[str, list[str]] = {}
         for name in self.names():
             if name.startswith(_CLASSES):
@@ -251,17 +251,17 @@ class Directory:
         return found
 
     def actors_below(self, path: str) -> list[str]:
-        """Return the name of every entry of an actor below that path, sorted."""
+        """Return the names of the entries of all actors below this path, sorted."""
         prefix = actor_key(path) + _BELOW
         return [name for name in self.names() if name.startswith(prefix)]
 
     def actor_paths(self, top: str) -> list[str]:
-        """Return the path of every actor below that one whose path is short enough for a name, sorted."""
+        """Return the paths of all actors below `top`, sorted; not those that are too long for the name of an entry."""
         found = [key.removeprefix("a.").replace(_BELOW, "/") for key in self.actors_below(top)]
         return [path for path in found if "//" not in path]
 
     def no_registrar(self, name: str) -> UnknownRegistrar:
-        """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
+        """Return the error for an unknown registrar; it names the known ones, and the one that was probably meant."""
         entry = self.lookup(_REGISTRAR + name)
         known = [other for other in self.registrars() if _is_there(self.lookup(_REGISTRAR + other))]
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
@@ -274,7 +274,7 @@ class Directory:
 
 
 def _joined(classes: Sequence[str]) -> str:
-    """As many of them, from the first on, as a link's content has room for."""
+    """Join the names of the first classes, as many as fit into a symbolic link."""
     text = ""
     for name in classes:
         if len(text.encode()) + len(name.encode()) >= _CONTENT_BYTES:
@@ -291,9 +291,9 @@ class StateDir:
     """A state directory opened by the one living system that uses it.
 
     Attributes:
-        path: the directory, absolute.
-        run_dir: for names and sockets of this incarnation.
-        key: 32 secret bytes, new each time; only the system's own processes get it.
+        path: the absolute path of the directory.
+        run_dir: the directory for the names and sockets of this incarnation.
+        key: 32 secret bytes, new each time; only the system's own processes get them.
     """
 
     def __init__(self, folder: Folder, lock: int) -> None:
@@ -310,10 +310,10 @@ class StateDir:
             _lock_shared(self._run.fd)
 
     def keep(self) -> None:
-        """Take the lock again if its file was removed, and say so: another system could start here meanwhile. Blocks.
+        """Take the lock again if its file was removed, and log that: another system could start here meanwhile. Blocks.
 
         Raises:
-            CatalogLocked: another system has taken it already; two use the directory, and one must be stopped.
+            CatalogLocked: another system has taken the lock already; both use the directory, and one must be stopped.
         """
         if self.lock < 0:
             return
@@ -325,15 +325,15 @@ class StateDir:
         os.close(lost)
 
     def close(self) -> None:
-        """Remove what only a living system needs, and let another one have the directory. Again is nothing.
+        """Remove the files that only a running system needs, and release the lock. A second call does nothing.
 
-        Each step is tried. What cannot be removed, the next start removes.
+        Each step is tried. The next start removes the files that cannot be removed now.
         """
         if self.lock < 0:
             return
         steps = Steps()
         steps.take("removing what only a running system needs", self._clear)
-        with contextlib.suppress(OSError):  # the pid in it is for people
+        with contextlib.suppress(OSError):  # the pid in the file is only for people
             os.ftruncate(self.lock, 0)
         steps.take("giving its lock back", self.forget)
         steps.end(f"state directory {self.path}: not closed altogether")
@@ -343,11 +343,11 @@ class StateDir:
             with self._folder.inner("run") as run:
                 _remove_incarnations(run)
         finally:
-            with contextlib.suppress(OSError):  # a straggler has written there again: the next start clears it
+            with contextlib.suppress(OSError):  # a late process has written a file again: the next start removes it
                 os.rmdir("run", dir_fd=self._folder.fd)
 
     def forget(self) -> None:
-        """Release the lock alone: in a forked child it is the parent's, and must not outlive it here."""
+        """Close the lock and the directories, and remove nothing. A forked child must not keep its parent's lock."""
         lock, self.lock = self.lock, -1
         os.close(lock)
         self._run.close()
@@ -355,17 +355,17 @@ class StateDir:
 
 
 def _lock_shared(fd: int) -> None:
-    """As cleaners of temporary files respect it; somebody else's lock does not matter."""
+    """Lock a directory, which cleaners of temporary files respect; if another process has locked it, do nothing."""
     with contextlib.suppress(OSError):
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 def open_state_dir(path: Path | str) -> StateDir:
-    """Make a state directory private, or create it, and take it for this system.
+    """Make a state directory private, or create it, and lock it for this system.
 
     Raises:
-        CatalogLocked: a living system has it; `.pid` is its process.
-        ConfigError: it cannot be written, belongs to another user, or is a directory that others share.
+        CatalogLocked: a living system has locked it; `.pid` is the process of that system.
+        ConfigError: the directory cannot be written, belongs to another user, or is shared with other users.
     """
     folder = _open_private(absolute_path(path))
     try:
@@ -384,7 +384,7 @@ def absolute_path(path: Path | str) -> Path:
     """Return the real path of a state directory.
 
     Raises:
-        ConfigError: the current directory, which it is relative to, is gone; or it is longer than PATH_BYTES.
+        ConfigError: the path is relative, and the current directory was removed; or it is longer than PATH_BYTES.
     """
     try:
         absolute = Path(os.path.realpath(path))
@@ -443,10 +443,10 @@ def _pid_in(lock: int) -> int | None:
 
 
 def _open_private(path: Path) -> Folder:
-    """Open the directory, tightened to 0700; create it if it is not there.
+    """Open the directory with mode 0700; create it if it does not exist.
 
     Raises:
-        ConfigError: it cannot be, or must not be: it is not ours alone.
+        ConfigError: the directory cannot be opened, or is not this user's alone.
     """
     with _named_errors("use", path):
         if path.exists() and not path.is_dir():
@@ -484,7 +484,7 @@ def _tighten(folder: Folder) -> None:
 
 
 def _others_files(folder: Folder) -> list[str]:
-    """Return what in a directory shows that it is somebody's for another purpose; nothing, if a system has used it."""
+    """Return the files that show that a directory has another purpose; none if a system has used it before."""
     names = sorted(name for name in folder.names() if name[0] != "." and name not in ("run", "lost+found"))
     if _LOCK in names or any(next((folder.path / name).glob("catalog.*"), None) for name in names):
         return []
@@ -496,14 +496,14 @@ def _has_files(path: Path) -> bool:
         return next(path.iterdir(), None) is not None
     except NotADirectoryError:
         return True
-    except OSError:  # what may not be read is not judged
+    except OSError:  # the directory cannot be read
         return False
 
 
 def _remove_incarnations(run: Folder) -> None:
-    """Remove what dead systems left; one of their stragglers may still be writing there.
+    """Remove the directories of dead systems, although a late process of theirs may still write to them.
 
-    Nothing else: a registrar may be called "run", and has its catalog here.
+    Remove nothing else: a registrar may be called "run", and its catalog is then here.
     """
     with _named_errors("use", run.path):
         found = [name for name in run.names() if _INCARNATION.fullmatch(name)]
@@ -513,12 +513,12 @@ def _remove_incarnations(run: Folder) -> None:
 
     for name in found:
         shutil.rmtree(name, ignore_errors=True, dir_fd=run.fd)
-        run.discard(name)  # it was no directory
+        run.discard(name)  # if it was no directory
 
 
 @contextlib.contextmanager
 def _named_errors(verb: str, path: object) -> Generator[None]:
-    """Turn an OSError into a ConfigError that says what could not be done, where and why."""
+    """Turn an OSError into a ConfigError that names the action, the path and the reason."""
     try:
         yield
     except BlockingIOError:
@@ -529,7 +529,7 @@ def _named_errors(verb: str, path: object) -> Generator[None]:
 
 
 def _advice(error: OSError, path: Path) -> str:
-    """What to do about it."""
+    """Return what the user can do about the error."""
     match error.errno:
         case errno.EACCES | errno.EPERM:
             return "make it writable, or choose another state_dir"

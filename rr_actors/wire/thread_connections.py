@@ -1,8 +1,8 @@
-"""ThreadConnections: the connections to one other process that threads of this one have to themselves.
+"""ThreadConnections: connections to one other process, each for one thread of this process at a time.
 
-A thread that sends a question and waits for the answer writes the one and reads the other itself: this process's loop
-has no part in it. Actors are asked so, and registrars load and unload so. Each connection is one thread's until it is
-given back; when there is none to be had, the question goes by the link that the loop has.
+A thread that waits for an answer writes the question and reads the answer itself, without this process's event loop.
+Asks of actors use this, and loads and unloads of registrars. A thread has its connection alone until it gives it back.
+If no connection is available, the question goes over the loop's link.
 """
 
 from __future__ import annotations
@@ -16,44 +16,44 @@ from typing import Generic, TypeVar
 from rr_actors.base.errors import RrError
 from rr_actors.wire.transport import Exchange
 
-_DIAL_S = 0.1  # a process that takes longer to shake hands is busy, or hangs: the loop has more patience
+_DIAL_S = 0.1  # a process with a slower handshake is busy, or hangs: then the loop waits for it
 _AGAIN_S = 1.0
-_LIMIT = 16  # each takes a file descriptor here, and two there; more threads than that share the link
+_LIMIT = 16  # each takes one file descriptor in this process, two in the other; more threads share the link
 
 E = TypeVar("E", bound=Exchange)
 
 
 class ThreadConnections(Generic[E]):
-    """Those of one process to another one, as long as the link beside them is up. From any thread.
+    """The connections of one process to another, as long as the link beside them is up. From any thread.
 
     Attributes:
-        closed: whether there are none any more.
+        closed: whether close() was called.
 
     Args:
-        dial: makes one, within so many seconds; None if there are none.
+        dial: opens a connection within the given number of seconds; returns None if it cannot.
     """
 
     def __init__(self, dial: Callable[[float], E | None]) -> None:
         self._dial = dial
-        self._lock = threading.Lock()  # of who dials, or closes
+        self._lock = threading.Lock()  # held to begin dialling, and to close
         self._idle: list[E] = []
-        self._in_use: dict[E, int] = {}  # by which thread
+        self._in_use: dict[E, int] = {}  # and the thread that uses it
         self._dialling: set[int] = set()  # the threads that dial
         self._dial_after = 0.0
         self.closed = False
 
     def take(self, timeout_s: float | None) -> E | None:
-        """Return one for the calling thread alone, which must give it back or take it out; None: there is none now.
+        """Return a connection for the calling thread alone, which must give it back or take it out; None: none is free.
 
         Args:
-            timeout_s: the most that dialling may take, if it is less than what it may take anyway.
+            timeout_s: how long opening a connection may take, if that is less than the usual limit of 0.1 s.
         """
         try:
             line = self._idle.pop()
         except IndexError:
             return self._dialled(timeout_s)
         self._in_use[line] = threading.get_ident()
-        if self.closed:  # perhaps since those in use were cut
+        if self.closed:  # perhaps after close() had cut the connections in use
             self.drop(line)
             return None
         return line
@@ -66,7 +66,7 @@ class ThreadConnections(Generic[E]):
                     return None
                 self._dialling.add(me)
             return self._open(me, _DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
-        except BaseException:  # KeyboardInterrupt, say: nobody has it
+        except BaseException:  # such as KeyboardInterrupt: no caller gets the connection
             self.drop_mine()
             raise
         finally:
@@ -89,36 +89,36 @@ class ThreadConnections(Generic[E]):
         return line
 
     def give_back(self, line: E) -> None:
-        """It has been answered, and is for the next."""
+        """Make a connection available to other threads: its question has been answered."""
         if self._in_use.pop(line, None) is None:
             line.close()
             return
         self._idle.append(line)
-        if self.closed:  # perhaps since all that were there were closed
+        if self.closed:  # perhaps after close() had closed the idle connections
             self._close_idle()
 
     def take_out(self, line: E) -> bool:
-        """It is not for anybody else, and the caller's to close; False if the calling thread has given it back."""
+        """Remove a connection, which the caller must close; return False if the calling thread has given it back."""
         return self._in_use.get(line) == threading.get_ident() and self._in_use.pop(line, None) is not None
 
     def drop(self, line: E) -> None:
-        """Close one that is lost, or whose answer nobody waits for, unless the calling thread has given it back."""
+        """Close a connection that is lost or has an answer to come, unless the calling thread has given it back."""
         if self.take_out(line):
             line.close()
 
     def drop_mine(self) -> None:
-        """As drop(), of whatever the calling thread has: it may have been interrupted as it got it."""
+        """Drop all connections of the calling thread, which may have been interrupted in take()."""
         me = threading.get_ident()
         for line in [line for line, thread in list(self._in_use.items()) if thread == me]:
             self.drop(line)
 
     def cut(self, line: E) -> None:
-        """Have the thread that waits on it hear that it is lost; nothing happens if none does."""
+        """End a connection that is in use: for the thread that waits on it, it is lost. Else do nothing."""
         if line in self._in_use:
             line.cut()
 
     def close(self) -> None:
-        """Let all of them go; threads that wait hear that they are lost."""
+        """Close all connections; for threads that wait on them, they are lost."""
         with self._lock:
             self.closed = True
         for line in list(self._in_use):

@@ -1,13 +1,13 @@
 """Transport: the contract of how messages reach another actor. Implementations stand beside it; one contract test
 suite runs over all.
 
-A link is one connection between two of them, opened by the one who wants something. Guarantees: messages arrive whole,
-in the order they were sent, each at most once; when a link is lost, what was sent last may or may not have arrived, and
-`lost` is called exactly once on each side, after everything that did arrive. The sender may send again on a new link.
+A link is one connection between two sides; the side that wants something opens it. Guarantees: messages arrive whole,
+in the order they were sent, each at most once. When a link is lost, the last messages may or may not have arrived.
+`lost` is called exactly once on each side, after all messages that did arrive. The sender may send again on a new link.
 
-Everything here but an Exchange runs on the process's loop, and no Receiver is called from within another's `send`,
-`flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the loop; a Receiver must
-not block; close the transport before the loop ends, or nobody hears `lost`. A Receiver that raises loses its link.
+All but an Exchange runs on the process's event loop. No Receiver is called from within the `send`, `flush` or `close`
+of another one. Obligations: after one or more `send`, call `flush` before returning to the loop; a Receiver must not
+block; close the transport before the loop ends, or no Receiver hears `lost`. A Receiver that raises loses its link.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import msgspec
 
 
 class Hello(msgspec.Struct, frozen=True, array_like=True):
-    """What the side that opens a link says first: what it is for, to whom, from whom, of which incarnation."""
+    """The first message of the side that opens a link: its purpose, the receiver, the sender and its incarnation."""
 
     kind: str  # "registrar", "direct" or "actors"
     to: str
@@ -28,7 +28,7 @@ class Hello(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True):
-    """The answer to Hello: the incarnation of who answers."""
+    """The answer to Hello: the incarnation of the side that answers."""
 
     epoch: int
 
@@ -41,51 +41,50 @@ class Link(Protocol):
 
     @property
     def more(self) -> bool:
-        """Whether another message, which came with the one that is being received, follows it at once."""
+        """Whether another message, which arrived together with the current one, follows it at once."""
         ...
 
     @property
     def peer(self) -> str:
-        """Who is at the other end, for people: "cameras (pid 4711)"."""
+        """The name of the other end, for people: "cameras (pid 4711)"."""
         ...
 
     @property
     def behind(self) -> bool:
-        """Whether the other end is slow to take what was flushed before: what may be lost is better not sent now."""
+        """Whether the other end has not taken all flushed data yet: then send no messages that may be lost."""
         ...
 
     def send(self, message: Any) -> None:
-        """Queue a message; dropped silently when the link is lost.
+        """Queue a message, or drop it silently if the link is lost.
 
         Raises:
-            MailboxFull: between processes: the peer does not read and the buffer has reached its limit; the message was
-                not queued.
-            NotSerializable: between processes: it cannot be encoded, or is longer than the limit; it was not queued.
+            MailboxFull: between processes: the peer does not read, and the buffer is full; nothing was queued.
+            NotSerializable: between processes: the message cannot be encoded, or is too long; nothing was queued.
         """
         ...
 
     def flush(self) -> None:
-        """Hand everything queued to the other side in one go."""
+        """Hand all queued messages to the other side at once."""
         ...
 
     def send_now(self, message: Any) -> None:
-        """Send one message, with whatever is queued. Raises what send() does."""
+        """Send one message, and all queued messages before it. Raises the errors of send()."""
         ...
 
     def close(self) -> None:
-        """Send what is queued and close; both sides hear `lost`."""
+        """Send the queued messages and close the link; `lost` is called on both sides."""
         ...
 
 
 class Receiver(Protocol):
-    """Who takes what arrives on a link."""
+    """The object that takes the messages of a link."""
 
     def received(self, link: Link, message: Any) -> None:
-        """One message, decoded."""
+        """Take one decoded message."""
         ...
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """The link is closed; None if either side closed it, else what happened, as far as can be told.
+        """Note that the link is closed; `reason` is None if either side closed it, else the error, if it is known.
 
         Called once for each `attach` that has returned.
         """
@@ -93,30 +92,30 @@ class Receiver(Protocol):
 
 
 class Exchange(Protocol):
-    """One way for a thread to ask and wait: a message there, one back, one thread at a time.
+    """A connection for a thread that asks and waits: one message out, one back, one thread at a time.
 
     Attributes:
-        epoch: the other side's, as its Welcome says.
+        epoch: the other side's epoch, from its Welcome.
     """
 
     epoch: int
 
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
-        """Write a message and return the one that comes back.
+        """Write a message and return the answer.
 
         Raises:
-            TimeoutError: none came within `timeout_s` seconds; it is not to be used again.
+            TimeoutError: no answer came within `timeout_s` seconds; do not use the connection again.
             OSError: the connection is lost; the message may have arrived.
-            NotSerializable: too long for a frame; it is as it was.
+            NotSerializable: the message is too long for a frame; the connection can still be used.
         """
         ...
 
     def cut(self) -> None:
-        """End it now: the thread that waits, if there is one, hears that it is lost. From any thread."""
+        """End the connection now: for a thread that waits on it, the connection is lost. From any thread."""
         ...
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the connection."""
         ...
 
 
@@ -129,22 +128,22 @@ class Transport(Protocol):
 
     @property
     def address(self) -> str:
-        """Where others reach this transport once it listens."""
+        """The address at which others reach this transport once it listens."""
         ...
 
     async def listen(self, accept: Accept) -> None:
-        """Accept links from now on. An RrError that `accept` raises is what the other side's connect raises."""
+        """Accept links from now on. If `accept` raises an RrError, the other side's connect() raises it, too."""
         ...
 
     async def connect(self, address: str, hello: Hello, attach: Attach) -> Link:
-        """Open a link. What the other side sends at once may reach the Receiver before this returns.
+        """Open a link. Messages that the other side sends at once may reach the Receiver before this returns.
 
         Raises:
-            RrError: what the other side's accept raised.
-            Unavailable: nobody listens there, or the handshake failed or took too long.
+            RrError: the error that the other side's accept raised.
+            Unavailable: no transport listens at the address, or the handshake failed or took too long.
         """
         ...
 
     async def close(self) -> None:
-        """Stop listening, close every link; each receiver has heard `lost` when this returns."""
+        """Stop listening and close all links; when this returns, `lost` has been called on each Receiver."""
         ...

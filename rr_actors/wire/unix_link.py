@@ -21,11 +21,11 @@ from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
 _log = logging.getLogger(__name__)
 
 CLOSE_LIMIT_S = 1.0
-"""How long a closing link waits for its peer to read what was sent last."""
+"""How long a closing link waits until its peer has read the last messages."""
 
 
 class Wire(msgspec.Struct, frozen=True):
-    """What links of one kind share."""
+    """The settings that all links of one kind share."""
 
     decoder: msgspec.msgpack.Decoder[Any]
     frame_limit_bytes: int
@@ -51,7 +51,7 @@ class UnixLink(asyncio.Protocol):
         peer: str,
         start: bytes = b"",
     ) -> None:
-        """Make the link; it is in `links` while it is open, and writes `start` before any message."""
+        """Make the link. It is in `links` while it is open, and writes `start` before any message."""
         self.hello = hello
         self.welcome = welcome
         self.peer = peer
@@ -62,7 +62,7 @@ class UnixLink(asyncio.Protocol):
         self._frame_limit = wire.frame_limit_bytes
         self._buffer = bytearray(start)  # the frames of the next flush
         self._buffer_limit = wire.buffer_limit_bytes
-        self._unsent = 0  # what the connection had not taken at the last look
+        self._unsent = 0  # bytes that the transport still buffered at the last look
         self._open = True
         self._reason: Exception | None = None
         self._receiver: Receiver | None = None
@@ -72,7 +72,7 @@ class UnixLink(asyncio.Protocol):
         self._outlet: Outlet | None = None
 
     def attach(self, attach: Attach) -> None:
-        """Give it its receiver; from then on it will hear `lost`."""
+        """Set the receiver of the link; from now on the link calls its `lost` at the end."""
         self._receiver = attach(self)
         self._received = self._receiver.received
         self._links.add(self)
@@ -102,7 +102,7 @@ class UnixLink(asyncio.Protocol):
 
     def flush(self) -> None:
         if self._open and self._buffer:
-            frames, self._buffer = self._buffer, bytearray()  # the transport may keep what it is given
+            frames, self._buffer = self._buffer, bytearray()  # the transport may keep the buffer
             self._transport.write(frames)
             self._unsent = self._transport.get_write_buffer_size()
 
@@ -115,19 +115,19 @@ class UnixLink(asyncio.Protocol):
             self._unsent = self._transport.get_write_buffer_size()
 
     def open_outlet(self) -> None:
-        """Let threads answer on it, too, what is asked from now on."""
+        """Let other threads, too, write answers to this link from now on."""
         if self._outlet is None and self._open:
-            with contextlib.suppress(OSError):  # then it is the loop that answers
+            with contextlib.suppress(OSError):  # then the event loop sends all answers
                 self._outlet = Outlet(self._transport.get_extra_info("socket").fileno())
 
     def answering(self, message: Any) -> Callable[[], None] | None:
-        """What sends the answer to the only open question, by any thread; None: it is the loop's to send."""
+        """Return a function with which any thread sends the answer to the only open question; None: the loop must."""
         outlet = self._outlet
         if outlet is None or not self._open:
             return None
         try:
             return functools.partial(self._answer, outlet, framed(message, self._frame_limit))
-        except NotSerializable:  # as the loop will find, and say
+        except NotSerializable:  # the loop will find this, too, and report it
             return None
 
     def _answer(self, outlet: Outlet, frame: bytes) -> None:
@@ -140,7 +140,7 @@ class UnixLink(asyncio.Protocol):
             self._transport.write(outlet.take_rest())
 
     def close(self) -> None:
-        """Send what is queued and close; a peer that does not read it within a second is cut off."""
+        """Send the queued messages and close; cut off a peer that does not read them within a second."""
         if not self._open:
             return
         if self._outlet is not None:
@@ -152,13 +152,13 @@ class UnixLink(asyncio.Protocol):
         self._timer = asyncio.get_running_loop().call_later(CLOSE_LIMIT_S, self._transport.abort)
 
     def abort(self, reason: Exception | None) -> None:
-        """Close at once, whatever is queued."""
+        """Close at once, and drop the queued messages."""
         self._open = False
         self._reason = self._reason or reason
         self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Hand over each message that is complete (asyncio calls this)."""
+        """Hand each complete message to the receiver (asyncio calls this)."""
         reader = self._reader
         received = self._received
         messages = reader.feed(data)
@@ -178,7 +178,7 @@ class UnixLink(asyncio.Protocol):
             self.abort(Unavailable(f"{self.peer} sent {reader.error}"))
 
     def eof_received(self) -> None:
-        """Nothing more will come (asyncio calls this). What is not sent yet cannot arrive any more."""
+        """Abort the link: the peer writes and reads no more (asyncio calls this)."""
         self.abort(
             None if self._reader.ended else Unavailable(f"the connection with {self.peer} ended: its process died")
         )
@@ -208,15 +208,15 @@ class UnixLink(asyncio.Protocol):
 
 # -- writing from any thread -------------------------------------------------------------------------------------------
 #
-# Beside the loop's transport that has the connection. For an answer that has nothing before it and nothing behind: the
-# peer has read what was sent before, or it would not have asked again.
+# Beside the event loop's transport, a thread may write only an answer with no other message before or behind it. The
+# peer has read all earlier messages, or it would not have asked again.
 
 
 class Outlet:
-    """A descriptor of its own for a connection, which stays this connection's whatever the transport does.
+    """A second descriptor for a connection, which stays valid whatever the transport does.
 
     Args:
-        fd: the transport's.
+        fd: the transport's descriptor of the connection.
 
     Raises:
         OSError: the process has no file descriptors left.
@@ -230,9 +230,9 @@ class Outlet:
         self._socket: socket.socket | None = socket.socket(fileno=os.dup(fd))
 
     def write(self, data: bytes) -> bool:
-        """Write without waiting; False: a rest, which the connection does not take now, is the loop's to write.
+        """Write without waiting; return False if the connection does not take all data: the loop must write the rest.
 
-        Dropped if the connection is lost, or this is closed.
+        The data is dropped if the connection is lost or this outlet is closed.
         """
         with self._lock:
             if self._socket is None:
@@ -241,19 +241,19 @@ class Outlet:
                 sent = self._socket.send(data, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 sent = 0
-            except OSError:  # as its transport will find
+            except OSError:  # the connection is lost; its transport will find that, too
                 return True
             self._rest = data[sent:]
             return not self._rest
 
     def take_rest(self) -> bytes:
-        """What a thread has left to be written, before anything else."""
+        """Return the data that a thread could not write, for the loop to write first; then forget it."""
         with self._lock:
             rest, self._rest = self._rest, b""
             return rest
 
     def close(self) -> bytes:
-        """Give the descriptor back, and what is left to be written; again is nothing."""
+        """Close the descriptor, and return the data that is still to be written. A second call does nothing."""
         with self._lock:
             if self._socket is not None:
                 self._socket.close()

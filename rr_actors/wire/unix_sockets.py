@@ -1,4 +1,4 @@
-"""Unix sockets in a directory, and what the kernel says of who is at the other end."""
+"""Unix sockets in a directory, and the process and user at the other end of a connection."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _OF_PROCESS = re.compile(r"(\d+)-[0-9a-f]{8}\.sock")
 
 
 def new_name() -> str:
-    """Return the name of a socket of this process, unlike any other."""
+    """Return a new, unique name for a socket of this process."""
     return f"{os.getpid()}-{os.urandom(4).hex()}.sock"
 
 
 def pid_of(name: str) -> int | None:
-    """Return the process of a socket with this name; None if it is not such a name."""
+    """Return the id of the process that made a socket of this name; None if the name has another form."""
     found = _OF_PROCESS.fullmatch(name)
     return None if found is None else int(found[1])
 
@@ -39,24 +39,24 @@ def _is_there(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except (OSError, OverflowError):  # another user's
+    except (OSError, OverflowError):  # the process belongs to another user
         return True
     return True
 
 
 class Peer(msgspec.Struct, frozen=True):
-    """Who the kernel says is at the other end."""
+    """The process and user at the other end, as the kernel names them."""
 
-    pid: int  # 0: of a process in a container, that has no id here
+    pid: int  # 0: the process runs in another container and has no id in this one
     uid: int
 
     @property
     def trusted(self) -> bool:
-        """Whether it is our own user, or root."""
+        """Whether the peer is of this process's user, or root."""
         return self.uid in (0, os.geteuid())
 
     def named(self, name: str) -> str:
-        """Return its name for people: "cameras (pid 4711)"."""
+        """Return the peer's name for people: "cameras (pid 4711)"."""
         return f"{name} ({self})"
 
     def __str__(self) -> str:
@@ -64,21 +64,21 @@ class Peer(msgspec.Struct, frozen=True):
 
 
 def peer_of(transport: asyncio.BaseTransport) -> Peer:
-    """Return who is at the other end of a connection."""
+    """Return the process and user at the other end of a connection."""
     return peer_at(transport.get_extra_info("socket"))
 
 
 def peer_at(connected: socket.socket) -> Peer:
-    """Return who is at the other end of a socket."""
+    """Return the process and user at the socket's other end."""
     raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     pid, uid, _ = _CREDENTIALS.unpack(raw)
     return Peer(pid, uid)
 
 
 class SocketDir:
-    """The socket files of a directory, reached by a descriptor of it: so its path may be of any length, and change.
+    """The socket files of a directory, reached by its descriptor: its path may be of any length, and change.
 
-    Usable from any thread: the descriptor is opened once, by the thread that binds or connects first, and kept.
+    Any thread may use it. The first thread that binds or connects opens the descriptor, which stays open.
     """
 
     def __init__(self, path: Path) -> None:
@@ -87,10 +87,10 @@ class SocketDir:
         self._closed = False
 
     def bind(self, name: str) -> socket.socket:
-        """Make the socket file, mode 0600; it refuses connections until somebody listens.
+        """Make the socket file with mode 0600; it refuses connections until the caller listens.
 
         Raises:
-            ConfigError: it cannot be made, or something of that name is there.
+            ConfigError: the file cannot be made, or a file of this name exists.
         """
         unbound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -109,11 +109,11 @@ class SocketDir:
         return unbound
 
     def connect(self, name: str) -> socket.socket:
-        """Connect, without waiting.
+        """Connect to the socket of this name without waiting.
 
         Raises:
-            OSError: nobody is there. BlockingIOError: too many wait there to be accepted.
-            ValueError: that is no socket's name.
+            OSError: no process listens. BlockingIOError: the queue of the listening process is full.
+            ValueError: the name cannot be the name of a socket.
         """
         if not name or "/" in name:
             raise ValueError(f"{name!r} is not the name of a socket")
@@ -130,19 +130,19 @@ class SocketDir:
         return connected
 
     def has(self, name: str) -> bool:
-        """Whether there is a socket file of this name, not a link to one."""
+        """Return whether a socket file of this name exists; a symbolic link to one does not count."""
         try:
             return stat.S_ISSOCK(os.stat(name, dir_fd=self._opened().fd, follow_symlinks=False).st_mode)
         except OSError:
             return False
 
     def unlink(self, name: str) -> None:
-        """Remove the socket file, if it is there."""
+        """Remove the socket file, if it exists."""
         with contextlib.suppress(OSError):
             self._opened().unlink(name)
 
     def sweep(self) -> None:
-        """Remove the sockets of processes that are dead: one that was killed could not do so itself."""
+        """Remove the sockets of dead processes: a process that was killed could not do so itself."""
         folder = self._opened()
         for name in folder.names():
             pid = pid_of(name)
@@ -150,7 +150,7 @@ class SocketDir:
                 folder.discard(name)
 
     def close(self) -> None:
-        """Give the descriptor back; nobody can be connected to any more."""
+        """Close the descriptor; later calls of connect() fail."""
         self._closed = True
         self._drop()
 
@@ -163,7 +163,7 @@ class SocketDir:
         if self._closed:
             raise FileNotFoundError(errno.ENOENT, "closed: its process is ending", str(self._path))
         folder = self._folder
-        if folder is not None and not folder.is_there():  # it was removed; it may have been made again
+        if folder is not None and not folder.is_there():  # the directory was removed, and perhaps made again
             self._drop()
             folder = None
         if folder is None:

@@ -1,8 +1,8 @@
 """Links between processes of one system: Unix sockets in a private directory, authenticated with the system's key.
 
-One socket a process. A link is one connection, made by the one who wants something and kept. What is on the wire is in
-frames.py and handshake.py; here are the connections, their limits, and what happens to a peer that does not keep to the
-rules: its own connection is closed and the log says whose it was; nobody else notices.
+Each process has one socket. A link is one connection, which stays open; the side that wants something makes it. The
+bytes are described in frames.py and handshake.py. This file has the connections and their limits. If a peer breaks the
+rules, only its own connection is closed, and the log names the peer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 BUFFER_LIMIT_BYTES = 64 * 1024 * 1024
 STRANGERS_LIMIT = 128
-"""How many connections at a time may be in their handshake; further ones are closed at once."""
+"""How many connections may be in their handshake at a time; further ones are closed at once."""
 PATIENCE_S = 0.25
 """How old a handshake must be for another one to take its place."""
 _BACKLOG = 1024
@@ -44,10 +44,10 @@ class UnixTransport:
     Args:
         socket_dir: a directory of mode 0700 that all processes of the system use.
         key: the system's 32 secret bytes.
-        codecs: the message type of each kind of link, for `Hello.kind`.
-        frame_limit_bytes: no message may be longer, on either side.
-        buffer_limit_bytes: what may wait for a peer that does not read, per link.
-        handshake_timeout_s: how long a peer may take to prove who it is.
+        codecs: the message type of each kind of link (`Hello.kind`).
+        frame_limit_bytes: the length of the longest message, on either side.
+        buffer_limit_bytes: how much may wait on one link for a peer that does not read.
+        handshake_timeout_s: how long the handshake of a peer may take.
 
     Attributes:
         address: the socket file's name in the socket directory.
@@ -83,7 +83,7 @@ class UnixTransport:
         """Accept links from now on.
 
         Raises:
-            ConfigError: the socket cannot be made there.
+            ConfigError: the socket cannot be made in the socket directory.
         """
         if self._server is not None or self._closed:
             raise UsageError(f"transport {self.address}: listens already, or is closed")
@@ -96,10 +96,10 @@ class UnixTransport:
         return await loop.create_unix_server(lambda: _Acceptor(self, self._key), sock=listener, backlog=_BACKLOG)
 
     async def keep(self) -> bool:
-        """Make the socket's file again if it was removed; whether it was. Links go on.
+        """Make the socket's file again if it was removed, and return whether it was. Open links are not affected.
 
         Raises:
-            ConfigError: it cannot be made.
+            ConfigError: the file cannot be made.
         """
         if self._server is None or self._closed or self._sockets.has(self.address):
             return False
@@ -128,10 +128,10 @@ class UnixTransport:
                 raise
 
     def dial(self, address: str, hello: Hello, timeout_s: float) -> BlockingLink:
-        """Connect for the calling thread alone. From any thread.
+        """Open a connection for the calling thread alone. From any thread.
 
         Raises:
-            RrError: as connect().
+            RrError: the errors of connect().
         """
         return BlockingLink(self._sockets, self._key, address, hello, self.wires[hello.kind], timeout_s)
 
@@ -147,12 +147,12 @@ class UnixTransport:
                     raise Unavailable(f"{hello.to} does not accept connections at {address}") from error
                 await asyncio.sleep(_RETRY_S)
             except (OSError, ValueError) as error:
-                if wanted := wanted_by(error):  # to wait for the peer would not help
+                if wanted := wanted_by(error):  # this process lacks something: waiting for the peer would not help
                     raise RrError(f"cannot connect to {hello.to}: {wanted}") from error
                 raise Unavailable(f"nobody listens for {hello.to} at {address}: {error}") from error
 
     def sweep(self) -> None:
-        """Remove what dead processes have left in the directory of sockets. From any thread.
+        """Remove the sockets of dead processes from the socket directory. From any thread.
 
         Raises:
             OSError: the directory cannot be read.
@@ -160,7 +160,7 @@ class UnixTransport:
         self._sockets.sweep()
 
     async def close(self) -> None:
-        """Stop listening, send what is queued (for a second at most), close every link; each has heard `lost` then."""
+        """Stop listening, send the queued messages (for a second at most), close all links, call `lost` for each."""
         self._closed = True
         steps = Steps()
         if self._server is not None:
@@ -174,34 +174,34 @@ class UnixTransport:
         try:
             await steps.take_async("closing the links", self._close_links())
         finally:
-            for link in [*self.links]:  # cancelled, or its own time limit is late
+            for link in [*self.links]:  # this call was cancelled, or the link's own time limit is late
                 steps.take("closing a link", link.abort, None)
                 steps.take("closing a link", link.connection_lost, None)
             steps.take("closing the directory of sockets", self._sockets.close)
         steps.end(f"transport {self.address}: not closed altogether")
         for _ in range(2):
-            await asyncio.sleep(0)  # the loop closes what was aborted when it turns
+            await asyncio.sleep(0)  # the loop closes aborted connections in its next turn
 
     async def _close_links(self) -> None:
         links = [*self.links]
         for link in links:
             link.close()
-        with contextlib.suppress(TimeoutError):  # a peer that does not read is not waited for
+        with contextlib.suppress(TimeoutError):  # do not wait for a peer that does not read
             async with asyncio.timeout(2 * CLOSE_LIMIT_S):
                 for link in links:
                     await link.closed.wait()
 
     def let_in(self, stranger: _Acceptor) -> bool:
-        """Count a new connection in; False when there is no room.
+        """Add a new connection to `strangers`; return False if there is no room.
 
-        One that dawdles makes room: a handshake takes milliseconds, so who wants a link gets it while others hold
-        connections open and say nothing.
+        The oldest connection makes room if it is slow: a handshake takes milliseconds. So a peer gets its link although
+        others hold connections open and send nothing.
         """
         if self._closed:
             return False
         if len(self.strangers) >= STRANGERS_LIMIT:
             if not self._crowded:
-                self._crowded = True  # logged once, until they are fewer
+                self._crowded = True  # logged once, until there are fewer again
                 _log.warning("%s: %d connections in their handshake, no room for more", self.address, STRANGERS_LIMIT)
             oldest = next(iter(self.strangers))
             if oldest.since + PATIENCE_S > stranger.since:
@@ -212,7 +212,7 @@ class UnixTransport:
         return True
 
     def forget(self, stranger: _Acceptor) -> None:
-        """Count it out: it has become a link, or is closed."""
+        """Remove a connection from `strangers`: it has become a link, or is closed."""
         self.strangers.pop(stranger, None)
         if len(self.strangers) < STRANGERS_LIMIT // 2:
             self._crowded = False
@@ -222,11 +222,11 @@ class UnixTransport:
 
 
 class _TurnedAway(Exception):
-    """The acceptor closed the connection before a word was said."""
+    """The acceptor closed the connection before it sent anything."""
 
 
 class _Acceptor(asyncio.Protocol):
-    """A connection that has yet to prove itself and say its Hello; then a UnixLink takes its place."""
+    """An accepted connection that has not sent its proof and its Hello yet; after them a UnixLink takes its place."""
 
     def __init__(self, owner: UnixTransport, key: bytes) -> None:
         self._owner = owner
@@ -309,10 +309,10 @@ class _Acceptor(asyncio.Protocol):
 
 
 class _Dialler(asyncio.Protocol):
-    """The other side of the handshake; `done` becomes the link, or raises.
+    """The connecting side of the handshake; the result of `done` is the link, or the error.
 
-    A protocol, and not a coroutine that reads the socket and then hands it over: uvloop reads before that coroutine
-    goes on, and what it read would be lost.
+    This is a protocol, and not a coroutine that reads the socket and then hands it over: uvloop would read before the
+    coroutine goes on, and these bytes would be lost.
     """
 
     def __init__(
@@ -379,7 +379,7 @@ class _Dialler(asyncio.Protocol):
         self.fail(Unavailable(f"cannot open a link to {peer}: {why}"))
 
     def fail(self, error: Exception) -> None:
-        """Close the connection, and let connect raise `error`."""
+        """Close the connection, and make connect() raise `error`."""
         self._forget()
         if not self.done.done():
             self.done.set_exception(error)
@@ -387,7 +387,7 @@ class _Dialler(asyncio.Protocol):
             self._transport.abort()
 
     def abandon(self) -> None:
-        """Nobody waits for the link any more."""
+        """Close the link or the connection: connect() does not wait for it any more."""
         self._forget()
         self.done.cancel()
         if self._link is not None:

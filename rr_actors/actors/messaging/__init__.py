@@ -1,1 +1,1 @@
-"""What actors exchange within a process: mailboxes, futures, exits, and messages that reached nobody."""
+"""Messages within a process: mailboxes, futures, reports of exits, and messages that reached no actor."""

@@ -1,7 +1,7 @@
 """Asking: which actor's handler waits for which actor's reply, so that a ring of them is an error instead of a hang.
 
-Two records, since neither sees everything. Within a process: `_waits`, exact, of every handler that waits for a reply,
-for futures asked for earlier too. Across processes: the chain of blocked askers, which every blocking ask carries.
+There are two records, since neither sees all waits. `_waits` has every handler of this process that waits for a reply,
+also on a future of an earlier ask. Across processes, every blocking ask carries the chain of blocked askers.
 
 The error is a UsageError. Its `.ring` has the names of the actors.
 """
@@ -16,7 +16,7 @@ from rr_actors.base.errors import UsageError
 
 
 class Target(NamedTuple):
-    """An actor, as rings speak of it: what identifies it, and what people call it."""
+    """An actor in a ring: the URN that identifies it, and its name for people."""
 
     urn: str
     name: str
@@ -27,7 +27,7 @@ Chain = tuple[Target, ...]
 
 
 class Activity:
-    """One handler of one actor at work. Not `active` once it has returned: a task it left behind blocks nobody."""
+    """One run of a handler. It is not `active` once the handler has returned: a task left behind blocks no actor."""
 
     __slots__ = ("active", "chain", "target")
 
@@ -38,7 +38,7 @@ class Activity:
 
 
 class Awaited(Protocol):
-    """What a handler waits for: a reply."""
+    """A reply that a handler waits for."""
 
     target: Target | None
 
@@ -53,13 +53,13 @@ _waits: dict[str, list[Awaited]] = {}  # by the urn of the actor whose handler w
 
 
 def chain() -> Chain:
-    """The chain that a blocking ask from here must carry."""
+    """Return the chain that a blocking ask of the current handler must carry."""
     me = activity.get()
     return () if me is None or not me.active else (*me.chain, me.target)
 
 
 def check_ring(target: Target) -> None:
-    """Raise UsageError if `target` waits, directly or around a ring, for the handler that asks here."""
+    """Raise UsageError if `target` waits, directly or by way of others, for the current handler."""
     me = activity.get()
     if me is not None and me.active:
         with _lock:
@@ -74,18 +74,18 @@ def check_chain(target: Target, asked_by: Chain) -> None:
 
 
 def begin_wait(awaited: Awaited) -> str | None:
-    """Note that the current handler waits for `awaited`, or raise as check_ring(). end_wait() takes what it returns."""
+    """Note that the current handler waits for `awaited`, or raise as check_ring(). Pass the result to end_wait()."""
     me = activity.get()
     if me is None or not me.active or awaited.target is None:
         return None
-    with _lock:  # one lock for check and entry: of two that close a ring at once, the second sees the first
+    with _lock:  # one lock for check and entry: if two waits close a ring at once, the second sees the first
         _check(me, awaited.target)
         _waits.setdefault(me.target.urn, []).append(awaited)
     return me.target.urn
 
 
 def end_wait(urn: str | None, awaited: Awaited) -> None:
-    """The handler has its reply, or has given up."""
+    """Note that a handler has its reply, or waits no more; `urn` is the result of begin_wait()."""
     if urn is None:
         return
     with _lock:
@@ -103,14 +103,14 @@ def _check(me: Activity, target: Target) -> None:
 
 
 def _path(start: Target, goal_urn: str) -> list[str] | None:
-    """The names from `start` along who waits for whom to the goal; None if that is not where it leads."""
+    """Return the names from `start` to the goal, where each actor waits for the next; None if there is no path."""
     came_from: dict[str, Target | None] = {start.urn: None}
     to_visit = [start]
     while to_visit:
         here = to_visit.pop()
         for awaited in _waits.get(here.urn, ()):
             following = awaited.target
-            if following is None or awaited.done():  # answered: its waiter just has not woken up yet
+            if following is None or awaited.done():  # answered: the waiting handler has not woken up yet
                 continue
             if following.urn == goal_urn:
                 return [*_names_to(here, came_from), following.name]

@@ -1,8 +1,8 @@
-"""Dead letters: messages of this process that reached nobody. Counted, the newest kept, and told of.
+"""Dead letters: messages of this process that reached no actor. They are counted, reported, and the newest are kept.
 
 The text of a message is made in the thread that records it, never on the loop: a message's `__repr__` is users' code.
-A log line comes at most every LOG_EVERY_S seconds, not for those whose sender had an error for it, and at most
-EVENTS_A_SECOND letters reach the listener.
+A log line comes at most every LOG_EVERY_S seconds, and only for letters whose sender got no error. At most
+EVENTS_A_SECOND letters a second reach the listener.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from rr_actors.runtime import event_loop
 logger = logging.getLogger("rr_actors")
 
 KEPT = 1000
-"""How many letters are kept: the newest."""
+"""How many letters are kept; older ones are dropped."""
 
 LOG_EVERY_S = 5.0
 EVENTS_A_SECOND = 100
 
 
 class DeadLetter(msgspec.Struct, frozen=True):
-    """A message that reached nobody.
+    """A message that reached no actor.
 
     Attributes:
         to: the actor's path, or its class and URN.
@@ -62,11 +62,11 @@ class DeadLetters(msgspec.Struct, frozen=True):
 
 
 Listener = Callable[[DeadLetter, int], None]
-"""Hears of a letter and of how many there have been so far; called from any thread."""
+"""Called from any thread with a letter, and the number of letters so far."""
 
 
 class Office:
-    """A process's dead letters. From any thread."""
+    """The dead letters of a process. From any thread."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -79,18 +79,18 @@ class Office:
         self._told = 0
 
     def letters(self, after: int = 0) -> DeadLetters:
-        """Those after the first `after` ones."""
+        """Return the letters after the first `after` ones."""
         with self._lock:
             return DeadLetters(self.count - after, [letter for number, letter in self._kept if number > after])
 
     def record(self, to: str, messages: Sequence[Any], why: str, *, unheard: int) -> None:
-        """These messages to one actor reached nobody, for the same reason. `unheard`: of how many no sender hears."""
+        """Record messages that did not reach one actor, for one reason. `unheard`: how many senders get no error."""
         process = event_loop.current()
         at = time.time()
         if process is not None and process.is_loop_thread():
             try:
                 process.workers.serial("dead letters", self._record, to, messages, why, unheard, at)
-            except Unavailable:  # as many threads as may be, or ending: better no texts than no letters
+            except Unavailable:  # no thread is free, or the process ends: letters without texts are better than none
                 self._record(to, [Lost(type(message).__name__) for message in messages], why, unheard, at)
         else:
             self._record(to, messages, why, unheard, at)
@@ -114,7 +114,7 @@ class Office:
                 listener(letter, count)
 
     def _may_log(self, more: int) -> int:
-        """How many to speak of in a line, if it is time for one."""
+        """Return how many letters to log in a line now; 0: no line is due. With the lock."""
         self._unlogged += more
         now = time.monotonic()
         if not more or now - self._logged_at < LOG_EVERY_S:
@@ -132,11 +132,11 @@ class Office:
 
 
 office = Office()
-"""This process's."""
+"""The dead letters of this process."""
 
 
 class Collection:
-    """The dead letters of a whole system: this process's from now on, and what the others tell of theirs."""
+    """The dead letters of a system: those of this process from now on, and those that others report."""
 
     def __init__(self) -> None:
         self._before = office.count
@@ -144,21 +144,21 @@ class Collection:
         self._counts: dict[int, int] = {}
 
     def heard(self, event: dict[str, Any]) -> None:
-        """A letter, with the count of its process, as plain data."""
+        """Note a letter of another process, and its count, from plain data."""
         if event["pid"] != os.getpid():
             letter = DeadLetter(event["to"], event["message"], event["why"], event["at"], event["pid"])
             self._elsewhere.append(letter)
             self._counts[letter.pid] = max(event["count"], self._counts.get(letter.pid, 0))
 
     def all(self) -> DeadLetters:
-        """Oldest first."""
+        """Return the letters of all processes, oldest first."""
         here = office.letters(self._before)
         letters = sorted([*here.letters, *self._elsewhere.copy()], key=lambda letter: letter.at)
         return DeadLetters(here.count + sum(list(self._counts.values())), letters[-KEPT:])
 
 
 class Lost:
-    """Stands for a message whose own text cannot be had here, as it is packed, say: `what` it is, "12 bytes"."""
+    """Stands for a message without a text, such as a packed one; `what` describes it: "12 bytes"."""
 
     def __init__(self, what: str) -> None:
         self.what = what

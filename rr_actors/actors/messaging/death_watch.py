@@ -1,7 +1,7 @@
-"""Watching: the actors of this process and who wants to hear of their end. An entry for each life of an actor.
+"""Watching: the actors of this process, and the callbacks for their end. Each life of an actor has one entry.
 
-An actor of rr_actors is entered when it comes alive and leaves when it has ended, or is abandoned. Any other Pykka
-actor is entered when somebody first watches it: Pykka tells nobody of an end, so its `actor_stopped` is made to.
+An rr_actors actor gets its entry when it comes alive, and loses it when it has ended or is abandoned. Any other Pykka
+actor gets it at the first watch. Pykka reports no end: so the actor's `actor_stopped` is changed to do that.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from rr_actors.runtime import event_loop
 logger = logging.getLogger("rr_actors")
 
 Fire = Callable[[ExitReport], None]
-"""Called once, from any thread, with how the actor ended; must not block."""
+"""Called once, from any thread, with the report of the actor's end; must not block."""
 
 _SECOND_LOOK_S = 0.1
 
 _lock = threading.Lock()
 _numbers = itertools.count(1)
 _watched: dict[threading.Event, dict[int, Fire]] = {}
-"""By the actor's `actor_stopped`, which unlike its URN is another one in each of its lives."""
+"""The callbacks, by the actor's `actor_stopped`, which differs in each of its lives, unlike its URN."""
 
 
 def begin(stopped: threading.Event) -> None:
-    """An actor of rr_actors comes alive; ended() must follow."""
+    """Make the entry of an actor of rr_actors that comes alive; the caller must call ended() later."""
     _watched[stopped] = {}
 
 
 def watch(ref: pykka.ActorRef[Any], fire: Fire) -> Callable[[], None] | None:
-    """Call `fire` when the actor, one of this process, has ended. Returns what ends the watch; None if it is dead."""
+    """Call `fire` when an actor of this process has ended; return what ends the watch, or None if it is dead."""
     stopped = ref.actor_stopped
     with _lock:
         fires = _watched.get(stopped)
@@ -54,7 +54,7 @@ def watch(ref: pykka.ActorRef[Any], fire: Fire) -> Callable[[], None] | None:
 
 
 def ended(stopped: threading.Event, report: ExitReport) -> None:
-    """The actor has ended, or is abandoned; saying so twice is nothing."""
+    """Call the callbacks of an actor that has ended or is abandoned; a second call does nothing."""
     with _lock:
         fires = _watched.pop(stopped, {})
     for fire in fires.values():
@@ -78,7 +78,7 @@ def _make_it_tell(stopped: threading.Event) -> None:
 
     stopped.set = set_and_tell  # pyright: ignore[reportAttributeAccessIssue]
     process = event_loop.current()
-    if process is not None:  # it may have been about to be set, in another thread, when it was replaced
+    if process is not None:  # another thread may have called the old `set` at this moment: look again later
         process.call(lambda: process.loop.call_later(_SECOND_LOOK_S, _look_again, stopped))
 
 
@@ -88,7 +88,7 @@ def _look_again(stopped: threading.Event) -> None:
 
 
 def _how_it_ends() -> ExitReport:
-    """Pykka sets `actor_stopped` while it handles the exception that ends an actor, if one does."""
+    """Return the report of a Pykka actor's end: Pykka sets `actor_stopped` while it handles the exception, if any."""
     error = sys.exc_info()[1]
     if error is None or (isinstance(error, SystemExit) and not error.code):
         return ExitReport("normal", "stopped")

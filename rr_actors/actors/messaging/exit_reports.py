@@ -1,4 +1,4 @@
-"""How actors begin and end, as others hear of it."""
+"""The beginning and the end of an actor, as it is reported to others."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import msgspec
 from rr_actors.base.errors import StartFailed, text_of
 from rr_actors.runtime.callback_errors import Raised
 
-# How actors begin and end, as others hear of it: what on_start may return, and the report of an exit.
+# The special result of on_start, and the report of an exit.
 
 Reason = Literal["normal", "shutdown", "abnormal", "killed"]
 
 
 class Ignore(enum.Enum):
-    """What on_start returns to say: do not start me, and do not mind (OTP: ignore)."""
+    """The result of on_start that means: do not start this actor, and do not treat that as an error (OTP: ignore)."""
 
     IGNORE = "ignore"
 
@@ -70,17 +70,17 @@ def abnormal(raised: Raised) -> ExitReport:
 OnExit = Callable[[ExitReport], None]
 
 
-# Birth: what an actor's creator knows and its __init__ does not pass on, and what the creator hears if it fails.
+# Birth: the values of an actor's creator that do not go by its __init__, and the creator's error if it fails.
 
 A = TypeVar("A")
 
 
 class Birth(msgspec.Struct, frozen=True):
-    """What an actor's creator gives to it; nothing by default, as by an ordinary call of its class.
+    """The values that an actor's creator gives to it; none by default, as in an ordinary call of its class.
 
     Attributes:
         path: the actor's path in its tree.
-        place: what its host has for it.
+        place: an object of its host, for the hook _before_start.
         on_exit: called on the loop, once, when the actor has ended.
     """
 
@@ -89,9 +89,9 @@ class Birth(msgspec.Struct, frozen=True):
     on_exit: OnExit | None = None
 
     def of(self, cls: Callable[..., A], args: tuple[Any, ...], kwargs: dict[str, Any]) -> A:
-        """Make the actor cls(*args, **kwargs). To be called in a context of its own, which ends with this call.
+        """Make the actor cls(*args, **kwargs). Call this in a new context, which is not used again.
 
-        The class is called, as a metaclass may have a `__call__`: so what is given goes by the context.
+        A metaclass may have a `__call__`, so the class itself is called, and the Birth goes by the context.
         """
         _given.set(self)
         return cls(*args, **kwargs)
@@ -102,19 +102,19 @@ _ORDINARY = Birth()
 
 
 def take() -> Birth:
-    """What the creator has given to the actor that is being made now; for its __new__, once."""
+    """Return the Birth of the actor that is being made now, for its __new__; a second call returns an empty one."""
     birth = _given.get()
     if birth is None:
         return _ORDINARY
-    _given.set(None)  # an actor that __init__ starts is not the one meant
+    _given.set(None)  # not for an actor that this one's __init__ starts
     return birth
 
 
 def as_heard(failure: BaseException, name: str) -> Exception:
-    """What the creator of the actor `name` hears of what its on_start raised."""
+    """Return the error for the creator of the actor `name`, from the one that on_start raised."""
     if isinstance(failure, Exception):
         return failure
-    # SystemExit is this actor's, not that of the one that started it.
+    # SystemExit ends this actor, not its creator.
     heard = StartFailed(f"{name}: on_start raised {text_of(failure)}", id=name)
     heard.__cause__ = failure
     return heard

@@ -1,8 +1,8 @@
 """Reply: the future of rr_actors, one of Pykka's and one of concurrent.futures at once.
 
 It can be awaited without blocking a loop. concurrent.futures.wait and as_completed, and asyncio.wrap_future, take it:
-they use the attributes `_condition`, `_state` and `_waiters` of a concurrent.futures.Future, which are made here when
-somebody asks for them.
+they use the attributes `_condition`, `_state` and `_waiters` of a concurrent.futures.Future, which are made here on
+first use.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ ExcInfo = tuple[type[BaseException] | None, BaseException | None, "TracebackType
 
 
 class Reply(pykka.Future[T], concurrent.futures.Future[T]):
-    """A value that will be there. Everything Pykka documents of futures holds: get, set, map, join, reduce, await.
+    """A value that comes later. It has all that Pykka documents of futures: get, set, map, join, reduce, await.
 
-    Everything that concurrent.futures documents holds, too: result, exception, cancel, add_done_callback.
+    It has all that concurrent.futures documents, too: result, exception, cancel, add_done_callback.
 
     Args:
-        target: the actor that the reply is awaited from; lets get() refuse to wait for itself.
+        target: the actor that replies; with it, get() can refuse a wait that would never end.
 
     Attributes:
-        withdraw: set by who makes the reply, if what was asked for can be taken back: called by cancel(), once.
+        withdraw: set by the maker of the reply if the request can be taken back; cancel() calls it once.
     """
 
     withdraw: Callable[[], object] | None = None
 
-    # most replies are set, read and gone: what few of them need is made when it is needed
+    # most replies are only set and read: attributes that few of them need are made on first use
     _set = False
     _value: Any = None
     _error: BaseException | None = None
@@ -81,13 +81,14 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         return self._cancelled
 
     def cancel(self) -> bool:
-        """Take back what was asked for; get() and result() raise concurrent.futures.CancelledError from then on.
+        """Take back the request; get() and result() raise concurrent.futures.CancelledError from then on.
 
         An rr_actors.Actor of this process does not handle the message then; an actor elsewhere may. A load is
         withdrawn.
 
         Returns:
-            False if it is done, if its actor handles it already, or if it cannot be taken back (a stop, an unload).
+            False if the future is done, if its actor handles the message already, or if the request cannot be taken
+            back (a stop, an unload).
         """
         with self._lock:
             withdraw = self.withdraw
@@ -102,7 +103,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         return True
 
     def set_running_or_notify_cancel(self) -> bool:
-        """Note that the message is handled from now on; False if it was cancelled and must not be."""
+        """Note that the actor begins to handle the message; return False if cancelled: it must not handle it."""
         with self._lock:
             self._running = not self._cancelled
             return self._running
@@ -111,10 +112,10 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         """Wait for the value, as get() does, with the errors of concurrent.futures.
 
         Raises:
-            TimeoutError: not there after `timeout` seconds.
-            concurrent.futures.CancelledError: it was cancelled.
-            UsageError: waiting here would hang, or `timeout` is no such number.
-            BaseException: what was set as exception.
+            TimeoutError: the value has not come after `timeout` seconds.
+            concurrent.futures.CancelledError: the future was cancelled.
+            UsageError: waiting here would hang, or `timeout` is no number of seconds.
+            BaseException: the exception that was set.
         """
         if self._hook_lock is None:
             self._wait_done(timeout)
@@ -149,10 +150,10 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         """Wait for the value, or for ever if `timeout` (seconds) is None.
 
         Raises:
-            pykka.Timeout: not there after `timeout` seconds.
+            pykka.Timeout: the value has not come after `timeout` seconds.
             UsageError: waiting here would hang: on the loop's thread, or for an actor that waits for this handler. Or
-                `timeout` is no such number.
-            BaseException: what was set as exception.
+                `timeout` is no number of seconds.
+            BaseException: the exception that was set.
         """
         hook_lock = self._hook_lock
         if hook_lock is not None:
@@ -168,7 +169,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         return self._value
 
     def set(self, value: Any = None) -> None:
-        """Set the value. After cancel() this is ignored, as the other ways to set it are.
+        """Set the value. After cancel(), this and the other methods that set it do nothing.
 
         Raises:
             queue.Full: it is set already, or has a get hook.
@@ -182,7 +183,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     def set_exception(  # pyright: ignore[reportIncompatibleMethodOverride]  # takes what both bases take
         self, exc_info: ExcInfo | BaseException | None = None
     ) -> None:
-        """Set the exception that get() raises; the one being handled if None.
+        """Set the exception that get() raises; if None, the exception that is being handled.
 
         Raises:
             queue.Full: it is set already, or has a get hook.
@@ -190,12 +191,12 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         self._settle(None, error_of(exc_info), None)
 
     def set_unopened(self, unpack: Callable[[], T], *, raises: bool = False) -> None:
-        """Set the value or exception as what `unpack` returns or raises, run once, in the thread that wants it.
+        """Set a function that returns the value or raises the exception; the first thread that reads it runs it once.
 
         Unpickling imports modules, so it must happen neither on the loop nor for replies that nobody reads.
 
         Args:
-            raises: it is an exception.
+            raises: whether `unpack` raises an exception.
 
         Raises:
             queue.Full: it is set already, or has a get hook.
@@ -203,7 +204,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         self._settle(None, None, unpack, raises=raises)
 
     def set_get_hook(self, func: Callable[[float | None], T]) -> None:
-        """Let get() return func(timeout), called once.
+        """Make get() return func(timeout), which is called once.
 
         Raises:
             queue.Full: it is set already.
@@ -215,9 +216,9 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             self._hook_lock = threading.RLock()
 
     def add_done_callback(self, fn: Callable[[Reply[T]], object]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Call fn(this future) once it is set: in the thread that sets it, or here and now if it is set already.
+        """Call fn(this future) when it is set, in the thread that sets it; if it is set already, call fn now.
 
-        The value of a future that map(), join() and their like return is computed then, in a thread of its own.
+        For a future from map(), join() and the like, this computes the value, in a new thread.
         """
         self._on_set(functools.partial(fn, self))
         self._run_hook()
@@ -234,7 +235,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     def __await__(self) -> Generator[Any, None, T]:
         try:
             loop = asyncio.get_running_loop()
-        except RuntimeError:  # driven by something else than asyncio: what Pykka itself does
+        except RuntimeError:  # no asyncio loop runs the coroutine: do as Pykka does
             return (yield from super().__await__())
         if self._hook_lock is not None:
             return (yield from loop.run_in_executor(None, self.get).__await__())
@@ -248,7 +249,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
 
     # -- for concurrent.futures and asyncio ----------------------------------------------------------------------------
 
-    if not TYPE_CHECKING:  # there they are the attributes of concurrent.futures.Future
+    if not TYPE_CHECKING:  # type checkers see the attributes of concurrent.futures.Future
 
         @property
         def _condition(self) -> threading.Condition:
@@ -271,7 +272,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                     self._watchers = []
                 return self._watchers
 
-    # -- how it is done ------------------------------------------------------------------------------------------------
+    # -- setting, waiting, unpacking -----------------------------------------------------------------------------------
 
     def _settle(
         self, value: Any, error: BaseException | None, unpack: Callable[[], Any] | None, *, raises: bool = False
@@ -287,7 +288,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     def _put(
         self, value: Any, error: BaseException | None, unpack: Callable[[], Any] | None, *, raises: bool = False
     ) -> list[Callable[[], object]] | None:
-        """With the lock."""
+        """Set the value or the error, and return the callbacks to call. With the lock."""
         self._value, self._error, self._open = value, error, unpack
         self._set = True
         self.withdraw = None
@@ -309,7 +310,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 logger.exception("a callback of %r raised", self)
 
     def _run_hook(self) -> None:
-        """Somebody waits in another way than by get(): compute what get() would, so that it is set."""
+        """Call get() in a new thread if there is a get hook: a caller waits for the value without get()."""
         with self._lock:
             if self._hook_lock is None or self._hook_runs:
                 return
@@ -390,7 +391,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             self._open = None
 
     def overdue(self, timeout_s: float | None) -> pykka.Timeout:
-        """The error for who has waited so long in vain."""
+        """Return the error for a caller that has waited `timeout_s` seconds without a reply."""
         return pykka.Timeout(f"no reply after {timeout_s} seconds: {self._whose()}")
 
     def _whose(self) -> str:
@@ -401,15 +402,15 @@ class StopReply(Reply[bool]):
     """The future of a stop: True, or False if the actor was dead already."""
 
     def set(self, value: Any = None) -> None:
-        """It has ended."""
+        """Note that the actor has ended: set True."""
         super().set(True)
 
     def set_unopened(self, unpack: Any, *, raises: bool = False) -> None:
-        """It has ended, says its process."""
+        """Note that the actor has ended, as its process reports: set True."""
         super().set(True)
 
     def set_exception(self, exc_info: ExcInfo | BaseException | None = None) -> None:
-        """It was dead already, or could not be asked."""
+        """Set False if the actor was dead already or could not be asked; else set the exception."""
         error = error_of(exc_info)
         if isinstance(error, (ActorDeadError, ActorUnavailable)):
             super().set(False)
@@ -418,12 +419,12 @@ class StopReply(Reply[bool]):
 
 
 def fail(reply: pykka.Future[Any], error: BaseException) -> None:
-    """Set the exception that get() raises, with where it was raised so far."""
+    """Set the exception that get() raises, with its traceback so far."""
     reply.set_exception((type(error), error, error.__traceback__))
 
 
 def error_of(exc_info: ExcInfo | BaseException | None) -> BaseException:
-    """The exception that Future.set_exception(exc_info) means; the one being handled if None."""
+    """Return the exception that Future.set_exception(exc_info) means; if None, the one that is being handled."""
     if isinstance(exc_info, BaseException):
         return exc_info
     kind, error, traceback = exc_info or sys.exc_info()

@@ -1,4 +1,4 @@
-"""Mailbox: an actor's inbox. It schedules the actor when the first message comes, and lets control messages pass."""
+"""Mailbox: an actor's inbox. It schedules the actor when the first message comes; control messages overtake others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rr_actors.base.errors import MailboxFull, Unavailable
 
 
 class Envelope(PykkaEnvelope[Any]):
-    """A message, where to reply, and who is blocked until it is answered."""
+    """A message, the future for its reply, and the actors that are blocked until it is answered."""
 
     __slots__ = ["chain"]
 
@@ -29,9 +29,9 @@ class Envelope(PykkaEnvelope[Any]):
 
 
 class Notice(Envelope):
-    """A Down on its way to the actor that monitors. It has the control lane, and is dropped if not wanted any more.
+    """A Down on its way to the actor that monitors. It goes by the control lane.
 
-    `claim` is the Monitor that says whether it is.
+    `claim` is its Monitor: the actor drops the Down if the Monitor was cancelled.
     """
 
     __slots__ = ["claim"]
@@ -44,8 +44,8 @@ class Notice(Envelope):
 class Stop(PykkaStop):
     """Ask an actor to stop.
 
-    "normal" waits for its turn, as Pykka documents; "shutdown", its supervisor's word, overtakes what is queued.
-    `final`: it is not going to be started again.
+    "normal" waits for its turn, as Pykka documents; "shutdown", from its supervisor, overtakes queued messages.
+    `final`: the actor will not be started again.
     """
 
     reason: str
@@ -62,12 +62,12 @@ class Stop(PykkaStop):
 
 
 def is_stop(message: object) -> bool:
-    """Whether it asks the actor to stop: Stop, or what Pykka's own references and registry send."""
+    """Return whether the message asks the actor to stop: a Stop, or a stop of Pykka's own references or registry."""
     return isinstance(message, PykkaStop)
 
 
 class Ended(ActorDeadError):
-    """The actor `name` has ended. The name tells it from what a handler raised because another actor had."""
+    """The actor `name` has ended. A handler may raise this about another actor, so the name is kept."""
 
     def __init__(self, text: str, name: str = "") -> None:
         super().__init__(text)
@@ -75,15 +75,15 @@ class Ended(ActorDeadError):
 
 
 def has_ended(error: BaseException, name: str) -> bool:
-    """Whether `error` says of the actor `name`, to which a message was sent, that it is dead."""
+    """Return whether `error` says that the actor `name`, to which a message was sent, is dead."""
     if isinstance(error, Ended):
         return error.name == name
-    # What Pykka's own actors set when they end was never raised; what a handler lets through was.
+    # An error that an ending Pykka actor sets was never raised; an error from a handler was.
     return isinstance(error, ActorDeadError) and error.__traceback__ is None
 
 
 class Packed:
-    """A message as another process sent it; opened where the actor runs, never on the loop. `size` in bytes."""
+    """A pickled message, which is unpickled where its actor runs, never on the loop. `size` in bytes."""
 
     __slots__ = ("open", "size")
 
@@ -96,12 +96,12 @@ class Packed:
 
 
 class Mailbox:
-    """Messages of one actor, first in, first out. `schedule` is called when one comes and the actor is at rest.
+    """The messages of one actor, first in, first out. A message to an actor at rest calls `schedule`.
 
     Args:
-        owner: whose it is, for errors.
-        limit: how many messages it holds; stop messages and Downs are not counted.
-        opens_packed: whether Packed messages may be put into it: the actor handles them off the loop.
+        owner: the actor's name, for errors.
+        limit: the number of messages it can hold; the limit does not hold for stop messages and Downs.
+        opens_packed: whether it accepts Packed messages: the actor unpickles them off the loop.
     """
 
     def __init__(self, owner: str, limit: int, *, opens_packed: bool = False) -> None:
@@ -112,20 +112,20 @@ class Mailbox:
         self._messages: deque[PykkaEnvelope[Any]] = deque()
         self._control: deque[PykkaEnvelope[Any]] = deque()
         self._at_rest = False  # until the actor has started
-        self._due = False  # whether the actor was scheduled, and has not had that turn yet
+        self._due = False  # whether the actor was scheduled and has not begun that turn
         self._schedule: Callable[[bool], None] | None = None
         self._open = True
 
     def begin(self, schedule: Callable[[bool], None]) -> None:
-        """From now on the actor is awake. After rest() the next message calls schedule(urgent); stops are urgent."""
+        """Set `schedule`: after rest() the next message calls schedule(urgent); stops and Downs are urgent."""
         self._schedule = schedule
 
     def put(self, envelope: PykkaEnvelope[Any], /) -> None:
-        """Queue a message. A supervisor's stop and a Down overtake those that wait.
+        """Queue a message. A supervisor's stop and a Down overtake the queued messages.
 
         Raises:
             ActorDeadError: the actor has stopped.
-            MailboxFull: it holds `limit` messages, or there is no thread for the actor; it is not in the queue.
+            MailboxFull: `limit` messages are queued, or no thread is free for the actor; nothing was queued.
         """
         message = envelope.message
         notice = type(envelope) is Notice
@@ -142,7 +142,7 @@ class Mailbox:
                 lane.append(envelope)
                 queued = True
             if schedule is not None:
-                schedule(urgent)  # without the lock: the actor may run, and want it, before this returns
+                schedule(urgent)  # without the lock: the actor may need it before this returns
         except BaseException as error:
             if schedule is None or self._taken_back(lane, envelope, schedule, queued=queued):
                 raise
@@ -161,7 +161,7 @@ class Mailbox:
             )
 
     def take_turn(self) -> bool:
-        """The actor was scheduled: whether this is the turn it was scheduled for, and not the same once more."""
+        """Take the turn for which the actor was scheduled; return False if it was taken before."""
         with self._lock:
             due, self._due = self._due, False
         return due
@@ -174,7 +174,7 @@ class Mailbox:
         *,
         queued: bool,
     ) -> bool:
-        """The actor could not be scheduled, or not for sure. False: the message has been refused already, or taken."""
+        """Take a message back after an error of `schedule`; return False if it was refused or taken already."""
         with self._lock:
             if not self._due:
                 return False
@@ -187,26 +187,26 @@ class Mailbox:
                 self._due = False
                 return True
         try:
-            schedule(True)  # others have come meanwhile, and count on being handled
+            schedule(True)  # for messages that have come meanwhile
         except BaseException:
             with self._lock:
                 self._due = False
-                self._at_rest = True  # the next message is another chance for them
+                self._at_rest = True  # so that the next message schedules the actor for them
             raise
         return True
 
     def next(self) -> PykkaEnvelope[Any] | None:
-        """Take the next message; None if there is none."""
+        """Take the next message; None if the mailbox is empty."""
         try:
             return self._control.popleft() if self._control else self._messages.popleft()
         except IndexError:
             return None
 
     def get(self) -> PykkaEnvelope[Any]:
-        """Take the next message; Pykka's name for it.
+        """Take the next message, without waiting; Pykka calls this name.
 
         Raises:
-            LookupError: there is none. It never blocks.
+            LookupError: the mailbox is empty.
         """
         envelope = self.next()
         if envelope is None:
@@ -214,20 +214,20 @@ class Mailbox:
         return envelope
 
     def empty(self) -> bool:
-        """Whether there is no message."""
+        """Return whether the mailbox is empty."""
         return not self._messages and not self._control
 
     def rest(self) -> bool:
-        """The actor has nothing to do: True, and the next put() schedules it; False if a message came meanwhile."""
+        """Note that the actor rests, so that the next put() schedules it; return False if a message came meanwhile."""
         with self._lock:
             self._at_rest = not self._messages and not self._control
             return self._at_rest
 
     def close(self) -> list[PykkaEnvelope[Any]]:
-        """Refuse messages from now on; returns those that nobody will handle."""
+        """Refuse messages from now on, and return those that were not handled."""
         with self._lock:
             self._open = False
-            self._schedule = None  # it leads to the actor, which may go now
+            self._schedule = None  # it refers to the actor, whose memory may be freed now
             left = [*self._control, *self._messages]
             self._control.clear()
             self._messages.clear()
@@ -242,7 +242,7 @@ def _overtakes(stop: object) -> bool:
 
 
 def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
-    """The actor has ended and these were left: tell those who wait for a reply, and count the letters as dead."""
+    """Answer the messages that an ended actor has not handled, and record them as dead letters."""
     for envelope in envelopes:
         _refuse(envelope, name)
     letters = [envelope for envelope in envelopes if type(envelope) is not Notice and not is_stop(envelope.message)]
@@ -256,7 +256,7 @@ def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
 
 
 def _refuse(envelope: PykkaEnvelope[Any], name: str) -> None:
-    """One who asked it to stop has what it wanted."""
+    """Fail the reply that a message waits for; a stop message succeeds, as the actor has ended."""
     reply = envelope.reply_to
     if reply is None:
         return

@@ -1,1 +1,1 @@
-"""The same across processes: references, proxies and asks that travel."""
+"""Messages between processes: references, proxies and asks that travel."""

@@ -1,4 +1,4 @@
-"""ActorHub: how the actors of this process and those of others reach each other."""
+"""ActorHub: carries messages between the actors of this process and those of other processes."""
 
 from __future__ import annotations
 
@@ -33,35 +33,36 @@ from rr_actors.wire.unix_transport import UnixTransport
 ASK_TIMEOUT_S = 30.0
 
 WATCH_S = 1.0
-"""How long monitor() waits until the other process watches."""
+"""How long monitor() waits until the other process confirms the watch."""
 
 CUT_S = 1.0
-"""How long a process whose link is lost is given to be dead, before it is taken to live."""
+"""How long, after its link is lost, a process may take to die before it counts as alive."""
 
 ABANDONED = ExitReport("killed", "abandoned")
 
 _URN_OF_PATH = "urn:rr-actor:"
 
 running: dict[str, pykka.ActorRef[Any]] = {}
-"""The actors of rr_actors that run in this process, by URN. What is in here stays alive."""
+"""The actors of rr_actors that run in this process, by URN. An entry keeps its actor from being collected."""
 
 
 def urn_of_path(path: str) -> str:
-    """The URN of the actor at a path of the tree, the same after each respawn."""
+    """Return the URN of the actor at a path of the tree, which is the same after each respawn."""
     return _URN_OF_PATH + path
 
 
 class ActorHub:
-    """Knows this process's actors by path and URN, answers for them, and carries messages to those of other processes.
+    """Knows this process's actors by path and URN, answers for them, and carries messages to actors of other processes.
 
-    Its owner passes on the links of kind "actors" that the transport accepts: `accept` is made for that.
+    Its owner passes the links of kind "actors" that the transport accepts to `accept`.
 
     A method that looks for an actor or sends to it raises ActorDeadError if there is no such actor, ActorUnavailable if
-    it is being respawned, MailboxFull if too much waits for its process, NotSerializable if a message does not pickle.
+    it is being respawned, MailboxFull if too many messages wait for its process, NotSerializable if a message cannot be
+    pickled.
 
     Args:
-        transport: listens already, or will; its address is where other processes find this one's actors.
-        name: who this process is, for the other side's errors: "root/cameras".
+        transport: the transport at whose address other processes find this process's actors; it may listen later.
+        name: the name of this process, for errors on the other side: "root/cameras".
         ask_timeout_s: the time-out of an ask that has none of its own.
     """
 
@@ -89,10 +90,10 @@ class ActorHub:
     # -- the actors of this process ------------------------------------------------------------------------------------
 
     def add(self, path: str, ref: pykka.ActorRef[Any], *, once: bool = False) -> None:
-        """Let the directory say UP of the actor at `path`: it lives here, and is ready.
+        """Enter the actor at `path`, which is ready in this process, into the directory as UP.
 
         Args:
-            once: it is temporary: when it has ended, it is dead, and not on its way back.
+            once: the actor is temporary: when it has ended, it is not started again.
 
         Raises:
             ConfigError: the directory cannot be written.
@@ -101,9 +102,9 @@ class ActorHub:
         self._directory.publish(actor_key(path), self.address, once=once)
 
     def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport = ABANDONED) -> None:
-        """The actor at `path` has ended, or is abandoned. The directory is its supervisor's to change.
+        """Remove the actor at `path`, which has ended or is abandoned. Its supervisor changes the directory.
 
-        An abandoned one, stuck in a handler, is dead from now on for everybody else.
+        An abandoned actor is stuck in a handler; for all others it is dead from now on.
         """
         if self._hosted.get(path) is ref:
             del self._hosted[path]
@@ -115,7 +116,7 @@ class ActorHub:
         death_watch.ended(ref.actor_stopped, report)
 
     def local(self, urn: str) -> pykka.ActorRef[Any] | None:
-        """The actor with this URN, if it lives in this process."""
+        """Return the reference to the actor with this URN, if it lives in this process."""
         if (ref := running.get(urn)) is not None:
             return ref
         if urn.startswith(_URN_OF_PATH):
@@ -125,29 +126,29 @@ class ActorHub:
     # -- the actors of others ------------------------------------------------------------------------------------------
 
     def ask(self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain) -> Callable[[], None]:
-        """Send the message; `reply` will be set. Returns what to call when nobody waits for it any more."""
+        """Send the message; `reply` is set later. Return what to call when nobody waits for the reply any more."""
         body = pickling.dumps(message, f"message to {where.target.name}")
         return self._call(where, reply, lambda call: _letter(call, where, body, chain))
 
     def line_to(self, where: Whereabouts) -> Line | None:
-        """The line to the process that has the actor, if there is one yet."""
+        """Return the line to the actor's process, or None if there is no line yet."""
         return self._lines.get(self._locate(where))
 
     def has(self, line: Line) -> bool:
-        """Whether it is a line of this hub, and its link is not lost."""
+        """Return whether the line belongs to this hub and its link is not lost."""
         return self._lines.get(line.address) is line
 
     def ask_now(
         self, line: Line, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain, timeout_s: float | None
     ) -> bool:
-        """Send the message by a connection of the calling thread's own, and wait; `reply` has been set then.
+        """Send the message by a connection of the calling thread alone, and wait until `reply` is set.
 
-        False: not that way. There is no such connection now, what was sent before may still be on its way, or the actor
-        has moved. Nothing was taken.
+        Return False if this way is not open: no connection is free, earlier messages may still be in flight, or the
+        actor has moved. No actor got the message then.
 
         Raises:
-            TimeoutError: no reply in time.
-            NotSerializable: the message does not pickle, or is too long.
+            TimeoutError: no reply came in time.
+            NotSerializable: the message cannot be pickled, or is too long.
         """
         body = pickling.dumps(message, f"message to {where.target.name}")
         call = self._new_call(line, where, reply)
@@ -170,24 +171,24 @@ class ActorHub:
             return False
 
     def tell(self, where: Whereabouts, message: Any) -> None:
-        """Send the message. It is lost, and logged, if the actor ends before it is there."""
+        """Send the message. If the actor ends before it arrives, the message is lost, and logged."""
         body = pickling.dumps(message, f"message to {where.target.name}")
         self._line(self._locate(where)).put(Tell(where.target.urn, body))
 
     def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
-        """Ask about the actor: "alive", "class" or "attributes"."""
-        reply: Reply[Any] = Reply()  # of the process, not of the actor: it may be asked from the actor's own handler
+        """Ask the actor's process about the actor: "alive", "class" or "attributes"."""
+        reply: Reply[Any] = Reply()  # without a target: the process replies, so the actor's own handler may wait for it
         self._call(where, reply, lambda call: Inquire(call.number, where.target.urn, what))
         return reply
 
     def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
-        """Stop the actor; `reply` will be set when it has ended."""
+        """Send the actor a stop; `reply` is set when the actor has ended."""
         return self._call(where, reply, lambda call: Halt(call.number, where.target.urn, reason, final))
 
     def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
-        """Call fire(reason, detail), once, when the actor has ended; see Down. Returns what ends the watch.
+        """Call fire(reason, detail), as for a Down, once, when the actor has ended. Return what ends the watch.
 
-        Where waiting is allowed, it is watched when this returns, if its process has answered within WATCH_S.
+        Where waiting is allowed, this waits up to WATCH_S until the actor's process confirms the watch.
         """
         address = self._locate(where)
         pid = pid_of(address)
@@ -210,7 +211,7 @@ class ActorHub:
             except _Cut:
                 if pid is None or self._closed:
                     gone(False)
-                else:  # its sockets close a moment before it is dead
+                else:  # the sockets of a process close a moment before it is dead
                     self._dispatcher.workers.submit(lifeline.wait_gone, (pid,), CUT_S, done=gone, patient=True)
             except Exception as error:
                 fire("noproc", str(error))
@@ -227,17 +228,17 @@ class ActorHub:
         return lambda: line.call_off(number)
 
     def pid(self, where: Whereabouts) -> int | None:
-        """Return the process that the actor lives in; None if it is not up, or nobody can tell."""
+        """Return the id of the actor's process; None if the actor is not up, or the process is not known."""
         if where.path is None:
             return pid_of(where.address)
         entry = self._directory.lookup(actor_key(where.path))
         return None if entry is None or entry.status is not Status.UP else pid_of(entry.address)
 
     def kill(self, where: Whereabouts) -> bool:
-        """Kill the actor's process (SIGKILL); False if it is not up.
+        """Kill the actor's process (SIGKILL); return False if the actor is not up.
 
         Raises:
-            UsageError: it has no process of its own.
+            UsageError: the actor has no process of its own.
         """
         if where.path is None or "/" not in where.path or not self._has_own_process(where.path):
             raise UsageError(
@@ -255,7 +256,7 @@ class ActorHub:
         return mine is None or mine.status is not Status.UP or above is None or above.address != mine.address
 
     def missing(self, where: Whereabouts) -> ActorDeadError | ActorUnavailable:
-        """The error for an actor that is not where it should be: dead, or being respawned, as the directory says."""
+        """Return the error for an actor that was not found: dead or being respawned, by its entry in the directory."""
         name = where.target.name
         entry = None if where.path is None else self._directory.lookup(actor_key(where.path))
         if entry is None:
@@ -263,7 +264,7 @@ class ActorHub:
         match entry.status:
             case Status.UP if entry.once:
                 return ActorDeadError(f"{name} not found: it has ended, and is temporary: it is not started again")
-            case Status.UP:  # until the supervisor has seen to its end, or has finished stopping it
+            case Status.UP:  # the supervisor has not handled its end yet, or is still stopping it
                 return ActorUnavailable(
                     f"{name} is being started again, or is stopping; this reference works again if it comes back",
                     id=where.path,
@@ -276,7 +277,7 @@ class ActorHub:
                 return ActorDeadError(f"{name} not found: it is {entry.status.value}{entry.because}")
 
     def may_be_alive(self, where: Whereabouts) -> bool:
-        """Whether nothing speaks against it: all that can be said without asking."""
+        """Return False if the directory says that the actor is not up, else True; its process is not asked."""
         try:
             self._locate(where)
         except (ActorDeadError, ActorUnavailable):
@@ -284,7 +285,7 @@ class ActorHub:
         return True
 
     def close(self) -> None:
-        """Close every link of kind "actors"; open calls fail. On the loop."""
+        """Close all links of kind "actors"; open calls fail. On the loop."""
         self._closed = True
         with self._lock:
             lines = list(self._lines.values())
@@ -310,7 +311,7 @@ class ActorHub:
         else:
             entry = self._directory.lookup(actor_key(where.path))
             address = entry.address if entry is not None and entry.status is Status.UP else ""
-        if not address or address == self.address:  # here it would have been found
+        if not address or address == self.address:  # an actor of this process would have been found before
             raise self.missing(where)
         return address
 
@@ -348,15 +349,15 @@ def _letter(call: Call, where: Whereabouts, body: bytes, chain: Chain) -> Ask:
 
 
 class _Cut(Exception):
-    """The link to the process was lost, or could not be opened."""
+    """The link to the actor's process was lost, or could not be opened."""
 
 
-_hubs: dict[str, ActorHub] = {}  # by the first part of the paths they answer for: one for each System of the process
+_hubs: dict[str, ActorHub] = {}  # by the first part of the paths of their actors: one for each System of the process
 _stopped: set[str] = set()  # the first parts of the paths of Systems that ran in this process and have stopped
 
 
 def set_hub(hub: ActorHub | None) -> None:
-    """Make `hub` the process's own for the tree its name is in; references use it from then on. None: none is."""
+    """Set the hub of this process for the tree of its name; references use it from then on. None: remove all hubs."""
     if hub is None:
         _hubs.clear()
         _stopped.clear()
@@ -367,28 +368,28 @@ def set_hub(hub: ActorHub | None) -> None:
 
 
 def remove_hub(hub: ActorHub) -> bool:
-    """Take the hub out, if it is still in; whether it was."""
+    """Remove the hub if it is still set; return whether it was."""
     if _hubs.get(_top(hub.name)) is not hub:
         return False
     del _hubs[_top(hub.name)]
-    if hub.name == _top(hub.name):  # not that of a child, whose system may live on
+    if hub.name == _top(hub.name):  # not the hub of a child, whose system may live on
         _stopped.add(hub.name)
     return True
 
 
 def has_stopped(path: str | None) -> bool:
-    """Whether the System whose tree `path` is in ran in this process and has stopped, all its actors with it."""
+    """Return whether the System of `path` ran in this process and has stopped with all its actors."""
     return path is not None and _top(path) in _stopped
 
 
 def hub(path: str | None = None) -> ActorHub | None:
-    """The process's own hub for the tree that `path` is in; the newest if there is no such tree here, or no path."""
+    """Return this process's hub for the tree of `path`; the newest hub if there is no such tree here, or no path."""
     found = None if path is None else _hubs.get(_top(path))
     return found or next(reversed(_hubs.values()), None)
 
 
 def ask_timeout_s() -> float:
-    """The time-out, in seconds, of an ask that has none of its own."""
+    """Return the time-out, in seconds, of an ask that has none of its own."""
     process = hub()
     return ASK_TIMEOUT_S if process is None else process.ask_timeout_s
 

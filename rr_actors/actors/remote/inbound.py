@@ -1,4 +1,4 @@
-"""Visitor: another process that asks the actors of this one."""
+"""Visitor: the link of another process that sends letters to the actors of this one."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ Find = Callable[[str], "pykka.ActorRef[Any] | None"]
 
 
 class Visitor:
-    """Another process that asks this one's actors: takes its letters, and sends the answers back on the same link.
+    """Takes the letters of another process to this one's actors, and sends the answers back on the same link.
 
     Args:
-        find: the actor of this process with a URN.
+        find: returns the reference to the actor of this process with a URN, or None.
         forget: called with the link when it is lost.
     """
 
@@ -59,7 +59,7 @@ class Visitor:
         self._watches: dict[int, Callable[[], None]] = {}
 
     def received(self, link: Link, message: Letter) -> None:
-        """A letter for an actor, or about it."""
+        """Take a letter for an actor, or about it."""
         match message:
             case Ask(call, to, body, chain):
                 self._deliver(to, body, call, tuple(Target(*each) for each in chain))
@@ -68,7 +68,7 @@ class Visitor:
             case Inquire(call, to, what):
                 self._in_turn(to, call, self._inquire, call, to, what)
             case Halt(call, to, reason, final):
-                # Like a message: behind those before it. A supervisor's stop overtakes them, as it does in the mailbox.
+                # Like a message, after the earlier ones. A supervisor's stop overtakes them, as in the mailbox.
                 if reason == "shutdown" or _opens_packed(self._find(to)):
                     self._halt(call, to, reason, final)
                 else:
@@ -82,14 +82,14 @@ class Visitor:
                 link.close()
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """Nobody is there any more to answer to; what was asked is done all the same."""
+        """End the watches: no answer can be sent any more. Actors still handle the messages that have arrived."""
         self._forget(link)
         for unwatch in self._watches.values():
             unwatch()
         self._watches.clear()
 
     def answer(self, call: int, value: Any, name: str) -> None:
-        """The handler returned. From any thread; pickles in this one."""
+        """Send the value that a handler returned. From any thread, which pickles it."""
         try:
             body = pickling.dumps(value, f"reply of {name}")
         except Exception as error:
@@ -98,7 +98,7 @@ class Visitor:
             self.post(Answered(call, body))
 
     def raised(self, call: int, error: BaseException, name: str = "") -> None:
-        """The handler of the actor `name` raised, or it has ended. From any thread; pickles in this one."""
+        """Send the exception of a handler, or that the actor `name` has ended. From any thread, which pickles it."""
         if has_ended(error, name):
             self.post(Dead(call, taken=True))
             return
@@ -125,7 +125,7 @@ class Visitor:
                 self._link.send(letter)
             except NotSerializable as error:  # too long for a frame
                 self._link.send(Raised(letter.call, pickling.dumps(error), text_of(error), ""))
-        except RrError as error:  # an answer must not get lost while the link is not
+        except RrError as error:  # the asker would wait for ever: an answer may be lost only with its link
             logger.error("%s does not read its answers, and is cut off: %s", self._link.peer, error)
             self._link.close()
             return
@@ -144,7 +144,7 @@ class Visitor:
             return
         if _opens_packed(ref):
             self._put(ref, to, Packed(lambda: pickling.loads(body), len(body)), call, chain)
-        else:  # it would be opened on the loop, or by code that knows nothing of Packed
+        else:  # this actor would unpickle it on the loop, or does not know Packed
             self._in_turn(to, call, self._open_and_put, ref, to, body, call, chain)
 
     def _open_and_put(self, ref: pykka.ActorRef[Any], to: str, body: bytes, call: int | None, chain: Chain) -> None:
@@ -169,9 +169,9 @@ class Visitor:
             self._not_taken(to, call, error)
 
     def _in_turn(self, to: str, call: int | None, fn: Callable[..., None], *args: Any) -> None:
-        """Run fn in a worker, after what the other process asked for the same actor before."""
+        """Run fn in a worker, after all earlier calls of the other process for the same actor."""
         try:
-            self._dispatcher.workers.serial((self._link.peer, to), fn, *args)  # by whichever of its connections
+            self._dispatcher.workers.serial((self._link.peer, to), fn, *args)  # on all its connections
         except Unavailable as error:
             self._not_taken(to, call, error)
 
@@ -232,7 +232,7 @@ class Visitor:
 
 
 class Asker(Visitor):
-    """A thread of another process that asks one thing at a time, and waits: the thread with the answer writes it."""
+    """Takes one ask at a time from a waiting thread of another process; the thread that has the answer writes it."""
 
     def __init__(self, find: Find, dispatcher: Dispatcher, link: UnixLink, forget: Callable[[Link], None]) -> None:
         super().__init__(find, dispatcher, link, forget)
@@ -240,7 +240,7 @@ class Asker(Visitor):
         self._answering = link.answering
 
     def received(self, link: Link, message: Letter) -> None:
-        """A letter for an actor."""
+        """Take an ask of an actor."""
         if type(message) is Ask:
             super().received(link, message)
         else:
@@ -248,16 +248,16 @@ class Asker(Visitor):
             link.close()
 
     def post(self, letter: Outgoing) -> None:
-        """Send an answer. From any thread."""
+        """Send an answer, in the calling thread if possible. From any thread."""
         answer = self._answering(letter)
-        if answer is None:  # too long for a frame, say
+        if answer is None:  # such as an answer that is too long for a frame
             super().post(letter)
         else:
             answer()
 
 
 class Answer(pykka.Future[Any]):
-    """The future that a handler's result is set on when the asker is in another process. Nobody waits on it here."""
+    """The future for the result of a handler whose asker is in another process. No thread waits on it here."""
 
     def __init__(self, visitor: Visitor, call: int, name: str) -> None:
         super().__init__()
@@ -266,11 +266,11 @@ class Answer(pykka.Future[Any]):
         self._name = name
 
     def set(self, value: Any = None) -> None:
-        """Send the value."""
+        """Send the value to the asker."""
         self._visitor.answer(self._call, value, self._name)
 
     def set_exception(self, exc_info: ExcInfo | None = None) -> None:
-        """Send the exception."""
+        """Send the exception to the asker."""
         self._visitor.raised(self._call, error_of(exc_info), self._name)
 
 

@@ -1,9 +1,9 @@
-"""Line: this process's way to the actors of one other process: what waits to be sent, and which calls are open.
+"""Line: this process's way to the actors of one other process: the messages to send, and the open calls.
 
-Nothing is sent twice. When the link is lost, every open call fails; the caller decides whether to ask again.
+No message is sent twice. When the link is lost, every open call fails; the caller decides whether to ask again.
 
-A thread that asks and waits has a connection of its own (wire/thread_connections.py), unless what was sent by the link
-may still be on its way: nothing overtakes what was sent before it, to whichever actor of that process.
+A thread that asks and waits uses a connection of its own (wire/thread_connections.py), but not while messages on the
+link may still be in flight: no message overtakes an earlier one, to whichever actor of that process.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ _numbers = itertools.count(1)
 
 
 class Whereabouts(msgspec.Struct, frozen=True):
-    """How to find an actor.
+    """Where to find an actor.
 
     Attributes:
-        target: its URN and its name for people.
-        path: its path in the tree, if it is supervised; who has it, the directory says.
-        address: otherwise, the address of the process it lives in.
+        target: the actor's URN and its name for people.
+        path: its path in the tree, if it is supervised; the directory has the address of its process.
+        address: otherwise, the address of its process.
     """
 
     target: Target
@@ -72,8 +72,8 @@ class Call(msgspec.Struct, frozen=True):
 
     Attributes:
         missing: makes the error for an actor that is not there.
-        cut: makes the error for a link that is lost; by default `missing` does.
-        begun: called when the other process says that it watches.
+        cut: makes the error for a link that is lost; if None, `missing` does.
+        begun: called when the other process confirms the watch.
     """
 
     number: int
@@ -85,10 +85,10 @@ class Call(msgspec.Struct, frozen=True):
 
 
 class Line:
-    """The messages for one address. On the loop, but for what says otherwise.
+    """The messages for one address. Call its methods on the loop, except where they say otherwise.
 
     Args:
-        hello: what the link is opened with.
+        hello: the Hello with which the link is opened.
         forget: called with the line when its link is lost, before its calls fail.
     """
 
@@ -107,24 +107,24 @@ class Line:
         self._forget = forget
         self._waiting: deque[tuple[Letter, Call | None]] = deque()
         self._calls: dict[int, Call] = {}
-        self._turn = 0  # how often what waits has been looked at
+        self._turn = 0  # how often _pump() has run
         self._woken_for = -1  # the turn that the loop was last asked for
         self._link: Link | None = None
         self._peer = address
         self._connecting: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
         self._asks = ThreadConnections(self._dial)
-        self._lock = threading.RLock()  # of the next: a finalizer that tells may run in a thread that has it
-        self._unsettled: int | None = None  # the last that was put: the number of its call, 0 if it has no answer
-        self._left: set[BlockingLink] = set()  # on which something may be unread; meanwhile nothing is sent
+        self._lock = threading.RLock()  # for _unsettled; a finalizer that tells may run in the thread that holds it
+        self._unsettled: int | None = None  # the call number of the last letter, 0 if it has no answer
+        self._left: set[BlockingLink] = set()  # with letters that may be unread; until then the link sends nothing
 
     @staticmethod
     def next_number() -> int:
-        """A number for a call, of no other call of this process. From any thread."""
+        """Return a number that no other call of this process has. From any thread."""
         return next(_numbers)
 
     def put(self, letter: Letter, call: Call | None = None) -> None:
-        """Send the letter, after those before it; `call` is answered or fails later. From any thread.
+        """Send the letter after all earlier ones; `call` is answered or fails later. From any thread.
 
         Raises:
             MailboxFull: WAITING_LIMIT letters wait: the other process does not read.
@@ -144,22 +144,22 @@ class Line:
         turn = self._turn
         if woken_for != turn:
             self._dispatcher.call(self._pump)
-            self._woken_for = turn  # last: a thread that is interrupted before has the next ask for the turn
+            self._woken_for = turn  # last: if the thread is interrupted before this, the next one calls _pump()
 
     @property
     def may_ask(self) -> bool:
-        """Whether ask() is worth a try. From any thread."""
+        """Whether ask() may succeed: no earlier letter may be in flight. From any thread."""
         return self._unsettled is None and self._link is not None and not (self._left or self._dispatcher.closed)
 
     def ask(self, letter: Ask, timeout_s: float | None) -> Answered | Raised | Dead | None:
-        """Send the letter by a connection of the calling thread's own, and wait; None: not that way, nothing was sent.
+        """Send the letter by a connection of the calling thread alone, and wait; None if this is impossible now.
 
         From any thread that may block.
 
         Raises:
-            TimeoutError: no answer in time.
-            OSError: the connection is lost, the letter may have arrived.
-            NotSerializable: it is too long for a frame.
+            TimeoutError: no answer came in time.
+            OSError: the connection is lost; the letter may have arrived.
+            NotSerializable: the letter is too long for a frame.
         """
         began = time.monotonic()
         line = self._asks.take(timeout_s) if self.may_ask else None
@@ -179,25 +179,25 @@ class Line:
         except OSError:
             self._asks.drop(line)
             raise
-        except BaseException:  # KeyboardInterrupt, say
+        except BaseException:  # such as KeyboardInterrupt
             self._leave(line)
             raise
         self._asks.drop(line)
         raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of the answer")
 
     def give_up(self, number: int) -> None:
-        """Nobody waits for the answer any more. From any thread."""
+        """Forget a call whose answer nobody waits for any more. From any thread."""
         self._dispatcher.call(self._calls.pop, number, None)
 
     def call_off(self, number: int) -> None:
-        """The Watch with this number is not wanted any more. From any thread."""
+        """End the Watch with this number. From any thread."""
         try:
             self._dispatcher.call(self._call_off, number)
         except Unavailable:
             logger.debug("a watch was called off after the loop had ended")
 
     def close(self) -> None:
-        """Close the link; open calls fail."""
+        """Close the link, and fail the open calls."""
         if self._connecting is not None:
             self._connecting.cancel()
         if self._link is not None:
@@ -208,7 +208,7 @@ class Line:
     # -- Receiver ------------------------------------------------------------------------------------------------------
 
     def received(self, link: Link, message: Letter) -> None:
-        """An answer."""
+        """Take an answer from the other process."""
         if not isinstance(message, (Answered, Raised, Dead, Watching, Over)):
             logger.error("%s sent %s on a link that this process opened", link.peer, type(message).__name__)
             link.close()
@@ -239,7 +239,7 @@ class Line:
                 fail(call.reply, call.missing())
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """The other process is gone, or closed the link."""
+        """Fail the open calls: the other process has ended, or the link is closed."""
         self._link = None
         self._fail(reason)
 
@@ -266,7 +266,7 @@ class Line:
             letter, call = self._waiting[0]
             try:
                 link.send(letter)
-            except MailboxFull:  # by the link's measure, bytes; it tells nobody when there is room again
+            except MailboxFull:  # the link's limit is in bytes; it does not report when there is room again
                 if self._retry is None:
                     self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._try_again)
                 break
@@ -286,7 +286,7 @@ class Line:
         self._pump()
 
     def _attach(self, link: Link) -> Line:
-        self._link = link  # here, not after connect(): it may be lost before that returns
+        self._link = link  # here, not after connect(): the link may be lost before that returns
         self._peer = link.peer
         return self
 
@@ -308,7 +308,7 @@ class Line:
             self._retry.cancel()
             self._retry = None
         self._asks.close()
-        for line in list(self._left):  # to which threads add
+        for line in list(self._left):  # a copy: threads add to it
             self._close_line(line)
         calls = list(self._calls.values())
         self._calls.clear()
@@ -326,13 +326,13 @@ class Line:
             dead_letters.office.record(name, lost, f"lost with its process at {self.address}", unheard=len(lost))
 
     def cut_off(self, call: Call, reason: Exception | None) -> None:
-        """The link, or the connection, that the call went by is lost. From any thread."""
+        """Fail a call whose link or connection is lost. From any thread."""
         if call.cut is not None:
             error = call.cut()
         elif reason is None or isinstance(reason, Unavailable) or not isinstance(reason, RrError):
             error = call.missing()
             error.__cause__ = reason
-        else:  # the peer is there and refuses
+        else:  # the other process runs, and refuses
             error = reason
         fail(call.reply, error)
 
@@ -342,14 +342,14 @@ class Line:
         return self._transport.dial(self.address, msgspec.structs.replace(self._hello, kind=ASKS), timeout_s)
 
     def _leave(self, line: BlockingLink) -> None:
-        """Nobody waits for its answer any more; what is sent from now on comes after what was asked there."""
-        self._left.add(line)  # first: nothing is sent meanwhile
+        """Leave a connection with an answer to come; until the question on it has been read, send no later letters."""
+        self._left.add(line)  # first: from now on no letter is sent
         if not self._asks.take_out(line):
             self._left.discard(line)
             return
         try:
             self._dispatcher.call(self._await_end, line)
-        except Unavailable:  # nothing is sent from now on
+        except Unavailable:  # the loop has ended: no letter is sent any more
             self._left.discard(line)
             line.close()
 
@@ -374,7 +374,7 @@ class Line:
 
 
 def _reraise(raised: Raised, origin: str) -> Any:
-    """Raise what the handler raised; in the thread that asked, since its class may have to be imported."""
+    """Raise the exception of the handler, in the thread that asked: its class may have to be imported."""
     error: BaseException | None = None
     if raised.error:
         try:

@@ -1,4 +1,4 @@
-"""What the actors of two processes say to each other, on links of kind "actors".
+"""The messages between the actors of two processes, on links of kind "actors".
 
 The process that dialled sends Ask, Tell, Inquire, Halt, Watch and Unwatch; the other one answers with Answered, Raised,
 Dead, Watching or Over. Bodies are pickled (the channel is private and authenticated) and are opened in a worker, or in
@@ -12,14 +12,14 @@ from typing import Any
 import msgspec
 
 KIND = "actors"
-"""Hello.kind of these links."""
+"""The Hello.kind of these links."""
 
 ASKS = "asks"
-"""Hello.kind of those on which a thread asks: one Ask at a time, and its answer."""
+"""The Hello.kind of a thread's connection: one Ask at a time, and its answer."""
 
 
 class Ask(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """A message for the actor `to` (its URN); answer with this number. `chain`: who is blocked until then."""
+    """A message for the actor with the URN `to`; the answer has the number `call`. `chain`: the blocked askers."""
 
     call: int
     to: str
@@ -28,14 +28,14 @@ class Ask(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class Tell(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """A message for the actor `to`; no answer."""
+    """A message for the actor `to`, without an answer."""
 
     to: str
     body: bytes
 
 
 class Inquire(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """About the actor, not for it: "alive", "class" or "attributes"."""
+    """A question about the actor: "alive", "class" or "attributes"."""
 
     call: int
     to: str
@@ -43,7 +43,7 @@ class Inquire(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 
 class Halt(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """Stop the actor; answer when it has."""
+    """A stop for the actor; the answer comes when it has ended."""
 
     call: int
     to: str
@@ -59,7 +59,7 @@ class Answered(msgspec.Struct, frozen=True, array_like=True, tag=5):
 
 
 class Raised(msgspec.Struct, frozen=True, array_like=True, tag=6):
-    """The handler raised. `error`: the exception, pickled, or empty if it does not pickle; `text` names it anyway."""
+    """The handler raised. `error`: the pickled exception, or b"" if it cannot be pickled; `text` is its text."""
 
     call: int
     error: bytes
@@ -68,27 +68,27 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=6):
 
 
 class Dead(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """There is no such actor, or it stopped before it handled the message; `taken`: or ended while it handled it."""
+    """There is no such actor, or it ended before it handled the message; if `taken`, perhaps while it handled it."""
 
     call: int
     taken: bool = False
 
 
 class Watch(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """Say Watching, and Over when the actor `to` has ended; or Dead if it is not there."""
+    """A watch of the actor `to`; the answers: Watching, then Over when it has ended; or Dead if there is none."""
 
     call: int
     to: str
 
 
 class Unwatch(msgspec.Struct, frozen=True, array_like=True, tag=9):
-    """Forget the Watch with this number."""
+    """The end of the Watch with this number."""
 
     call: int
 
 
 class Over(msgspec.Struct, frozen=True, array_like=True, tag=10):
-    """The watched actor has ended, in this way."""
+    """The watched actor has ended, for this reason."""
 
     call: int
     reason: str
@@ -105,4 +105,4 @@ Letter = Ask | Tell | Inquire | Halt | Answered | Raised | Dead | Watch | Unwatc
 
 
 CODECS: dict[str, Any] = {KIND: Letter, ASKS: Letter}
-"""The messages of these links, for the transport."""
+"""The message type of each kind of these links, for the transport."""

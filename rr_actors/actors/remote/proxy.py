@@ -1,4 +1,4 @@
-"""Proxies: Pykka's ActorProxy for the actors of rr_actors. They travel, and have the operators that the object has.
+"""Proxies: Pykka's ActorProxy for the actors of rr_actors. They can be pickled, and have the operators of the object.
 
 A proxy of an actor in another process asks for the actor's attributes once, and again for a name it does not know.
 """
@@ -21,7 +21,7 @@ A = TypeVar("A", bound=pykka.Actor)
 
 AttrPath = tuple[str, ...]
 Attributes = dict[AttrPath, tuple[bool, bool]]
-"""For each path: whether it is callable, whether it is traversable. Operators are among them, as ("__len__",)."""
+"""For each path: whether it is callable, whether it is traversable. Operators are included, as ("__len__",)."""
 
 
 # -- operators ---------------------------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ def _enter(self: Any) -> Any:
 
 
 def _exit(self: Any, kind: Any, error: Any, _traceback: Any) -> Any:
-    return _ask(self, "__exit__", (kind, error, None))  # a traceback does not travel
+    return _ask(self, "__exit__", (kind, error, None))  # a traceback cannot be pickled
 
 
 def _call(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -70,26 +70,26 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "__exit__": _exit,
     "__call__": _call,
 }
-"""What a proxy has if the object has it. All but a call wait for the answer, as Python's operators do."""
+"""The operators that a proxy has if the object has them. All but a call wait for the answer, as in Python."""
 
 
 def operators_of(thing: object) -> frozenset[str]:
-    """Return those operators that the object has."""
+    """Return the operators that the object has, of those in OPERATORS."""
     return frozenset(name for name in OPERATORS if _has(type(thing), name))
 
 
 def _has(cls: type, name: str) -> bool:
-    for base in cls.__mro__:  # not getattr, which looks at the class's own class, too
+    for base in cls.__mro__:  # not getattr, which also looks at the metaclass
         if name in vars(base):
             return vars(base)[name] is not None
     return False
 
 
 def as_answer(actor: pykka.Actor, ref: pykka.ActorRef[Any], message: object, result: Any) -> Any:
-    """Return what the asker gets of an operator's result: the reference for the actor itself, a list for an iterator.
+    """Return an operator's result as the asker gets it: a reference for the actor itself, a list for an iterator.
 
     Args:
-        ref: leads to the actor from everywhere.
+        ref: the reference to the actor, for any process.
     """
     if isinstance(message, ProxyCall):
         match message.attr_path[-1]:
@@ -113,7 +113,7 @@ def _with_operators(cls: type[Any], operators: frozenset[str]) -> type[Any]:
 
 
 class _OwnProxy:
-    """Equals the proxies of one actor: what introspection hides among the actor's attributes."""
+    """Equals all proxies of one actor: introspection leaves out the attributes that are equal to it."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -144,19 +144,19 @@ def _at(thing: Any, path: AttrPath) -> Any:
 
 
 class _Stub:
-    """Stands for a part of an actor of another process, where Pykka wants to look at the actor itself."""
+    """Stands for a part of an actor of another process, for code of Pykka that looks at the actor itself."""
 
 
 class _Method(_Stub):
     def __call__(self) -> None:
-        """Only has to be there: callable() looks for it."""
+        """Exist only so that callable() returns True."""
 
 
 class Mirror(_Stub):
     """An object with the attributes of an actor of another process, for pykka.ActorProxy to look at.
 
     Args:
-        inquire: asks the actor's process; may raise ActorDeadError.
+        inquire: asks the actor's process for the attributes; may raise ActorDeadError.
     """
 
     def __init__(self, ref: pykka.ActorRef[Any], inquire: Callable[[], Attributes]) -> None:
@@ -164,7 +164,7 @@ class Mirror(_Stub):
         self._inquire = inquire
 
     def __dir__(self) -> list[str]:
-        """Look again: Pykka asks for this when it meets a name that it does not know."""
+        """Ask for the attributes again, and return their names: Pykka calls this for a name that it does not know."""
         self._copy()
         return list(vars(self))
 
@@ -190,7 +190,7 @@ class Mirror(_Stub):
 
 
 class _Proxy(pykka.ActorProxy[A]):
-    """Two are equal if they are of the same part of the same actor."""
+    """A proxy that equals another if both are of the same part of the same actor."""
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, pykka.ActorProxy):
@@ -217,10 +217,10 @@ class LocalProxy(_Proxy[A]):
 
 
 def local_proxy(ref: pykka.ActorRef[A], path: AttrPath = ()) -> pykka.ActorProxy[A]:
-    """Return the proxy of an actor of this process, or of the part of it that the path leads to.
+    """Return the proxy of an actor of this process, or of the part of it at `path`.
 
     Raises:
-        pykka.ActorDeadError: it has ended.
+        pykka.ActorDeadError: the actor has ended.
     """
     part = _at(ref._actor_weakref(), path)  # pyright: ignore[reportPrivateUsage]
     return _with_operators(LocalProxy, operators_of(part))(actor_ref=ref, attr_path=path)
@@ -230,12 +230,12 @@ class DistantProxy(_Proxy[A]):
     """Behaves as pykka.ActorProxy: methods give futures, attributes are read as futures and set at once.
 
     Args:
-        inquire: asks the actor's process for its attributes; may raise ActorDeadError. Where waiting is refused, in an
-            `async def` handler, what a name stands for shows when it is called, or awaited.
-        known: its attributes, if they are known; else it asks now, or, if `later`, when the first is wanted.
+        inquire: asks the actor's process for its attributes; may raise ActorDeadError. In an `async def` handler,
+            which must not wait, a name is taken as a method when it is called, as an attribute when it is awaited.
+        known: the attributes, if they are known; else the proxy asks now, or, if `later`, on first use.
     """
 
-    # An actor that keeps this proxy is introspected, too, and Pykka asks each attribute for these two.
+    # Pykka looks for these two names in each attribute of an actor, and an attribute may be this proxy.
     _pykka_traversable = False
     pykka_traversable = False
 
@@ -261,7 +261,7 @@ class DistantProxy(_Proxy[A]):
         self.__class__ = _with_operators(DistantProxy, frozenset(OPERATORS).intersection(mine))
 
     def __getattr__(self, name: str) -> Any:
-        """A method to call, a part to go into, or the future of an attribute's value."""
+        """Return a method to call, a proxy of a part, or the future of an attribute's value."""
         if name.startswith("_"):
             raise AttributeError(f"{self!r} has no attribute {name!r}: such names are private")
         path = (*self._attr_path, name)
@@ -279,7 +279,7 @@ class DistantProxy(_Proxy[A]):
         return self.actor_ref.ask(ProxyGetAttr(attr_path=path), block=False)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute of the actor, and wait until it is."""
+        """Set an attribute of the actor, and wait until it is set."""
         if name == "actor_ref" or name.startswith("_"):
             object.__setattr__(self, name, value)
         else:
@@ -305,18 +305,18 @@ def _reduce(proxy: Any) -> tuple[Any, ...]:
 
 
 def _arrive(ref: Any, attr_path: AttrPath, known: Attributes | None) -> pykka.ActorProxy[Any]:
-    """Make the proxy without asking anybody: this runs while a message is opened."""
+    """Make an unpickled proxy, without asking the actor: this runs while a message is opened."""
     inquire = getattr(ref, "attributes", None)
     if inquire is None:  # a copy, within its process, of the proxy of a plain Pykka actor
         return pykka.ActorProxy(actor_ref=ref, attr_path=attr_path)
     return DistantProxy(actor_ref=ref, inquire=inquire, attr_path=attr_path, known=known, later=True)
 
 
-copyreg.pickle(pykka.ActorProxy, _reduce)  # those that people make themselves, of a reference
+copyreg.pickle(pykka.ActorProxy, _reduce)  # for proxies that a user makes from a reference
 
 
 class _Unknown(CallableProxy[A]):
-    """Something of the actor that is a method if it is called, an attribute if awaited, a part if it has parts."""
+    """A name of the actor: a method if it is called, an attribute if it is awaited, a part if a name of it is used."""
 
     def __getattr__(self, name: str) -> _Unknown[A]:
         if name.startswith("_"):

@@ -1,6 +1,6 @@
-"""What stands in for the parts of an actor that is in another process: its mailbox, its stopped event, its reply.
+"""Stand-ins for the parts of an actor in another process: its mailbox, its stopped event, its reply.
 
-Pykka's own code takes a reference for those parts; DistantRef has these in their places, which go by messages.
+Pykka's own code gets these parts from a reference. A DistantRef has stand-ins for them, which send messages.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from rr_actors.actors.remote.peer import Whereabouts
 
 
 class DistantReply(Reply[Any]):
-    """The reply of an actor that may be respawned: when it dies first, the directory says what that means.
+    """The reply of an actor that may be respawned: if it dies first, its entry in the directory decides the error.
 
-    Pykka makes what map() and join() return by calling the class without arguments; that waits for no actor itself.
+    For map() and join(), Pykka calls the class without arguments; such a future itself waits for no actor.
     """
 
     def __init__(self, where: Whereabouts | None = None) -> None:
@@ -27,7 +27,7 @@ class DistantReply(Reply[Any]):
         self._where = where
 
     def set_exception(self, exc_info: ExcInfo | BaseException | None = None) -> None:
-        """Set the exception that get() raises."""
+        """Set the exception that get() raises; for a dead actor, the error from the directory."""
         error = error_of(exc_info)
         if self._where is not None and has_ended(error, self._where.target.name):
             error = as_directory_says(self._where, error)
@@ -35,19 +35,19 @@ class DistantReply(Reply[Any]):
 
 
 def as_directory_says(where: Whereabouts, dead: BaseException) -> BaseException:
-    """What is to be heard of an actor of which its last process says `dead`: it may be on its way back."""
+    """Return the error for an actor that its last process reported `dead`: it may be being respawned."""
     process = hub(where.path)
     return dead if where.path is None or process is None else process.missing(where)
 
 
 class DistantInbox:
-    """What DistantRef.actor_inbox is for an actor in another process."""
+    """The DistantRef.actor_inbox of an actor in another process."""
 
     def __init__(self, ref: pykka.ActorRef[Any]) -> None:
         self._ref = ref
 
     def put(self, envelope: PykkaEnvelope[Any], /) -> None:
-        """Send the envelope's message; its future is set when the reply comes."""
+        """Send the envelope's message; get() of its future returns the reply."""
         wanted = envelope.reply_to
         if wanted is None:
             self._ref.tell(envelope.message)
@@ -56,7 +56,7 @@ class DistantInbox:
         wanted.set_get_hook(lambda timeout: reply.get(timeout=timeout))
 
     def get(self) -> PykkaEnvelope[Any]:
-        """Not possible from here.
+        """Raise an error: another process's messages cannot be taken.
 
         Raises:
             LookupError: always.
@@ -64,16 +64,16 @@ class DistantInbox:
         raise LookupError(f"the mailbox of {self._ref} is in another process")
 
     def empty(self) -> bool:
-        """True: there is nothing to be had."""
+        """Return True: no message can be taken from here."""
         return True
 
 
 class DistantStopped:
-    """What DistantRef.actor_stopped is for an actor in another process."""
+    """The DistantRef.actor_stopped of an actor in another process."""
 
     def __init__(self, ref: pykka.ActorRef[Any]) -> None:
         self._ref = ref
 
     def is_set(self) -> bool:
-        """Whether the actor is not alive."""
+        """Return whether the actor is not alive."""
         return not self._ref.is_alive()
