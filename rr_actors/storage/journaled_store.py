@@ -120,7 +120,9 @@ class JournaledStore:
                 with self._lock:
                     segment, self._segment = self._segment, None
                     self._closed = True
-                if segment is not None:  # it is empty, or _fold() would have ended it
+                if segment is not None and segment.end.records:  # _fold() was interrupted, or a commit came behind it
+                    segment.close()
+                elif segment is not None:
                     segment.remove()
                 self._tables.close(erase=erase, settled=not self._pending)
 

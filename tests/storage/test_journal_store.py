@@ -310,6 +310,28 @@ def test_who_is_interrupted_while_he_folds_loses_nothing_that_was_committed(
     assert in_order(read_rows(path)) == [query("a"), query("c")]
 
 
+@pytest.mark.parametrize("interrupted", [True, False])
+def test_what_is_committed_and_not_folded_while_a_store_closes_is_there_at_the_next_opening(
+    path: Path, monkeypatch: pytest.MonkeyPatch, interrupted: bool
+) -> None:
+    """Ctrl-C ends the folding at its beginning; or another thread commits just behind the folding."""
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    fold = store._fold
+
+    def disturbed() -> None:
+        if interrupted:
+            raise KeyboardInterrupt
+        fold()
+        store.commit([Put(query("b"))])
+
+    monkeypatch.setattr(store, "_fold", disturbed)
+    with pytest.raises(KeyboardInterrupt) if interrupted else contextlib.nullcontext():
+        store.close()
+    with contextlib.closing(open_store(path)) as again:
+        assert content(again) == [query(id_) for id_ in ("a" if interrupted else "ab")]
+
+
 def test_an_interrupt_after_a_segment_is_begun_loses_nothing_that_is_committed_later(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
