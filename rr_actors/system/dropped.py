@@ -1,7 +1,7 @@
-"""Dropped: running systems that nothing refers to any more. They warn, as an open socket does, and are stopped.
+"""Dropped systems: they run, but nothing refers to them any more. They warn, as an open socket does, and are stopped.
 
-A system is dropped wherever the last reference to it goes, or wherever the garbage collector runs: nothing may wait
-there. So it is stopped by its loop, in the background.
+A system is dropped where its last reference goes, or where the garbage collector runs. Nothing may wait at such a
+point, so the system's loop stops the system in the background.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from rr_actors.runtime.event_loop import current
 logger = logging.getLogger("rr_actors")
 
 _stopping: dict[str, tuple[Future[None], float]] = {}
-"""Done when each has stopped, and how long that may take, by the real paths of the state directories."""
+"""The future that is done when a system has stopped, and its limit in seconds, by the real state directory."""
 
 
 def weakly(method: Callable[..., object]) -> Callable[..., None]:
-    """A callback that does not keep the method's object alive; without the object it does nothing."""
+    """Return a callback that does not keep the method's object alive; without the object it does nothing."""
     reference = weakref.WeakMethod(method)
 
     def call(*args: Any) -> None:
@@ -37,11 +37,11 @@ def weakly(method: Callable[..., object]) -> Callable[..., None]:
 
 
 def stop(what: str, state_dir: Path, dropped: object, stopping: Coroutine[Any, Any, None], limit_s: float) -> None:
-    """Warn that `what` was dropped, and run the coroutine `stopping` on the loop. Waits for nothing.
+    """Warn that `what` was dropped, and run the coroutine `stopping` on the loop. Do not wait for it.
 
     Args:
-        dropped: the object, for the warning.
-        limit_s: seconds that `stopping` may take. If the program exits meanwhile, it waits as long.
+        dropped: the dropped object, for the warning.
+        limit_s: seconds that `stopping` may take. A program that exits meanwhile waits for so long.
     """
     text = f"{what} was dropped without stop(): call stop(), or use it as a context manager"
     warnings.warn(text, ResourceWarning, source=dropped, stacklevel=3)
@@ -66,13 +66,13 @@ def stop(what: str, state_dir: Path, dropped: object, stopping: Coroutine[Any, A
 
 
 def wait_stopped(state_dir: Path, timeout_s: float) -> None:
-    """Wait until a system that was dropped has left that directory, at most so many seconds."""
+    """Wait until the dropped system of this state directory has stopped, at most `timeout_s` seconds."""
     if (stopping := _stopping.pop(str(state_dir), None)) is not None:
         concurrent.futures.wait(stopping[:1], timeout_s)
 
 
 def _wait_at_exit() -> None:
-    # Before the loop is closed: what it stops would be cancelled half way.
+    # This runs before the loop is closed, which would cancel the stops half way.
     for state_dir, (_, limit_s) in list(_stopping.items()):
         wait_stopped(Path(state_dir), limit_s)
 

@@ -1,4 +1,4 @@
-"""Subscribers: who hears, in a worker and in order, what happens in a system. And what the events are.
+"""Subscribers: callbacks that hear, in a worker and in order, what happens in a system; and the types of the events.
 
 docs/supervision.md lists the events for people.
 """
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class _ChildEvent(TypedDict):
-    """What a ChildEvent always has."""
+    """The keys that every ChildEvent has."""
 
     event: Literal[
         "started",
@@ -47,9 +47,9 @@ class _ChildEvent(TypedDict):
 class ChildEvent(_ChildEvent, total=False):
     """Something that happened to a child of a supervisor. A key whose value says nothing is left out.
 
-    The keys are the attributes of a record of `SupervisorRef.history()`. `path` is the child's, `at` the time
-    in seconds since the epoch. `state` is the child's from then on, None when it is forgotten. `reason` and `detail`
-    say why it ended.
+    The keys are the attributes of a record of `SupervisorRef.history()`. `path` is the child's path, `at` the
+    time in seconds since the epoch. `state` is the child's state after the event, or None if its supervisor forgets the
+    child. `reason` and `detail` say why it ended.
     """
 
     run: int
@@ -68,8 +68,8 @@ class ChildEvent(_ChildEvent, total=False):
 class ResourceEvent(TypedDict):
     """Something that happened to a resource.
 
-    `registrar` serves it, at the server of the id `server`. `detail` is the status ("FATAL unplugged"), or the error of
-    what failed, else "".
+    `registrar` is its provider, and `server` the id of its server. `detail` is the status ("FATAL unplugged"), the
+    error of a load or unload that failed, or else "".
     """
 
     event: Literal["loaded", "load_failed", "unloaded", "unload_failed", "status"]
@@ -112,21 +112,21 @@ class EndedEvent(TypedDict):
 
 
 class MissedEvent(TypedDict):
-    """This subscriber was too slow: here are `count` events missing. Others may have heard them."""
+    """A notice that this subscriber was too slow and has missed `count` events. Others may have heard them."""
 
     event: Literal["missed"]
     count: int
 
 
 Event = ChildEvent | ResourceEvent | ProgressEvent | DeadLetterEvent | EndedEvent | MissedEvent
-"""What a subscriber is called with. A type checker tells them apart by `event["event"]`."""
+"""The argument of a subscriber. A type checker tells the kinds apart by `event["event"]`."""
 
 Facts = dict[str, Any]
-"""An event on its way here: it may come from another process."""
+"""An event on its way to the subscribers: it may come from another process."""
 
 
 def kinds_for_all() -> list[str]:
-    """Return the kinds of events that everybody hears: all but "missed", which is one subscriber's own."""
+    """Return the kinds of events that every subscriber hears: all but "missed", which goes to one alone."""
     types = (ChildEvent, ResourceEvent, ProgressEvent, DeadLetterEvent, EndedEvent)
     return [kind for cls in types for kind in get_args(get_type_hints(cls)["event"])]
 
@@ -135,46 +135,46 @@ class Subscribers:
     """The subscribers of one system, also while it does not run. From any thread.
 
     Args:
-        system: its name, for logs.
+        system: the system's name, for logs.
     """
 
     def __init__(self, system: str) -> None:
         self._system = system
         self._callbacks: dict[int, tuple[str, Callable[..., Any]]] = {}
-        self._backlogs: dict[int, Backlog[Facts]] = {}  # on the loop, but for leave(): it has ended then
+        self._backlogs: dict[int, Backlog[Facts]] = {}  # filled on the loop; other threads only remove from it
         self._listeners: dict[int, Callable[[Facts], None]] = {}
         self._recorders: dict[int, Callable[[Facts], None]] = {}
         self._numbers = itertools.count(1)
         self._node: Node | None = None
-        self._saying = threading.Lock()  # whether there are any
+        self._saying = threading.Lock()  # held to say whether anybody listens
 
     def attend(self, node: Node) -> None:
-        """The system runs, and this is its own process's node: have its processes tell it, if anybody listens."""
+        """Take the node of the system's own process, and tell all processes whether anybody listens."""
         self._node = node
         self._say_whether_watched()
 
     def leave(self) -> None:
-        """The system has stopped, or this is a forked child: nobody hears any more."""
+        """Forget the node, so that nobody hears any more: the system has stopped, or this is a forked child."""
         self._node = None
         self._backlogs = {}
         self._saying = threading.Lock()  # another thread may have held it at the fork
 
     def add(self, callback: Callable[..., Any]) -> Callable[[], None]:
-        """Have the callback called for each event; returns what ends that.
+        """Have the callback called for each event, and return a function that ends the subscription.
 
         Raises:
-            UsageError: it cannot be called.
+            UsageError: the callback cannot be called.
         """
         if not callable(callback):
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
         return self._add(self._callbacks, (_name_of(callback), described(callback, "subscribe")))
 
     def listen(self, listener: Callable[[Facts], None]) -> Callable[[], None]:
-        """Have the package's own listener called on the loop, where it must be quick; returns what ends that."""
+        """Have a listener of the package called on the loop (it must be quick); return a function that ends that."""
         return self._add(self._listeners, listener)
 
     def record(self, recorder: Callable[[Facts], None]) -> Callable[[], None]:
-        """As listen(), and have the processes say what they send each other, in events called "recorded"."""
+        """Call the recorder as listen() does, and have the processes send their entries, as "recorded" events."""
         return self._add(self._recorders, recorder)
 
     def _add(self, those: dict[int, T], one: T) -> Callable[[], None]:
@@ -188,13 +188,13 @@ class Subscribers:
         try:
             those[number] = one
             self._say_whether_watched()
-        except BaseException:  # KeyboardInterrupt, say: nobody could end it
+        except BaseException:  # KeyboardInterrupt, for instance: nobody could end the subscription
             end()
             raise
         return end
 
     def tell(self, event: Facts) -> None:
-        """This has happened."""
+        """Pass an event to the recorders, listeners and subscribers, while the system runs."""
         node = self._node
         if node is None:
             return
@@ -208,7 +208,7 @@ class Subscribers:
             try:
                 self._backlog(node, number).put(event)
             except KeyError:
-                continue  # it has ended its subscription just now
+                continue  # the subscription has ended just now
             except RrError:
                 logger.exception("system %s: an event was not delivered", self._system)
 
@@ -225,7 +225,7 @@ class Subscribers:
         return callback(MissedEvent(event="missed", count=count))
 
     def _have_heard(self, hear: Callable[[Facts], None], event: Facts) -> None:
-        """A defect of what listens ends no registrar and no supervisor: they tell of what they have done."""
+        """Call a listener, and log what it raises: its defect must end no registrar and no supervisor."""
         try:
             hear(event)
         except Exception:
@@ -244,5 +244,5 @@ class Subscribers:
 def _name_of(callback: Callable[..., Any]) -> str:
     try:
         return exact_text(name_of(callback))
-    except Exception:  # of its own code
+    except Exception:  # raised by the callback's own code
         return shown(callback)

@@ -1,4 +1,4 @@
-"""The registrars of a system: how one is found or opened, and those that nobody has open now."""
+"""The registrars of a system: how to find and open one, and the dormant ones, which nobody has open now."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from rr_actors.storage.witness import Witness, tell_of_missing
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
 
-# The registrars of a running system, as those of one of its processes find and open them.
+# The registrars of a running system, found and opened from one of its processes.
 
 
 def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object) -> Registrar:
-    """Open a registrar in this process, and let others in. Not on the loop.
+    """Open a registrar in this process, and serve other processes. Not on the loop.
 
     Args:
-        owner: is not dropped while the registrar is open.
+        owner: an object that stays alive while the registrar is open.
 
     Raises:
-        NameTaken: there is one of this name, or will be.
+        NameTaken: the system has a registrar of this name, or will have one.
         ConfigError: `config` is no RegistrarConfig, or has another name.
         CatalogError: its catalog is locked, damaged or of another version.
     """
@@ -41,10 +41,10 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
 
 
 async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
-    """Open a registrar in this process, and let others in. On the loop.
+    """Open a registrar in this process, and serve other processes. On the loop.
 
     Raises:
-        NameTaken: there is one of this name, or will be.
+        NameTaken: the system has a registrar of this name, or will have one.
         CatalogError: its catalog is locked, damaged or of another version.
     """
     entry = node.find(name)
@@ -60,14 +60,14 @@ async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
 
 
 def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) -> Registrar:
-    """The registrar of this process, or a handle on that of another one.
+    """Return the registrar of this process, or a handle on a registrar of another process.
 
     Args:
-        patient: whether a handle waits for its registrar while that is being started or respawned.
-        owner: what a handle keeps alive.
+        patient: whether a handle waits while its registrar is being started or respawned.
+        owner: an object that the handle keeps alive.
 
     Raises:
-        UnknownRegistrar: there is none of this name.
+        UnknownRegistrar: the system has no registrar of this name.
     """
     check_name(name, "registrar name")
     actor = node.registrars.get(name)
@@ -79,7 +79,7 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
     return RegistrarHandle(node, name, patient=patient, owner=owner)
 
 
-# Dormant registrars: their process died, and nobody has opened them again. What they hold stays held meanwhile.
+# Dormant registrars: their process died, and nobody has opened them again. Their queries stay held meanwhile.
 
 _HELD: tuple[Table, ...] = ("held", "peers")
 
@@ -87,10 +87,10 @@ logger = logging.getLogger("rr_actors")
 
 
 def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
-    """The registrars with a catalog on disk that holds or serves something, or cannot be read. In a worker.
+    """Return the registrars whose catalog on disk holds or serves something, or cannot be read. In a worker.
 
     Args:
-        except_for: names of those that are about to be opened.
+        except_for: names of registrars that are about to be opened.
     """
     found: list[str] = []
     tell_of_missing(state_dir)
@@ -108,17 +108,17 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
 
 
 async def give_up_clients(node: Node, names: Iterable[str]) -> None:
-    """Give up those of these that clients of a killed application have left. On the loop."""
+    """Give up the registrars in `names` that clients of a killed application have left. On the loop."""
     for name in names:
         if name.startswith(CLIENTS):
             try:
                 await give_up(node, name)
-            except RrError as error:  # of one damaged catalog, say: the system starts all the same
+            except RrError as error:  # a damaged catalog, for instance: the system starts all the same
                 logger.warning("%s: what it holds is not released, and it stays dormant: %s", name, error)
 
 
 async def give_up(node: Node, name: str) -> None:
-    """Take what a dormant registrar holds out of its catalog, and have its providers release it. On the loop.
+    """Delete what a dormant registrar holds from its catalog, and have the providers release it. On the loop.
 
     Raises:
         CatalogError: its catalog cannot be opened.
@@ -128,7 +128,7 @@ async def give_up(node: Node, name: str) -> None:
 
 
 def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
-    """Take what a registrar holds that nobody has open out of its catalog. Blocks.
+    """Delete the queries and peers of a registrar that nobody has open from its catalog. Blocks.
 
     Raises:
         CatalogError: its catalog cannot be opened or written.

@@ -16,7 +16,7 @@ from rr_actors.wire.name_service import Status
 
 
 def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
-    """A supervisor and all below it: id, path, settings, and its children in the order of their start."""
+    """Return a supervisor and all below it: id, path, settings, and its children in the order of their start."""
     try:
         described = supervisor.describe()
     except RrError as error:
@@ -26,7 +26,7 @@ def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
 
 
 def _describe_child(above: str, child: dict[str, Any]) -> dict[str, Any]:
-    """A child as its supervisor describes it; if it is a supervisor that runs, with all below it."""
+    """Return a child as its supervisor describes it; a running supervisor, with all below it."""
     child["path"] = f"{above}/{child['id']}"
     if child["type"] == "supervisor" and child["state"] == "running":
         return describe_supervisor(SupervisorRef(child["path"])) | child
@@ -34,10 +34,10 @@ def _describe_child(above: str, child: dict[str, Any]) -> dict[str, Any]:
 
 
 def describe_at(place: SupervisorRef) -> dict[str, Any]:
-    """What is at a path of the tree: a supervisor and all below it, or another child, as its supervisor describes it.
+    """Return what is at a path: a supervisor and all below it, or another child as its supervisor describes it.
 
     Raises:
-        NotFound: nothing is.
+        NotFound: there is nothing at this path.
     """
     described = describe_supervisor(place)
     above, _, id = place.path.rpartition("/")
@@ -47,7 +47,7 @@ def describe_at(place: SupervisorRef) -> dict[str, Any]:
         children: list[dict[str, Any]] = SupervisorRef(above).describe()["children"]
     except NotFound:
         raise
-    except RrError:  # who could say more is not there either
+    except RrError:  # the supervisor above does not answer either
         return described
     for child in children:
         if child["id"] == id:
@@ -57,17 +57,17 @@ def describe_at(place: SupervisorRef) -> dict[str, Any]:
 
 
 def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
-    """The paths of all children of this id below a supervisor.
+    """Return the paths of all children of this id below a supervisor.
 
     Raises:
-        ActorUnavailable: a supervisor on the way is being respawned: what is below it cannot be told.
+        ActorUnavailable: a supervisor on the way is being respawned, so the children below it are not known.
     """
     ahead, paths = [supervisor], list[str]()
     while ahead:
         place = ahead.pop()
         try:
             children = place.which_children()
-        except NotFound:  # it is stopped, or has ended just now
+        except NotFound:  # the supervisor is stopped, or has ended just now
             continue
         paths += [f"{place.path}/{child.id}" for child in children if child.id == id]
         ahead += [SupervisorRef(f"{place.path}/{child.id}") for child in children if child.type == "supervisor"]
@@ -75,10 +75,10 @@ def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
 
 
 def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
-    """Every registrar of a system that is not gone, by its name: its state, and if it is up, what it has.
+    """Return every registrar that is not gone, by name: its state, and if it is up, its servers, resources and queries.
 
     Args:
-        node: of a process of the system.
+        node: the node of any process of the system.
     """
     described: dict[str, dict[str, Any]] = {}
     for name, status in node.statuses().items():
@@ -92,7 +92,7 @@ def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
 
 
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:
-    """A registrar: its servers, the resources it serves with their holders and dependencies, the queries it holds."""
+    """Return a registrar: its servers, its resources with their holders and dependencies, and the queries it holds."""
     queries = registrar.queries()
     resources = registrar.resources()
     depends: dict[str, list[str]] = {}

@@ -88,11 +88,11 @@ _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
 
 _systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
-"""Those of this process that run, by the real paths of their state directories."""
+"""The running systems of this process, by the real paths of their state directories."""
 
 
 class _Starting:
-    """A start that may be given up before there is anything to cancel, or while it goes on."""
+    """A start that can be given up, also before there is anything to cancel."""
 
     def __init__(self) -> None:
         self._course: Course[None] | None = None
@@ -100,14 +100,14 @@ class _Starting:
         self.succeeded = False
 
     def wait(self, course: Course[None]) -> None:
-        """Wait for what starts the tree."""
+        """Wait for the course that starts the tree, and end it if the start is given up already."""
         self._course = course
         if self._given_up:
             course.give_up()
         course.wait()
 
     def give_up(self) -> None:
-        """Have it end soon."""
+        """Have the start end soon."""
         self._given_up = True
         if (course := self._course) is not None:
             course.give_up()
@@ -147,8 +147,8 @@ class System:
         self.state_dir = state_path(state_dir)
         self.config = system_config(config)
         check_tree(self.root, self.root.id)
-        self._top = self.root.id  # what the paths of this tree begin with
-        self._lock = threading.RLock()  # of who starts or stops it
+        self._top = self.root.id  # the paths of this tree begin with it
+        self._lock = threading.RLock()  # held by the thread that starts or stops the system
         self._starting: _Starting | None = None
         self._stopping: Course[None] | None = None
         self._state: StateDir | None = None
@@ -158,7 +158,7 @@ class System:
         self._pages: list[WebPage] = []
         self._dispatcher: Dispatcher | None = None
         self._subscribers = Subscribers(self.name)
-        self._logs: Backlog[Facts] | None = None  # of this run; on the loop, but for its end
+        self._logs: Backlog[Facts] | None = None  # of this run; used on the loop, except at the end of the run
         self._counters = Counters()
         self._recordings = Recordings(self._subscribers.record, self._counters)
         self._dead_letters = Collection()
@@ -184,14 +184,14 @@ class System:
             shielded(functools.partial(self._start_now, starting), starting.give_up)
             return self
         except BaseException:
-            if starting.succeeded:  # interrupted after that: the caller never gets to stop it
+            if starting.succeeded:  # interrupted after the start: the caller cannot stop the system
                 self.stop()
             raise
 
-    __enter__ = start  # itself: between two calls an interrupt could lose a system that has started
+    __enter__ = start  # no method that calls it: an interrupt between the calls could lose a system that has started
 
     def _check_start(self) -> _Starting:
-        """In the calling thread, which may hold the import locks that another one would wait for."""
+        """Check that no import would block the start. In the calling thread, which may hold import locks itself."""
         start = f"system {self.name!r}: start()"
         check_no_child_imports(start)
         check_children_can_import(as_child_spec(self.root), self.root.id, start)
@@ -218,7 +218,7 @@ class System:
                 fork_safety.add(self, System._leave_to_parent)
                 starting.wait(dispatcher.course(self._start(info)))
             except BaseException as error:
-                steps = Steps()  # what failed first is what its caller has to know
+                steps = Steps()  # the caller must hear of the first failure
                 steps.take("giving back what it used", self._give_back)
                 steps.report(logger, f"system {self.name!r}: its start failed, and not everything is given back")
                 if isinstance(error, (OSError, MemoryError)) and (wanted := wanted_by(error)):
@@ -241,7 +241,7 @@ class System:
         return _systems.get(str(absolute_path(state_path(state_dir))))
 
     def __del__(self) -> None:
-        """Dropped while it runs: say so, and stop it in the background."""
+        """Warn that the system was dropped while it runs, and stop it in the background."""
         node: Node | None = getattr(self, "_node", None)  # __init__ may have raised
         if node is not None:
             what = f"system {self.name!r} in {self.state_dir}"
@@ -252,19 +252,19 @@ class System:
         try:
             await self._stop(node, self.config.stop_timeout_s)
         finally:
-            with contextlib.suppress(Unavailable):  # no worker is free: the loop does it
+            with contextlib.suppress(Unavailable):  # no worker is free: _give_back() closes them on the loop
                 await node.dispatcher.workers.run(self._recordings.close)  # it may wait for a disk
             self._give_back()
 
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
-        # Held weakly by what runs: a system that is dropped is to be noticed.
+        # The running parts hold the system weakly, so that a dropped system is noticed.
         node = Node(info, self._top, on_event=dropped.weakly(self._publish))
         self._node = node
         self._subscribers.attend(node)
         try:
             await node.start()
-        except Exception:  # there are no descriptors, say; one that is given up goes with its loop
+        except Exception:  # for instance no descriptors are left; after a cancelled start the node ends with its loop
             await node.close()
             raise
         if self._state is not None:
@@ -296,7 +296,7 @@ class System:
         starting = asyncio.ensure_future(tree.start((self.root,), {}, None))
         try:
             await asyncio.shield(starting)
-        except asyncio.CancelledError:  # its starter was interrupted: what has started is stopped again
+        except asyncio.CancelledError:  # the starting thread was interrupted: stop what has started
             await tree.stop(self.config.stop_timeout_s, final=False)
             await asyncio.wait((starting,))
             starting.exception()
@@ -305,7 +305,8 @@ class System:
     def stop(self, timeout_s: float | None = None) -> None:
         """Stop everything, in the reverse order of the start, and release everything held. A second stop does nothing.
 
-        An interrupted stop (Ctrl-C) kills the processes that have not stopped yet. In a forked child it does nothing.
+        An interrupted stop (Ctrl-C) kills the processes that have not stopped yet. In a forked child, stop() does
+        nothing.
 
         Args:
             timeout_s: seconds after which processes that have not stopped are killed. None: the config's
@@ -324,7 +325,7 @@ class System:
         if (running := self._node) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
             check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running, instead)
-        if (starting := self._starting) is not None:  # interrupted while it starts, say by a handler that calls this
+        if (starting := self._starting) is not None:  # it still starts: a signal handler calls stop(), for instance
             starting.give_up()
         return limit_s
 
@@ -341,7 +342,7 @@ class System:
             steps.end(f"system {self.name!r}: stopped, with errors")
 
     def _shut_down(self) -> None:
-        """Stop, in a thread of its own, as a console has asked for; then who waits for the system's end goes on."""
+        """Stop the system in a thread of its own, because a console asked for it; wait() and run() return then."""
         threading.Thread(target=self._stop_for_console, name="rr-shut-down").start()
 
     def _stop_for_console(self) -> None:
@@ -364,7 +365,7 @@ class System:
             console.refuse_commands()
         try:
             await self._wind_up(node, limit_s, steps)
-        except asyncio.CancelledError:  # the one that stops it was interrupted
+        except asyncio.CancelledError:  # the thread that stops the system was interrupted
             await self._wind_up(node, 0.0, steps)
             raise
         finally:
@@ -404,7 +405,7 @@ class System:
         steps.end(f"system {self.name!r}: not everything is given back")
 
     def _leave_to_parent(self) -> object:
-        """In a forked child: see fork_safety.py."""
+        """Forget all that runs, in a forked child, and return it for fork_safety.py to keep: it is the parent's."""
         left = (self._node, self._tree, self._console, self._dispatcher, self._state, self._pages)
         for page in self._pages:
             page.forget()
@@ -432,29 +433,29 @@ class System:
         self.stop()
 
     async def __aenter__(self) -> Self:
-        """Start it as start() does, and hold up no event loop; cancelled, the start is given up."""
+        """Start the system as start() does, without blocking the event loop; if cancelled, give the start up."""
         starting = self._check_start()
         await _in_thread(functools.partial(self._start_now, starting), starting.give_up)
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        """Stop it as stop() does, and hold up no event loop; cancelled, it kills what has not stopped yet."""
+        """Stop the system as stop() does, without blocking the event loop; if cancelled, kill what still runs."""
         await _in_thread(functools.partial(self._stop_now, self._check_stop(None)), self._stop_at_once)
 
     def run(self) -> signal.Signals | None:
-        """Start, unless it runs already; wait for SIGTERM or Ctrl-C (SIGINT), or for the end of the tree; then stop.
+        """Start the system unless it runs; wait for SIGTERM, Ctrl-C (SIGINT) or the end of the tree; then stop it.
 
-        The way for a service and for a container, where the program is process 1 and SIGTERM does nothing by default.
-        A second signal kills what has not stopped yet. Only the main thread can call it; while it runs the two signals
-        are its own.
+        Use it for a service or a container, where the program is process 1 and SIGTERM does nothing by default.
+        A second signal kills what has not stopped yet. Only the main thread can call run(), and run() replaces the
+        handlers of both signals meanwhile.
 
         Returns:
-            The signal that ended it. None: the tree has ended by itself, in order.
+            The signal that ended it; or None, if the tree ended by itself in order, or a console shut the system down.
 
         Raises:
-            What start() and stop() raise.
-            SupervisionError: the tree has ended by itself, and not in order; `__cause__` is what ended it.
-            UsageError: another thread than the main one calls it.
+            The errors of start() and stop().
+            SupervisionError: the tree ended by itself, and not in order; `__cause__` is the error that ended it.
+            UsageError: a thread other than the main one calls it.
         """
         with Termination(f"system {self.name!r}: run()", self._stop_at_once) as termination:
             try:
@@ -462,7 +463,7 @@ class System:
                 if self._node is None:
                     self.start()
                 while not self._ended.wait(_LOOK_S):
-                    pass  # a signal that another thread has got interrupts no wait of this one
+                    pass  # a signal that another thread gets does not interrupt this wait
             except Told:
                 logger.info("system %s: stops, as it got a %s", self.name, termination.told)
             finally:
@@ -486,7 +487,7 @@ class System:
         """Wait until the tree ends by itself (restart intensity, auto_shutdown), or a console shuts the system down.
 
         Returns:
-            Whether one of them has happened.
+            Whether the tree ended or the system was shut down.
 
         Raises:
             UsageError: timeout_s is no number of seconds.
@@ -495,12 +496,12 @@ class System:
 
     @property
     def ended(self) -> ExitReport | None:
-        """The report of how the tree ended by itself; None while it runs."""
+        """The report of how the tree ended by itself, or was shut down by a console; None if neither has happened."""
         return self._end
 
     def _tree_ended(self, report: ExitReport) -> None:
         self._end = report
-        if self._node is not None:  # who waits for any of it hears so
+        if self._node is not None:  # the threads that wait for a part of it hear of its end
             node = self._node
             why = report.detail or report.reason
             node.directory.mark(actor_key(self._top), Status.GONE, why)
@@ -520,7 +521,7 @@ class System:
     # -- registrars ----------------------------------------------------------------------------------------------
 
     def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar:
-        """Open a registrar of this process, to consume resources, to provide them, or both. It continues its catalog.
+        """Open a registrar in this process, to consume or provide resources, or both. It continues its catalog.
 
         Raises:
             InvalidName: the name has characters that no name may have, or begins with "client.".
@@ -545,7 +546,7 @@ class System:
         return registrar_in(self._running(), name, patient=True, owner=self)
 
     def dormant(self) -> list[str]:
-        """Return the registrars that hold or serve something, whose process died and which nobody has opened again."""
+        """Return the registrars that hold or serve something, whose process died, and that nobody has opened again."""
         return [name for name, status in self._running().statuses().items() if status is Status.DORMANT]
 
     def release(self, name: str) -> None:
@@ -566,7 +567,7 @@ class System:
     def ref(self, id: str) -> ActorRef[Any]:
         """Return a reference to a child actor anywhere in the tree, by its id or its path ("inner/a").
 
-        An id is looked for under the root supervisor first, then below. If several children have it, use a path.
+        An id is searched for under the root supervisor first, then below. If several children have it, use a path.
 
         Raises:
             NotFound: no child has this id, or several have it. The error has their paths.
@@ -589,7 +590,7 @@ class System:
         """Return a supervisor by its path of ids, "root/inner" or "inner"; without a path, the root supervisor.
 
         Raises:
-            NotFound: there is no such supervisor, or it is gone. `.known` has those that exist. Later calls on it raise
+            NotFound: there is no such supervisor, or it is gone. `.known` has the others. Later calls on it raise
                 this too, and ActorUnavailable while it is being respawned.
         """
         directory = self._running().directory
@@ -626,18 +627,18 @@ class System:
         return Tree(describe_at(self._supervisor_ref(path)))
 
     def dead_letters(self) -> DeadLetters:
-        """Return the messages that reached nobody since the system started: their number, and the newest 1000.
+        """Return the dead letters since the start, messages that reached nobody: their number, and the newest 1000.
 
-        It has all messages of this process, and at most 100 a second of each other process.
+        They include all messages of this process, and at most 100 a second of each other process.
         """
         return self._dead_letters.all()
 
     def subscribe(self, callback: Callable[[Event], Any] | Callable[[dict[str, Any]], Any]) -> Callable[[], None]:
         """Call `callback(event)` in a worker, in order, for each event of the whole system.
 
-        An event is a dict: an rr.ChildEvent, rr.ResourceEvent, rr.DeadLetterEvent or rr.EndedEvent. "event" is its kind
-        ("started", "loaded" ...); docs/supervision.md lists them. The rest says where ("path", or "registrar", "server"
-        and "resource_id") and how.
+        An event is a dict: an rr.ChildEvent, rr.ResourceEvent, rr.ProgressEvent, rr.DeadLetterEvent, rr.EndedEvent or
+        rr.MissedEvent. "event" is its kind ("started", "loaded" ...); docs/supervision.md lists them. The other keys
+        say where ("path", or "registrar", "server" and "resource_id") and how.
 
         Returns:
             A function that ends the subscription.
@@ -647,18 +648,18 @@ class System:
     def serve_web(self, *, host: str = "127.0.0.1", port: int = 0) -> WebPage:
         """Serve a live web page of this system, from a process of its own that ends with the system.
 
-        It needs the extra `web`. docs/console.md shows the page, docs/security.md says who may open it.
+        It needs the extra `web`. docs/console.md shows the page, docs/security.md says who can open it.
 
         Args:
-            host: the address to listen at. Every program that can reach it and has the page's URL can drive the system.
-            port: 0 for a free one.
+            host: the address to listen at. Every program that reaches it and has the page's URL can drive the system.
+            port: the port to listen at; 0 takes a free one.
 
         Returns:
             The page: its `.url`, and `.stop()`.
 
         Raises:
             UsageError: the system does not run or has no console, the library nicegui is not installed, or `host` or
-                `port` is none.
+                `port` is not valid.
             Unavailable: the page did not start; the error output says why.
         """
         check_may_block("System.serve_web()")
@@ -682,30 +683,30 @@ class System:
     def record(self, file: str | os.PathLike[str] | None = None, *, limit: int = RECORDING_LIMIT) -> Recording:
         """Begin to record what happens: events, exits, callbacks, and the messages between registrars.
 
-        Use it as a context manager, or call its stop(). While nobody records, nothing is paid for it; docs/recording.md
-        says what it costs while somebody does. It ends with the system, too.
+        Use it as a context manager, or call its stop(). It ends with the system, too. Only a recording in progress has
+        a cost, which docs/recording.md gives.
 
         Args:
-            file: write it to a new file, which is not bounded; without, it is in memory. A thread writes it: what a
-                slow disk has no room for is missed.
-            limit: how many entries are kept in memory; the oldest go first.
+            file: a new file to write it to, without a bound; None: it is in memory. A thread writes the file, and
+                misses entries if the disk is too slow.
+            limit: how many entries are kept in memory; the oldest are dropped first.
 
         Raises:
             UsageError: the system does not run, or limit is no whole number above 0.
-            ConfigError: the file is there already, or cannot be made.
+            ConfigError: the file exists already, or cannot be created.
         """
         self._running()
         recording = Recording(self.name, limit=limit, path=None if file is None else Path(file))
         begin(recording, self._recordings)
-        if self._node is None:  # it was stopped meanwhile
+        if self._node is None:  # the system was stopped meanwhile
             recording.stop()
             self._running()
         return recording
 
     def figures(self) -> list[Figure]:
-        """Return what the system is measured by: children, restarts, registrars, mailboxes, commits, dead letters.
+        """Return the figures of the system: children, restarts, registrars, mailboxes, commits, dead letters.
 
-        During recordings it also counts loads, their time, and exits. rr_actors.system.recording.figures has
+        During recordings, loads, their time, and exits are also counted. rr_actors.system.recording.figures has
         prometheus_text() for them, rr_actors.system.recording.otel_export has register_metrics().
         """
         node = self._running()
@@ -713,7 +714,7 @@ class System:
         for name, status in node.statuses().items():
             try:
                 stats[name] = registrar_in(node, name, patient=False).stats() if status is Status.UP else {}
-            except RrError:  # it has ended just now
+            except RrError:  # the registrar has ended just now
                 stats[name] = {}
         tree = describe_supervisor(self.supervisor())
         return [*figures_of(tree, stats, self.dead_letters().count), *self._counters.figures()]
@@ -751,7 +752,7 @@ def _say_log_lost(error: BaseException, event: Facts | None) -> None:
 
 
 async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:
-    """Run fn() in a thread until it has ended; cancelled, have it end soon."""
+    """Run fn() in a thread until it has ended; if cancelled, call give_up(), and wait for the end."""
     running = asyncio.ensure_future(asyncio.to_thread(fn))
     try:
         await asyncio.shield(running)
@@ -759,12 +760,12 @@ async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) ->
         give_up()
         await asyncio.wait((running,))
         if not running.cancelled():
-            running.exception()  # that it was given up, mostly
+            running.exception()  # retrieved: mostly it says that fn() was given up
         raise
 
 
 def _free_top(id: str) -> str:
-    """The root's id, or "root.2" while another system of this process has it: paths lead to one actor only."""
+    """Return the root's id, or "root.2" while another system of this process has it: a path leads to one actor only."""
     number = 1
     top = id
     while (other := hub(top)) is not None and other.name == top:
@@ -773,23 +774,23 @@ def _free_top(id: str) -> str:
     return top
 
 
-# Trees: what a system is to run, a Supervisor and all below it, checked before anything of it is started.
+# Trees: a Supervisor and all below it, checked before the system starts any of it.
 
 
 def root_of(root: object) -> Supervisor:
-    """The root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists.
+    """Return the root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists.
 
     Raises:
-        InvalidSpec: it is neither.
+        InvalidSpec: `root` is no Supervisor and no list of children.
     """
     return cast("Supervisor", root) if is_a(root, Supervisor) else Supervisor(_children(root))
 
 
 def check_tree(supervisor: Supervisor, path: str) -> None:
-    """That every child can be hosted, and that no two managers would have the same registrar, or a client's.
+    """Check that every child can be hosted, and that no two managers would have the same registrar, or a client's.
 
     Raises:
-        InvalidSpec: naming the child and the field.
+        InvalidSpec: a check fails; the error names the child and the field.
     """
     for spec in supervisor.child_specs:
         inner = spec.actor_class_or_manager
@@ -815,6 +816,6 @@ def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
 
 def _each_child(root: object) -> Iterator[ChildSpec | Supervisor]:
     for child in cast("Sequence[ChildSpec | Supervisor]", root):
-        if not is_a(child, (ChildSpec, Supervisor)):  # before the next: there may be a thousand million of them
+        if not is_a(child, (ChildSpec, Supervisor)):  # checked before the next: there may be a thousand million
             raise invalid("System", "root", "ChildSpecs and Supervisors", child)
         yield child

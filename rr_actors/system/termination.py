@@ -14,20 +14,20 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class Told(BaseException):
-    """A signal has come: raised in the main thread, out of what it waits for."""
+    """Raised in the main thread by the first signal, out of the call that waits."""
 
 
 class Termination:
-    """The time in which SIGTERM and SIGINT mean: stop in order. A context manager, for the main thread.
+    """A context manager for the main thread. Within it, SIGTERM and SIGINT mean: stop in order.
 
-    The first signal raises Told, once, while `awaited` is true. Each further one calls `hurry`. A process with id 1 has
-    no default action for SIGTERM: without a handler the signal does nothing there.
+    The first signal raises Told, if `awaited` is true. Each further signal calls `hurry`. A process with id 1 has no
+    default action for SIGTERM: without a handler the signal does nothing to it.
 
     Args:
-        hurry: makes a stop that goes on end soon.
+        hurry: makes a stop that is in progress end soon.
 
     Raises:
-        UsageError: another thread than the main one enters it.
+        UsageError: a thread other than the main one enters it.
     """
 
     def __init__(self, what: str, hurry: Callable[[], object]) -> None:

@@ -13,9 +13,9 @@ from rr_actors.base.errors import Unavailable
 from rr_actors.runtime.processes.lifeline import kill_group
 
 _LIBRARIES = ("nicegui", "typer", "rich")
-"""What the program needs. They are looked for and not imported here: only the page's process needs them."""
+"""The libraries of the program. They are looked for and not imported here: only the page's process needs them."""
 _START_S = 60.0
-"""How long the page may take until it can be opened: a machine that is busy imports slowly."""
+"""Seconds that the page may take until it can be opened: a busy machine imports slowly."""
 
 
 class WebPage:
@@ -44,7 +44,7 @@ class WebPage:
             raise
 
     def stop(self) -> None:
-        """End the page's process at once. Browsers that show the page say that they have lost it. Again is nothing."""
+        """End the page's process at once. Browsers say that they have lost the page. A second stop does nothing."""
         program = self._program
         if program.returncode is None:
             kill_group(program.pid)
@@ -52,7 +52,7 @@ class WebPage:
         self._close_pipes()
 
     def forget(self) -> None:
-        """Leave it to the parent: this is a fork of the process that serves it."""
+        """Leave the page to the parent: this is a fork of the process that serves it."""
         self._close_pipes()
         self._program.returncode = 0
 
@@ -71,7 +71,7 @@ class WebPage:
         return f"<WebPage {'stopped' if self._program.returncode is not None else self.url.partition('?')[0]}>"
 
     def _address(self) -> str:
-        """What the program prints when it can be opened."""
+        """Return the address that the program prints when the page can be opened."""
         output = self._program.stdout
         assert output is not None
         poll = select.poll()

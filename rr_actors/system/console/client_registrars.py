@@ -1,8 +1,8 @@
 """Registrars of clients: opened in the application's process for another process, as long as that is connected.
 
-Each belongs to one connection. The kernel closes that when the client ends, however it ends; then the registrar is
-closed, and what it held is released. In the system it is called "client.NAME". One that a killed application left
-behind is given up at the system's next start.
+Each belongs to one connection. The kernel closes the connection when the client ends, however it ends. Then the
+registrar is closed, and its queries are released. In the system it is called "client.NAME". The system's next start
+gives up those that a killed application left.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from rr_actors.system.registrar_lookup import open_registrar
 
 logger = logging.getLogger("rr_actors")
 
-_ROOM_BYTES = 1024  # of an answer, for what is not the response
+_ROOM_BYTES = 1024  # of an answer, for everything but the response
 
 
 class ClientRegistrars:
-    """Those of one system. In workers."""
+    """The clients' registrars of one system. In workers."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: dict[str, tuple[object, Registrar]] = {}
 
     def open(self, view: View, name: str, owner: object) -> Done:
-        """Open one for a connection.
+        """Open a registrar for a connection.
 
         Raises:
-            InvalidName, NameTaken: the name is none, or another client has it.
+            InvalidName, NameTaken: the name is not valid, or another client has it.
         """
         full = CLIENTS + check_name(name, "registrar name")
         system = view.system
@@ -55,7 +55,7 @@ class ClientRegistrars:
         return Done(f"opened registrar {full}", {"registrar": full})
 
     def close(self, owner: object) -> None:
-        """Close those of a connection that has ended, and release what they hold."""
+        """Close the registrars of a connection that has ended, and release what they hold."""
         with self._lock:
             mine = [name for name, (other, _) in self._open.items() if other is owner]
             closing = [self._open.pop(name)[1] for name in mine]
@@ -63,16 +63,16 @@ class ClientRegistrars:
             try:
                 registrar.close()
                 logger.info("registrar %s: closed, as its client has gone", registrar.name)
-            except Exception:  # of a provider, or a defect: the others are closed all the same
+            except Exception:  # a provider's error, or a defect: go on with the others
                 logger.exception(
                     "registrar %s: its client has gone, and not all that it held is released", registrar.name
                 )
 
     def hold(self, command: Hold, is_gone: Callable[[], bool]) -> Holding:
-        """Load; what a client has asked for that does not wait any more is released again.
+        """Load a resource for a client; release it again if the client does not wait any more.
 
         Raises:
-            RrError: as Registrar.load.
+            RrError: as Registrar.load(), or the response is too long.
         """
         registrar = self._of(command.registrar)
         query, response = load_bytes(registrar, command.server, command.request, command.timeout_s)
@@ -85,10 +85,10 @@ class ClientRegistrars:
         return Holding(query.id, query.resource_id, response)
 
     def release(self, command: Release) -> Done:
-        """Unload.
+        """Release a query of a client's registrar.
 
         Raises:
-            RrError: as Registrar.unload.
+            RrError: as Registrar.unload().
         """
         self._of(command.registrar).unload(command.query_id, timeout_s=command.timeout_s)
         return Done(f"released {command.query_id}")
@@ -104,10 +104,10 @@ class ClientRegistrars:
 
 
 def ask(system: Viewed, command: AskActor) -> Replied:
-    """Ask an actor.
+    """Ask an actor of the system, and return its answer.
 
     Raises:
-        RrError: there is none, it does not answer, its handler raised, or its answer is no plain data.
+        RrError: there is no such actor, it does not answer, its handler raised, or its answer is no plain data.
     """
     message = _plain.decode(command.message, command.actor, "message")
     reply = system.ref(command.actor).ask(message, block=False)
@@ -117,7 +117,7 @@ def ask(system: Viewed, command: AskActor) -> Replied:
         reply.cancel()
         text = f"{command.actor}: it has not answered within {command.timeout_s:g} s; a later answer reaches nobody"
         raise Unavailable(text) from late
-    if error is not None and not isinstance(error, RrError):  # of its handler
+    if error is not None and not isinstance(error, RrError):  # raised by the actor's handler
         raise RrError(f"{command.actor}: {text_of(error)}") from error
     return Replied(encode(reply.get(), f"answer of {command.actor}"))
 

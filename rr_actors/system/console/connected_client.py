@@ -1,7 +1,7 @@
 """connect(): a client of a running system, for any other process of the same user: a worker of a pool, a notebook.
 
-It speaks with the system's console, has no key of it, and opens no pickle. What it holds is held by registrars in the
-application's process. Each has a connection of its own, which ends with the client.
+The client speaks with the system's console, has no key of the system, and opens no pickle. Registrars in the
+application's process hold its queries. Each registrar has a connection of its own, which ends with the client.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from rr_actors.system.console.console_messages import (
 
 logger = logging.getLogger("rr_actors")
 
-_ANSWER_S = 60.0  # for what has no time limit of its own
-_GRACE_S = 10.0  # for an answer, above the time limit of what was asked for
+_ANSWER_S = 60.0  # for a request that has no time limit of its own
+_GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
 
 _A = TypeVar("_A")
 
@@ -51,7 +51,7 @@ class Client:
     Attributes:
         system: the system's name.
         state_dir: its state directory.
-        pid: its process.
+        pid: the id of the system's process.
     """
 
     def __init__(self, run_dir: Path) -> None:
@@ -62,14 +62,14 @@ class Client:
         self.pid = welcome.pid
 
     def open_registrar(self, name: str | None = None) -> ClientRegistrar:
-        """Open a registrar for this client. It is closed, and all that it holds released, when the client ends.
+        """Open a registrar for this client. When the client ends, it is closed, and its queries are released.
 
         Args:
-            name: what it is called; in the system that has "client." before it. None: this process's id.
+            name: the registrar's name, before which the system puts "client."; None: "pid-" and this process's id.
 
         Raises:
             NameTaken: another client has this name.
-            InvalidName: it has characters that no name may have.
+            InvalidName: the name has characters that no name may have.
             NotRunning: the system has ended.
         """
         return ClientRegistrar(self._connections, f"pid-{os.getpid()}" if name is None else name)
@@ -81,16 +81,16 @@ class Client:
             actor: its id or its path, as for System.ref().
 
         Raises:
-            NotFound: there is none.
+            NotFound: there is no such actor.
             NotSerializable: the message or the answer is no plain data.
-            RrError: it did not answer, or its handler raised.
+            RrError: the actor did not answer, or its handler raised.
         """
         limit_s = _limit(timeout_s)
         command = AskActor(actor, encode(message, f"message to {actor}"), limit_s)
         return Codec(None, "answer").show(self._connections.ask(command, Replied, limit_s + _GRACE_S).answer)
 
     def close(self) -> None:
-        """Close all its registrars and connections. What they hold is released a moment later. Again is nothing."""
+        """Close all registrars and connections. Their queries are released soon after. A second close does nothing."""
         self._connections.close("the client is closed")
 
     def __enter__(self) -> Self:
@@ -107,7 +107,7 @@ class ClientRegistrar:
     """A client's registrar: it loads, holds and releases. From any thread; a context manager closes it at the end.
 
     Attributes:
-        name: what the system calls it, "client.NAME".
+        name: the registrar's name in the system, "client.NAME".
     """
 
     def __init__(self, connections: Connections, name: str) -> None:
@@ -123,12 +123,12 @@ class ClientRegistrar:
     def load(
         self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
     ) -> ClientQuery:
-        """Load a resource, or share it if somebody holds it already, and return a query of it.
+        """Load a resource, or share it if another query holds it already, and return a query of it.
 
         Args:
             server: "registrar/server".
             request: a value of the server's request type.
-            response_type: read the response as this type. Without, classes in it are read as dicts.
+            response_type: the type to read the response as. None: classes in it are read as dicts.
             timeout_s: seconds that the load may take; None: a day.
 
         Raises:
@@ -152,7 +152,7 @@ class ClientRegistrar:
     async def load_async(
         self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
     ) -> ClientQuery:
-        """As load(), awaited on any loop. Cancelled, the query is released when the load has ended."""
+        """Load as load() does, from any event loop. If cancelled, release the query when the load has ended."""
         return await _awaited(
             lambda: self.load(server, request, response_type=response_type, timeout_s=timeout_s), ClientQuery.unload
         )
@@ -161,15 +161,15 @@ class ClientRegistrar:
         """Release a query.
 
         Raises:
-            UnknownQuery: it is not held.
-            UnloadFailed: it was the last query, and the unload callback raised. It is still held.
+            UnknownQuery: the query is not held.
+            UnloadFailed: it was the last query, and the unload callback raised. The query is still held.
             NotRunning: the system has ended.
         """
         limit_s = _limit(timeout_s)
         self._connections.ask(Release(self.name, _id_of(query_or_id), limit_s), Done, limit_s + _GRACE_S)
 
     def queries(self) -> list[QueryRow]:
-        """Return what it holds, with the states of the last statuses."""
+        """Return the queries that the registrar holds, each with the state of its last status."""
         with self._connections.lent() as client:
             return client.queries(self.name).rows
 
@@ -177,7 +177,7 @@ class ClientRegistrar:
         """Ask the system for the state of the last status of a query: "OK", "WARNING" ...
 
         Raises:
-            UnknownQuery: it is not held any more.
+            UnknownQuery: the query is not held any more.
             NotRunning: the system has ended.
             Unavailable: the registrar does not answer.
         """
@@ -191,7 +191,7 @@ class ClientRegistrar:
         raise UnknownQuery(f"query {id}: {self.name} does not hold it any more", query_id=id)
 
     def close(self) -> None:
-        """Close it. What it holds is released a moment later. Again is nothing."""
+        """Close the registrar, whose queries are released a moment later. A second close does nothing."""
         self._lifeline.close()
 
     def __enter__(self) -> Self:
@@ -208,9 +208,9 @@ class ClientQuery:
     """A client's hold on one resource. As a context manager it is released at the end.
 
     Attributes:
-        id, resource_id: as of a Query.
+        id, resource_id: as those of a Query.
         server_id: "registrar/server".
-        request, response: what was asked for, and the answer as it was then.
+        request, response: the request, and the response that the load returned.
     """
 
     def __init__(
@@ -224,11 +224,11 @@ class ClientQuery:
         self.response = response
 
     def fetch_state(self) -> str:
-        """Ask the system for the state of its last status, as ClientRegistrar.fetch_state()."""
+        """Ask the system for the state of the query's last status, as ClientRegistrar.fetch_state() does."""
         return self._holder.fetch_state(self)
 
     def unload(self, *, timeout_s: float | None = 30.0) -> None:
-        """Release it, as ClientRegistrar.unload()."""
+        """Release the query, as ClientRegistrar.unload() does."""
         self._holder.unload(self, timeout_s=timeout_s)
 
     def __enter__(self) -> Self:
@@ -245,10 +245,10 @@ def connect(state_dir: str | os.PathLike[str] | None = None) -> Client:
     """Return a client of a running system of this user, in this process or another.
 
     Args:
-        state_dir: the system's; None: RR_STATE, or else the one system that runs.
+        state_dir: the system's state directory; None: the one that RR_STATE names, or else of the one running system.
 
     Raises:
-        NotRunning: no system runs there, or it has no console.
+        NotRunning: no system runs, or it has no console.
         UsageError: several systems run; the error names them.
         Unavailable: the system is another user's, or of another version.
         ConfigError: state_dir is no path, or cannot be read.
@@ -267,7 +267,7 @@ def _id_of(query_or_id: ClientQuery | str) -> str:
 
 
 async def _awaited(call: Callable[[], _A], undo: Callable[[_A], object]) -> _A:
-    """Await a call that a thread makes; cancelled, what it comes to is undone, also when the loop has ended by then."""
+    """Await a call that a thread makes; if cancelled, undo its result later, even if the loop has ended by then."""
     made: Future[_A] = Future()
 
     def make() -> None:
@@ -285,7 +285,7 @@ async def _awaited(call: Callable[[], _A], undo: Callable[[_A], object]) -> _A:
 
 
 def _undo(undo: Callable[[_A], object], made: Future[_A]) -> None:
-    """In a thread of its own: the loop and its threads may be ending."""
+    """Undo the result of a call, in a thread of its own: the loop and its threads may be ending."""
     if made.exception() is None:
         threading.Thread(target=_undone, args=(undo, made.result()), name="rr-undo").start()
 

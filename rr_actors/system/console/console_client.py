@@ -1,4 +1,4 @@
-"""The console's client: plain and synchronous, for any program of the same user. Nothing of a system runs in it."""
+"""The console's client: plain and synchronous, for any program of the same user. No part of a system runs in it."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ class ConsoleClient:
     """A connection to the console of a running system. For one thread; as a context manager it is closed at the end.
 
     Args:
-        run_dir: where the console's socket is; find_console() knows.
-        timeout_s: how long an answer may take.
+        run_dir: the directory of the console's socket, as find_console() returns it.
+        timeout_s: seconds that an answer may take.
 
     Attributes:
-        welcome: which system it is.
-        is_broken: whether an answer did not come, or was none: it is not to be used again.
+        welcome: the console's answer to Hello, which names the system.
+        is_broken: whether an answer did not come: then the connection must not be used again.
 
     Raises:
-        NotRunning: nobody answers there.
-        Unavailable: somebody of another user does, or one that speaks another version.
+        NotRunning: no console answers in run_dir.
+        Unavailable: the console is another user's, or speaks another version.
     """
 
     def __init__(self, run_dir: Path, *, timeout_s: float = 60.0) -> None:
@@ -86,12 +86,12 @@ class ConsoleClient:
         """Send a request and return its answer, which is of the type `expected`.
 
         Args:
-            timeout_s: how long the answer may take; None: as the client was made.
+            timeout_s: seconds that the answer may take; None: the client's own limit.
 
         Raises:
-            RrError: the system refused it, or could not do it.
+            RrError: the system refused the request, or could not carry it out.
             NotRunning: the system has ended.
-            Unavailable: it has not answered in time; what was asked for may be done all the same.
+            Unavailable: no answer came in time; the system may carry out the request all the same.
         """
         self.is_broken = True
         self._send(request)
@@ -100,23 +100,23 @@ class ConsoleClient:
         return _checked(answer, expected)
 
     def children(self, match: str = "") -> Children:
-        """Return the whole tree, or what of it has `match` in its path; page after page."""
+        """Return all children of the tree that have `match` in their paths, read page by page."""
         return self._all(ListChildren(match), Children)
 
     def registrars(self) -> Registrars:
-        """Return all registrars; page after page."""
+        """Return all registrars, read page by page."""
         return self._all(ListRegistrars(), Registrars)
 
     def resources(self, registrar: str = "", match: str = "", limit: int | None = None) -> Resources:
-        """Return the resources of a registrar, or of all, that have `match` in them; at most `limit`."""
+        """Return the resources of a registrar, or of all, that ListResources(match) finds; at most `limit`."""
         return self._all(ListResources(match, registrar=registrar), Resources, limit)
 
     def queries(self, registrar: str = "", match: str = "", limit: int | None = None) -> Queries:
-        """Return the queries that a registrar holds, or all, that have `match` in them; at most `limit`."""
+        """Return the queries that a registrar holds, or all, that ListQueries(match) finds; at most `limit`."""
         return self._all(ListQueries(match, registrar=registrar), Queries, limit)
 
     def _all(self, request: PageRequest, expected: type[_Page], limit: int | None = None) -> _Page:
-        """The rows of all pages, with the notes of all; at most `limit` rows."""
+        """Return the rows of all pages, at most `limit`, with the notes of all pages."""
         rows: list[Any] = []
         notes: dict[str, None] = {}
         while True:
@@ -130,20 +130,20 @@ class ConsoleClient:
                 return msgspec.structs.replace(page, rows=rows[:limit], **more)
 
     def follow(self, follow: Follow) -> Iterator[Events | Missed]:
-        """Yield what happens from now on, until the system ends. After this the connection does nothing else.
+        """Yield the events from now on, until the system ends. The connection has no other use after that.
 
-        A Missed says how many events this reader was too slow for, and how the tree is now.
+        A Missed has the number of events that this reader was too slow for, and the tree as it is now.
 
         Raises:
-            RrError: the system refused it.
+            RrError: the system refused the request.
         """
         return self._parts(follow, Events | Missed)
 
     def record(self) -> Iterator[Entries | Missed]:
-        """Yield what is recorded from now on, until the system ends. After this the connection does nothing else.
+        """Yield the recorded entries from now on, until the system ends. The connection has no other use after that.
 
         Raises:
-            RrError: the system refused it.
+            RrError: the system refused the request.
         """
         return self._parts(BeginRecording(), Entries | Missed)
 
@@ -164,13 +164,13 @@ class ConsoleClient:
                 yield answer
 
     def close(self) -> None:
-        """Close the connection; a call that waits in another thread ends with NotRunning. Again is nothing."""
-        with contextlib.suppress(OSError):  # it is closed already, or the other side has gone
+        """Close the connection; a call that waits in another thread raises NotRunning. A second close does nothing."""
+        with contextlib.suppress(OSError):  # the connection is closed already, or the other side has gone
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
     def drop(self) -> None:
-        """Close this process's copy alone: a forked child's, whose parent uses the connection."""
+        """Close the copy of the connection in a forked child, and leave the connection itself to the parent."""
         self._socket.close()
 
     def __enter__(self) -> Self:
@@ -187,7 +187,7 @@ class ConsoleClient:
         except TimeoutError as error:
             raise Unavailable(f"{self._who()} does not read what it is sent") from error
         except OSError:
-            return  # it has refused the connection: what it said is read next
+            return  # the console has refused the connection: its answer is read next
 
     def _receive(self, timeout_s: float | None) -> Answer:
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
@@ -211,7 +211,7 @@ class ConsoleClient:
 
 
 class NotRunning(Unavailable):
-    """No running system was reached, or it has ended."""
+    """No running system was reached, or the system has ended."""
 
 
 def _checked(answer: Answer, expected: type[_A]) -> _A:
@@ -230,7 +230,7 @@ def _connected(run_dir: Path) -> socket.socket:
             try:
                 connected = sockets.connect(SOCKET)
                 break
-            except BlockingIOError as error:  # too many wait there
+            except BlockingIOError as error:  # too many connections wait to be accepted
                 if time.monotonic() > deadline:
                     raise Unavailable(f"{run_dir}: the system's console accepts no connections") from error
                 time.sleep(_RETRY_S)
@@ -246,10 +246,10 @@ def _connected(run_dir: Path) -> socket.socket:
 
 
 def take_parts(recording: Recording, parts: Iterable[Entries | Missed]) -> None:
-    """Add what ConsoleClient.record() yields to a recording, until it ends.
+    """Add to a recording the parts that ConsoleClient.record() yields, until they end.
 
     Raises:
-        RrError: the system refused it.
+        RrError: the system refused the request.
     """
     for part in parts:
         if isinstance(part, Missed):
@@ -259,10 +259,10 @@ def take_parts(recording: Recording, parts: Iterable[Entries | Missed]) -> None:
 
 
 def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:
-    """Return the directory with the console's socket: of the system in a state directory, or of the one that runs.
+    """Return the directory of a console's socket: of the system in `state_dir`, or of the only running system.
 
     Raises:
-        NotRunning: no system runs, there or at all, or it has no console.
+        NotRunning: no system runs (in `state_dir`), or it has no console.
         UsageError: several systems of this user run; the error names them.
     """
     if state_dir is not None:

@@ -1,4 +1,4 @@
-"""Commands of a console: what changes something, each answered with a sentence that says what was done. In a worker."""
+"""Commands of a console: they change something. The answer is a sentence that says what was done. In a worker."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from rr_actors.system.console.console_questions import View
 from rr_actors.wire.name_service import Status as Presence
 
 REGISTRAR = "console"
-"""The system's own registrar that holds what a console loads and keeps; it is opened for the first such load."""
+"""The registrar of the system that holds the resources that a console loads and keeps. The first such load opens it."""
 
 
 class Commands:
@@ -58,14 +58,14 @@ class Commands:
         self.clients = ClientRegistrars()
 
     def carry_out(self, command: Command, is_gone: Callable[[], bool], connection: object) -> Answer:
-        """Do it, and say what was done.
+        """Carry out a command, and return an answer that says what was done.
 
         Args:
-            is_gone: whether the one who asked for it has left.
-            connection: of the one who asks: what is opened for it lives as long.
+            is_gone: returns whether the client has left.
+            connection: the client's connection; a registrar that is opened for the client lives as long.
 
         Raises:
-            RrError: it cannot be done; nothing was changed, or the error says what.
+            RrError: the command cannot be carried out; nothing was changed, or the error says what was.
         """
         match command:
             case Load():
@@ -193,7 +193,7 @@ class Commands:
         return Done(f"sent {name} to {path} (pid {child.pid})", facts)
 
     def _pid_of(self, path: str) -> int | None:
-        """The process that a supervisor is in."""
+        """Return the id of the process that a supervisor runs in."""
         above, _, id = path.rpartition("/")
         return SupervisorRef(above).which_child(id).pid if above else os.getpid()
 
@@ -268,7 +268,7 @@ def _json(text: str) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON can tell it; its text where JSON cannot."""
+    """Return a value in the form that JSON gives it, or its text if JSON cannot hold it."""
     try:
         return msgspec.json.decode(msgspec.json.encode(value, enc_hook=repr))
     except Exception:  # a user's value: keys that are no text, numbers that are too long

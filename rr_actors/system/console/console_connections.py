@@ -1,4 +1,4 @@
-"""Connections to the console of one system: one for each call in flight, opened as needed and kept for the next."""
+"""Connections to the console of one system: one for each call in flight, opened as needed and kept for later calls."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Connections:
 
     Args:
         find: returns the directory of the console's socket; called for each new connection.
-        timeout_s: how long an answer may take, unless a call says otherwise.
+        timeout_s: seconds that an answer may take, unless a call says otherwise.
     """
 
     def __init__(self, find: Callable[[], Path], timeout_s: float) -> None:
@@ -40,7 +40,7 @@ class Connections:
         """Return a new connection. The caller closes it; close() does, too.
 
         Raises:
-            NotRunning: no system runs there, or these connections are closed.
+            NotRunning: no system runs, or these connections are closed.
             Unavailable: the system is another user's, or speaks another version.
         """
         if not self._closed:
@@ -54,7 +54,7 @@ class Connections:
 
     @contextmanager
     def lent(self) -> Generator[ConsoleClient]:
-        """Return a connection that nobody else uses within the `with` block.
+        """Lend a connection that no other call uses within the `with` block.
 
         Raises:
             NotRunning, Unavailable: as open().
@@ -72,15 +72,15 @@ class Connections:
         """Send a request and return its answer.
 
         Raises:
-            RrError: the system refused it, or could not do it.
+            RrError: the system refused the request, or could not carry it out.
             NotRunning: the system has ended, or these connections are closed.
-            Unavailable: it has not answered in time; what was asked for may be done all the same.
+            Unavailable: no answer came in time; the system may carry out the request all the same.
         """
         with self.lent() as client:
             return client.ask(request, expected, timeout_s)
 
     def welcome(self) -> Welcome:
-        """Return which system it is.
+        """Return the console's answer to Hello, which names the system.
 
         Raises:
             NotRunning, Unavailable: as open().
@@ -89,7 +89,7 @@ class Connections:
             return client.welcome
 
     def close(self, why: str) -> None:
-        """Close all of them. Calls in flight end with NotRunning, and later ones say why. Again is nothing."""
+        """Close all connections. Calls in flight and later ones raise NotRunning. A second close does nothing."""
         with self._lock:
             self._closed = self._closed or why
             clients, self._idle = list(self._all), []
@@ -97,7 +97,7 @@ class Connections:
             client.close()
 
     def leave_to_parent(self) -> None:
-        """In a forked child: drop its copies, so that the parent's connections end with the parent."""
+        """Close the copies in a forked child, so that the parent's connections end with the parent."""
         self._lock = threading.Lock()  # another thread may have held it at the fork
         self._closed = "this process was forked from the client's: call rr.connect() here"
         self._idle = []
@@ -117,7 +117,7 @@ class Connections:
             client.close()
 
     def _forget_idle(self) -> None:
-        """Close the connections to a system that has ended."""
+        """Close the idle connections: their system has ended."""
         with self._lock:
             idle, self._idle = self._idle, []
         for client in idle:

@@ -1,8 +1,8 @@
-"""The feed: what happens in a system, numbered, to the consoles that follow it. On the loop.
+"""The feed: it numbers the events of a system and sends them to the consoles that follow it. On the loop.
 
-An event costs a list's append for each reader; they are sent twenty times a second, many in one frame. A reader that
-does not read fills its own list and nothing else. When that is full it is emptied; the reader hears later how many
-events it has missed, and how the tree is now.
+An event costs one append to a list for each reader. Twenty times a second the feed sends the events, many in one frame.
+A reader that does not read fills only its own list. A full list is emptied. Later the reader hears how many events it
+has missed, and how the tree is then.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from rr_actors.system.recording.recordings import Recordings
 from rr_actors.wire.frames import framed
 
 KEPT = 2000
-"""How many events wait for one reader, before it has missed them."""
+"""The most events that wait for one reader; with one more, it has missed them all."""
 KEPT_OF_RECORDING = 50_000
-"""How many entries wait for one that records."""
+"""The most entries that wait for one reader that records."""
 BATCH_S = 0.05
-"""How long an event may wait for others to be sent with it."""
+"""Seconds that an event waits for others, to be sent with them."""
 _BATCH = 500
 
 
 class Reader:
-    """One console that follows.
+    """One console that follows the events, or records.
 
     Args:
-        send: writes a frame to its connection.
-        fall_behind: called when it can be written to again and has missed events: it sends a Missed, then calls
+        send: writes a frame to the console's connection.
+        fall_behind: called when the console reads again and has missed events. It sends a Missed, then calls
             caught_up().
     """
 
@@ -66,7 +66,7 @@ class Reader:
         self._dropped = 0
 
     def hear(self, event: Event) -> None:
-        """Keep an event for it, if it wants it."""
+        """Keep an event for the console, if the console has asked for such events."""
         if self._kinds and event.event not in self._kinds:
             return
         if self._about and not mentions(event.facts, self._about):
@@ -74,7 +74,7 @@ class Reader:
         self._keep(event)
 
     def take(self, entries: list[Entry], dropped: int) -> None:
-        """Keep entries of a recording for it."""
+        """Keep entries of a recording for the console."""
         self._dropped += dropped
         for entry in entries:
             self._keep(entry)
@@ -87,7 +87,7 @@ class Reader:
             self._waiting.clear()
 
     def flush(self) -> None:
-        """Send what waits, as far as its connection takes it."""
+        """Send the events that wait, as long as the connection takes them."""
         if self.is_blocked or self._is_catching_up:
             return
         if self.missed:
@@ -100,7 +100,7 @@ class Reader:
             self._dropped = 0
 
     def take_missed(self) -> tuple[int, int]:
-        """How many it has missed, and up to which number; what waits came later or is counted."""
+        """Return how many events were missed, and the number of the last one; begin to count anew."""
         missed, seq = self.missed, self.newest
         if self._waiting:
             seq = self._waiting[0].seq - 1
@@ -108,7 +108,7 @@ class Reader:
         return missed, seq
 
     def caught_up(self) -> None:
-        """It has heard what it had missed: events go on."""
+        """Note that the console has received the Missed, and go on with the events."""
         self._is_catching_up = False
         self.flush()
 
@@ -117,7 +117,7 @@ class Feed:
     """The feed of one system.
 
     Args:
-        subscribers: the feed is one of them as long as there is a reader of events.
+        subscribers: the feed is one of them as long as it has a reader of events.
         recordings: each reader that records begins one.
     """
 
@@ -131,7 +131,7 @@ class Feed:
         self._timer: asyncio.TimerHandle | None = None
 
     def add(self, reader: Reader) -> None:
-        """Have it hear what happens from now on."""
+        """Send a reader what happens from now on."""
         if reader.records:
             self._recording[reader] = self._recordings.begin(functools.partial(self._recorded, reader))
             return
@@ -140,7 +140,7 @@ class Feed:
             self._unlisten = self._subscribers.listen(self.heard)
 
     def remove(self, reader: Reader) -> None:
-        """It hears nothing any more; with the last one the system's processes hear that nobody listens."""
+        """Send a reader nothing more; with the last reader of events, end the feed's own subscription."""
         if (end := self._recording.pop(reader, None)) is not None:
             end()
             return
@@ -151,7 +151,7 @@ class Feed:
             unlisten()
 
     def heard(self, facts: dict[str, Any]) -> None:
-        """This has happened."""
+        """Number an event, and keep it for the readers."""
         self.seq += 1
         at = facts.get("at")
         rest = {key: value for key, value in facts.items() if key not in ("event", "at")}
@@ -174,7 +174,7 @@ class Feed:
             reader.flush()
 
     def close(self) -> None:
-        """Send what waits, and nothing any more."""
+        """Send the events that wait, and remove all readers."""
         if self._timer is not None:
             self._timer.cancel()
             self._flush()

@@ -1,8 +1,8 @@
-"""What is said on a console's socket: requests, answers and the feed of events, as typed messages.
+"""The messages on a console's socket: requests, answers and the feed of events, as types.
 
-Each is a MessagePack map in a frame (rr_actors/wire/frames.py). A connection begins with Hello; after that each
-request has one answer, in their order. After Follow only the feed comes. Nothing here is ever a pickle, and no message
-has a key of the system.
+Each message is a MessagePack map in a frame (rr_actors/wire/frames.py). A connection begins with Hello. After that each
+request has one answer, in the order of the requests. After Follow only the feed comes. No message is ever a pickle, and
+none has a key of the system.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rr_actors.system.recording.figures import Figure
 VERSION = 2
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
-"""The longest request; a resource's request as JSON is the longest part of any."""
+"""The longest request. The longest part of any is a resource's request as JSON."""
 ANSWER_LIMIT_BYTES = 4 * 2**20
 PAGE_LIMIT = 500
 """The most rows of a page."""
@@ -43,13 +43,13 @@ class _Message(msgspec.Struct, frozen=True, tag_field="is", tag=str.lower, omit_
 
 
 class Hello(_Message, frozen=True):
-    """The first message: which version of this protocol the client speaks."""
+    """The first message: the version of this protocol that the client speaks."""
 
     version: int
 
 
 class _Page(_Message, frozen=True):
-    """A page of what there is with the text `match` in it."""
+    """A page of the rows that have the text `match` in them."""
 
     match: _Text = ""
     offset: _Offset = 0
@@ -57,34 +57,34 @@ class _Page(_Message, frozen=True):
 
 
 class ListChildren(_Page, frozen=True):
-    """A page of the supervisor tree, each supervisor before its children: those with `match` in their paths."""
+    """A page of the supervisor tree, each supervisor before its children: the rows with `match` in their paths."""
 
 
 class ListRegistrars(_Page, frozen=True):
-    """A page of the registrars, by name: those with `match` in their names."""
+    """A page of the registrars, by name: the rows with `match` in their names."""
 
 
 class ListResources(_Page, frozen=True):
-    """A page of the resources of one registrar, or of all: those with `match` in id, server, request or status."""
+    """A page of the resources of one registrar, or of all: the rows with `match` in id, server, request or status."""
 
     registrar: _Text = ""
 
 
 class ListQueries(_Page, frozen=True):
-    """A page of the queries that one registrar holds, or all: those with `match` in their ids, server or request."""
+    """A page of the queries that one registrar holds, or all: the rows with `match` in ids, server or request."""
 
     registrar: _Text = ""
 
 
 class Find(_Message, frozen=True):
-    """The resources and queries of an id, or of the beginning of one: four characters or more."""
+    """The resources and queries of an id, or of the beginning of an id, of four characters or more."""
 
     id: _Text
     registrar: _Text = ""
 
 
 class ListHistory(_Message, frozen=True):
-    """The newest records of what happened to the child at a path and to all below it; of all children with ""."""
+    """The newest records of the child at a path and of all below it; with "", of all children."""
 
     path: _Text = ""
     limit: _Limit = 100
@@ -97,16 +97,16 @@ class ListDeadLetters(_Message, frozen=True):
 
 
 class ListFigures(_Message, frozen=True):
-    """What the system is measured by, as System.figures() returns it."""
+    """The figures of the system, as System.figures() returns them."""
 
 
 def mentions(facts: dict[str, Any], text: str) -> bool:
-    """Return whether one of these facts has the text in it: a path, a registrar, a server, an id ..."""
+    """Return whether one of these facts contains the text: a path, a registrar, a server, an id ..."""
     return any(text in fact for fact in facts.values() if isinstance(fact, str))
 
 
 class Follow(_Message, frozen=True):
-    """Have the events of these kinds sent (of all with none), of whose facts one has the text `about` in it."""
+    """Have events sent: of these kinds (or of all, if none is given), with the text `about` in one of their facts."""
 
     events: Annotated[list[_Text], msgspec.Meta(max_length=50)] = []
     about: _Text = ""
@@ -121,10 +121,10 @@ class Load(_Message, frozen=True):
 
     Attributes:
         server: "registrar/server".
-        request: JSON.
-        holder: the registrar that holds it; "" for the system's own one of the console.
-        keep: hold it when this is answered. Otherwise it is released at once.
-        dry_run: change nothing, and say what would be done.
+        request: the request as JSON.
+        holder: the registrar that holds the resource; "": the console's own registrar.
+        keep: hold the resource after the answer. Otherwise it is released at once.
+        dry_run: change nothing; the answer says what would be done.
     """
 
     server: _Text
@@ -138,7 +138,7 @@ class Load(_Message, frozen=True):
 class Unload(_Message, frozen=True):
     """Release a query of any holder; with `force` take a resource away from all its holders.
 
-    `id` may be the beginning of one.
+    `id` may be the beginning of an id.
     """
 
     id: _Text
@@ -148,7 +148,7 @@ class Unload(_Message, frozen=True):
 
 
 class SendStatus(_Message, frozen=True):
-    """Say how a resource is, in its owner's name. `id` may be the beginning of one, or a query's."""
+    """Send a status of a resource in its owner's name. `id` may be the beginning of an id, or a query's id."""
 
     id: _Text
     state: Literal["OK", "UPDATE", "WARNING", "ERROR", "FATAL"]
@@ -195,9 +195,9 @@ class ShutDown(_Message, frozen=True):
 
 
 class OpenRegistrar(_Message, frozen=True):
-    """Open a registrar for a client; it is closed, and all that it holds released, when this connection ends.
+    """Open a registrar for a client. When this connection ends, it is closed, and its queries are released.
 
-    In the system it is called "client.NAME"; Done's facts have that as `registrar`.
+    In the system it is called "client.NAME"; Done's facts have this name as `registrar`.
     """
 
     name: _Text
@@ -249,16 +249,16 @@ class Welcome(_Message, frozen=True):
 
 
 class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A place in the tree.
+    """A row of the tree: a supervisor or another child.
 
     Attributes:
         depth: 0 for the root.
         state: "running", "starting", "restarting", "stopped"; "unavailable": it does not answer, see `error`.
-        pid: of the process that it lives in, while it runs.
+        pid: the id of the process that it lives in, while it runs.
         restarts: how often it was restarted, as far as its supervisor remembers.
         up_s: for how many seconds it has been ready.
-        strategy: a supervisor's, with its restart intensity.
-        max_restarts, recent_restarts: a supervisor's: how many restarts its window allows, and how many are in it.
+        strategy: of a supervisor: its strategy and restart intensity.
+        max_restarts, recent_restarts: of a supervisor: how many restarts its window allows, and how many are in it.
     """
 
     path: str
@@ -275,7 +275,7 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class RegistrarRow(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A registrar: whether it is there, the servers that it has, and its counts (Registrar.stats)."""
+    """A registrar: its status, its servers, and its counts (Registrar.stats)."""
 
     name: str
     status: str
@@ -315,7 +315,7 @@ class Queries(_Message, frozen=True):
 
 
 class Found(_Message, frozen=True):
-    """What has the id. `notes`: registrars that could not be asked, and why."""
+    """The resources and queries of an id. `notes`: registrars that could not be asked, and why."""
 
     resources: list[ResourceRow]
     queries: list[QueryRow]
@@ -329,27 +329,27 @@ class Happenings(_Message, frozen=True):
 
 
 class Letters(_Message, frozen=True):
-    """How many dead letters there were, and the newest of them, oldest first."""
+    """The number of dead letters so far, and the newest of them, oldest first."""
 
     count: int
     letters: list[DeadLetter]
 
 
 class Figures(_Message, frozen=True):
-    """The figures of a moment."""
+    """The figures of the system at one moment."""
 
     figures: list[Figure]
 
 
 class Done(_Message, frozen=True):
-    """A command was carried out: a sentence that says what was done, and the same as plain data."""
+    """The answer to a command that was carried out: a sentence that says what was done, and the same as plain data."""
 
     text: str
     facts: dict[str, Any] = {}
 
 
 class Holding(_Message, frozen=True):
-    """A client's registrar holds this query; `response` has the response's canonical bytes."""
+    """The answer to Hold: the query that the client's registrar holds now, and the response's canonical bytes."""
 
     query_id: str
     resource_id: str
@@ -357,21 +357,21 @@ class Holding(_Message, frozen=True):
 
 
 class Replied(_Message, frozen=True):
-    """What an actor has answered: plain data, as canonical bytes."""
+    """The answer to AskActor: the actor's answer, plain data, as canonical bytes."""
 
     answer: bytes
 
 
 class Refused(_Message, frozen=True):
-    """The request failed; after this nothing of it is left to be done."""
+    """The answer to a request that failed. The system does nothing more for this request."""
 
     failure: Failure
 
 
 class Following(_Message, frozen=True):
-    """The answer to Follow: the number of the newest event. The feed begins with the one after that.
+    """The answer to Follow: the number of the newest event. The feed begins with the next one.
 
-    To BeginRecording it is 0: entries have numbers of their own.
+    As the answer to BeginRecording it has 0, because entries have numbers of their own.
     """
 
     seq: int
@@ -384,10 +384,10 @@ class Event(msgspec.Struct, frozen=True):
     """Something that happened.
 
     Attributes:
-        seq: its number; they count all events of the system that the console heard, in their order.
-        at: when, seconds since the epoch.
-        event: what, as System.subscribe() calls it.
-        facts: whose and how, plain data.
+        seq: its number. The numbers count all events of the system that the console heard, in their order.
+        at: its time, in seconds since the epoch.
+        event: its kind, as in System.subscribe().
+        facts: the other keys of the event, as plain data.
     """
 
     seq: int
@@ -403,14 +403,14 @@ class Events(_Message, frozen=True):
 
 
 class Entries(_Message, frozen=True):
-    """What was recorded, in the order of arrival. `dropped`: for how many entries their processes had no room."""
+    """Recorded entries, in the order of arrival. `dropped`: how many entries their processes had no room for."""
 
     entries: list[Entry]
     dropped: int = 0
 
 
 class Missed(_Message, frozen=True):
-    """The reader was too slow: it has missed so many events, up to number `seq`. This is how the tree is now."""
+    """A notice that the reader was too slow: it missed `count` events, up to number `seq`. `tree` is the tree now."""
 
     count: int
     seq: int

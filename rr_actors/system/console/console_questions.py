@@ -48,19 +48,19 @@ from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Status
 
 _LOOK_S = 5.0
-"""How long one supervisor may take to say what it has: a console shows the others meanwhile."""
+"""Seconds that one supervisor may take to answer; after that, a console shows the others without it."""
 _TRACEBACK = 4000  # characters
 
 
 class Viewed(Protocol):
-    """What a console wants of its System."""
+    """The part of System that a console uses."""
 
     name: str
     config: SystemConfig
 
     @property
     def ended(self) -> ExitReport | None:
-        """How the tree has ended; None while it runs."""
+        """The report of how the tree has ended; None while it runs."""
         ...
 
     def supervisor(self, path: str | None = None) -> SupervisorRef:
@@ -84,15 +84,15 @@ class Viewed(Protocol):
         ...
 
     def figures(self) -> list[Figure]:
-        """Return what the system is measured by."""
+        """Return the figures of the system."""
         ...
 
 
 class View:
-    """What a running system looks like to a console. From workers.
+    """A running system, as a console sees it. From workers.
 
     Args:
-        system: held weakly: a system that is dropped is to be noticed.
+        system: held weakly, so that a dropped system is noticed.
     """
 
     def __init__(self, system: Viewed, node: Node) -> None:
@@ -103,20 +103,20 @@ class View:
 
     @property
     def system(self) -> Viewed:
-        """The system.
+        """The system that the console looks at.
 
         Raises:
-            Unavailable: it was dropped.
+            Unavailable: the system was dropped.
         """
         if (system := self._system()) is None:
             raise Unavailable("the system was dropped, and is being stopped")
         return system
 
     def answer(self, question: Question) -> Answer:
-        """Look, and say what there is.
+        """Answer a question about the system.
 
         Raises:
-            RrError: what was asked for is not there, or does not answer.
+            RrError: the part that the question is about does not exist, or does not answer.
         """
         match question:
             case ListChildren(match, offset, limit):
@@ -143,7 +143,7 @@ class View:
     # -- the tree --------------------------------------------------------------------------------------------------
 
     def children(self, match: str = "", offset: int = 0, limit: int = 500) -> Children:
-        """A page of the tree."""
+        """Return a page of the tree."""
         rows = [row for row in self._walk() if match in row.path]
         return Children(len(rows), rows[offset : offset + limit])
 
@@ -156,7 +156,7 @@ class View:
     def _supervisor(self, row: ChildRow) -> Iterator[ChildRow]:
         try:
             described = SupervisorRef(row.path, timeout_s=_LOOK_S).describe()
-        except Exception as error:  # it is stopped or being started again; or its process does not answer in time
+        except Exception as error:  # the supervisor is stopped or restarting, or its process does not answer in time
             state = "unavailable" if row.state == "running" else row.state
             yield msgspec.structs.replace(row, state=state, error=readable(text_of(error)))
             return
@@ -170,7 +170,7 @@ class View:
                 yield below
 
     def _history(self, path: str) -> list[Record]:
-        """What happened to the child at `path` and below it, oldest first."""
+        """Return the records of the child at `path` and of all below it, oldest first."""
         paths = [row.path for row in self._walk() if row.type == "supervisor" and not row.error]
         place = self.path_of(path) if path else ""
         records: list[Record] = []
@@ -184,10 +184,10 @@ class View:
         return [_fitting(record) for record in sorted(chosen, key=lambda record: record.at)]
 
     def path_of(self, child: str) -> str:
-        """The path of a child given by its path or its id.
+        """Return the path of a child that is given by its path or its id.
 
         Raises:
-            NotFound: there is none, or several have the id.
+            NotFound: there is no such child, or several have the id.
         """
         root = self.system.supervisor().path
         if child == root:
@@ -200,10 +200,10 @@ class View:
     # -- registrars --------------------------------------------------------------------------------------------------
 
     def up(self, registrar: str = "") -> list[str]:
-        """The registrars that can be asked: this one, or all.
+        """Return the names of the registrars that can be asked: this one, or all that are up.
 
         Raises:
-            UnknownRegistrar: there is none of that name.
+            UnknownRegistrar: the system has no registrar of this name.
         """
         if registrar:
             self.registrar(registrar)
@@ -211,10 +211,10 @@ class View:
         return [name for name, status in self.node.statuses().items() if status is Status.UP]
 
     def registrar(self, name: str) -> Registrar:
-        """A registrar, or a handle on it that waits for nothing.
+        """Return a registrar, or a handle on it that does not wait for a restart.
 
         Raises:
-            UnknownRegistrar, InvalidName: there is none of that name.
+            UnknownRegistrar, InvalidName: the system has no registrar of this name.
         """
         return registrar_in(self.node, name, patient=False)
 
@@ -231,7 +231,7 @@ class View:
     def _pages(
         self, what: Literal["resources", "queries"], registrar: str, match: str, offset: int, limit: int
     ) -> tuple[int, list[Page], list[str]]:
-        """A page that goes on from one registrar to the next: the total, its parts, and who could not be asked."""
+        """Return a page over several registrars: the total, its parts, and notes on registrars that do not answer."""
         total, pages, notes = 0, list[Page](), list[str]()
         for name in self.up(registrar):
             have = sum(len(one.resources) + len(one.queries) for one in pages)
@@ -246,7 +246,7 @@ class View:
         return total, pages, notes
 
     def find(self, id: str, registrar: str = "") -> Found:
-        """What has this id, or begins with it if nothing has it."""
+        """Return the resources and queries with this id, or if there are none, those whose ids begin with it."""
         if not id:
             raise UsageError("expected the id of a query or resource, or four characters of its beginning, got nothing")
         resources, queries, notes = list[ResourceRow](), list[QueryRow](), list[str]()
@@ -274,6 +274,6 @@ def _child_row(child: dict[str, Any], path: str, depth: int) -> ChildRow:
 
 
 def _fitting(record: Record) -> Record:
-    """A record whose texts can be sent."""
+    """Return a record with texts that can be sent."""
     cut = record.traceback[-_TRACEBACK:]
     return msgspec.structs.replace(record, detail=readable(record.detail), traceback=readable(cut))

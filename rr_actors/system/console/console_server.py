@@ -1,7 +1,7 @@
-"""The console's socket: accepts consoles of this user, reads their requests, and has them answered in workers.
+"""The console's socket: the server accepts consoles of this user, reads their requests, and has workers answer them.
 
-Each connection has one request at a time in flight, and what it sends meanwhile is not read. So a client, whatever it
-does, holds one worker, one answer and one list of events; and the system waits for no client.
+Each connection has one request in flight, and the server does not read the next requests meanwhile. So a client can
+hold at most one worker, one answer and one list of events, and the system waits for no client.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ from rr_actors.wire.unix_sockets import SocketDir, peer_of
 logger = logging.getLogger("rr_actors")
 
 CONNECTIONS_LIMIT = 128
-"""How many consoles may be connected; further ones are refused."""
+"""The most consoles that may be connected; further ones are refused."""
 FRAME_S = 5.0
-"""How long a client may take for its first message, and for the rest of one that it has begun."""
+"""Seconds that a client may take for its first message, and for the rest of a message that it has begun."""
 STALLED_S = 30.0
-"""How long a client may leave an answer unread."""
+"""Seconds that a client may leave an answer unread."""
 _AGAIN_S = 0.1
 
 
@@ -60,7 +60,7 @@ class Console:
     """The console of one running system. On the loop; open() and close() are awaited there.
 
     Args:
-        subscribers, recordings: of the system; what its feed has.
+        subscribers, recordings: the system's; the console's feed uses them.
         shut_down: stops the system, in a thread of its own.
     """
 
@@ -87,7 +87,7 @@ class Console:
         self._entering: asyncio.Future[None] | None = None
 
     async def open(self) -> None:
-        """Listen, and put the system into the list of this user's running ones.
+        """Listen, and put the system into the list of this user's running systems.
 
         Raises:
             ConfigError: the socket cannot be made.
@@ -96,7 +96,7 @@ class Console:
         self.node.keeper.also.append(self._keep)
         self._entering = asyncio.ensure_future(self.node.dispatcher.workers.run(self._entry.make))
         try:
-            await asyncio.shield(self._entering)  # a start that is interrupted takes it out again when it is in
+            await asyncio.shield(self._entering)  # after an interrupted start, close() takes the entry out again
         except ConfigError as error:
             logger.warning("system %s: it is found by its state directory alone: %s", self.node.info.name, error)
 
@@ -115,11 +115,11 @@ class Console:
             self._making = asyncio.get_running_loop().create_task(self._serve())
 
     def refuse_commands(self) -> None:
-        """The system stops: commands are refused from now on, and the feed goes on."""
+        """Refuse commands from now on, because the system stops. The feed goes on."""
         self.stopping = True
 
     async def close(self) -> None:
-        """Stop listening, and close every connection. Each step is tried. Again is nothing."""
+        """Stop listening, and close every connection. Try each step. A second close does nothing."""
         server, self._server = self._server, None
         entering, self._entering = self._entering, None
         steps = Steps()
@@ -137,12 +137,12 @@ class Console:
         for connection in list(self.connections):
             steps.take("closing a console's connection", connection.end)
         steps.take("closing the directory of sockets", self._sockets.close)
-        await asyncio.sleep(0)  # the loop closes what was ended when it turns
+        await asyncio.sleep(0)  # in its next turn the loop closes the transports that were ended
         await asyncio.sleep(0)
         steps.end("the console is not closed altogether")
 
     def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> bytes:
-        """The frame that answers a request. In a worker."""
+        """Return the frame that answers a request. In a worker."""
         try:
             return framed(self._answer(request, is_gone, connection), ANSWER_LIMIT_BYTES)
         except Exception as error:
@@ -160,17 +160,17 @@ class Console:
         return self.view.answer(request)
 
     def missed(self, count: int, seq: int) -> bytes:
-        """The frame for a reader that was too slow. In a worker."""
+        """Return the frame for a reader that was too slow. In a worker."""
         return framed(Missed(count, seq, self.view.children()), ANSWER_LIMIT_BYTES)
 
 
 def refusal(error: BaseException) -> bytes:
-    """The frame that says that a request has failed, and why."""
+    """Return the frame that says that a request has failed, and why."""
     return framed(Refused(failure_of(error)), ANSWER_LIMIT_BYTES)
 
 
 class Connection(asyncio.Protocol):
-    """One console, from its connection to its end."""
+    """The connection of one console."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -186,10 +186,10 @@ class Connection(asyncio.Protocol):
         self._has_registrars = False
         self._key = ("console", id(self))
 
-    # -- what asyncio calls ------------------------------------------------------------------------------------------
+    # -- called by asyncio -------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Let it in, if it is this user's and there is room."""
+        """Accept the console, if it is this user's and there is room."""
         self._transport = cast("asyncio.Transport", transport)
         peer = peer_of(transport)
         if not peer.trusted:
@@ -203,7 +203,7 @@ class Connection(asyncio.Protocol):
             self._set_timer(FRAME_S)
 
     def data_received(self, data: bytes) -> None:
-        """Take what completes requests; a client that breaks the rules is refused and cut off."""
+        """Take the requests that `data` completes; refuse and disconnect a client that breaks the rules."""
         if self._ended:
             return
         self._requests += self._frames.feed(data)
@@ -214,15 +214,15 @@ class Connection(asyncio.Protocol):
             self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
         else:
             self._next()
-            if self._requests:  # else one that leaves is noticed
+            if self._requests:  # otherwise read on, to notice a client that leaves
                 self._transport.pause_reading()
 
     def eof_received(self) -> bool:
-        """It says no more: what it has asked for is not answered either."""
+        """Have the connection closed: the client sends no more, and its last request is not answered either."""
         return False
 
     def pause_writing(self) -> None:
-        """It does not read: what else there is for it waits."""
+        """Hold back further answers and events, because the client does not read."""
         self._blocked = True
         if self._reader is not None:
             self._reader.is_blocked = True
@@ -230,7 +230,7 @@ class Connection(asyncio.Protocol):
             self._set_timer(STALLED_S)
 
     def resume_writing(self) -> None:
-        """It reads again."""
+        """Go on with answers and events, because the client reads again."""
         self._blocked = False
         self._stop_timer()
         if self._reader is not None:
@@ -240,7 +240,7 @@ class Connection(asyncio.Protocol):
             self._next()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It has gone."""
+        """Remove the console, which has gone, and close its registrars."""
         self._ended = True
         self._stop_timer()
         self._requests.clear()
@@ -251,7 +251,7 @@ class Connection(asyncio.Protocol):
             self._close_registrars()
 
     def _close_registrars(self) -> None:
-        """Have them closed, behind their opening, should that still go on."""
+        """Have the client's registrars closed, after an opening that may still be in progress."""
         console = self._console
         try:
             console.node.dispatcher.workers.serial(self._key, console.commands.clients.close, self)
@@ -263,7 +263,7 @@ class Connection(asyncio.Protocol):
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def _next(self) -> None:
-        """Begin with the next request, if the last one is answered and the client has read that."""
+        """Begin with the next request, if the last one is answered and the client has read the answer."""
         if self._ended or self._busy or self._blocked:
             return
         if not self._requests:
@@ -345,7 +345,7 @@ class Connection(asyncio.Protocol):
     # -- the end -----------------------------------------------------------------------------------------------------
 
     def end(self) -> None:
-        """Send what is written, and close; at once if it does not read."""
+        """Send what is written, and close the connection; at once, if the client does not read."""
         self._ended = True
         self._stop_timer()
         if self._reader is not None:
@@ -356,7 +356,7 @@ class Connection(asyncio.Protocol):
             self._transport.close()
 
     def _leave(self, error: BaseException) -> None:
-        """Say why, and close."""
+        """Send the error, and close the connection."""
         self._transport.write(refusal(error))
         self.end()
 

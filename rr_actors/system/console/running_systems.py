@@ -1,8 +1,8 @@
-"""Running systems: a private list of those of this user, so that one is found without its state directory.
+"""Running systems: a private list of this user's systems, so that one is found without its state directory.
 
-An entry is a symbolic link, called by the pid of its system's process, that leads to the directory with its console's
-socket. It is in XDG_RUNTIME_DIR, or where there is none in a directory of mode 0700 below the temporary files. What a
-killed system left, the next one removes.
+An entry is a symbolic link to the directory of a console's socket; its name begins with the pid of the system's
+process. The list is in XDG_RUNTIME_DIR or, without that, in a directory of mode 0700 below the temporary files. A
+system that starts removes the entries of killed ones.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _INCARNATION = re.compile(r"[0-9a-f]{8}")
 
 
 class Entry:
-    """A running system's entry in the list, when it is made."""
+    """The entry of a running system in the list; make() creates it."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
@@ -31,10 +31,10 @@ class Entry:
         self._place: tuple[str, str] | None = None
 
     def make(self) -> None:
-        """Put it into the list.
+        """Put the entry into the list.
 
         Raises:
-            ConfigError: there is no place for it.
+            ConfigError: no directory can keep the list.
         """
         failure: OSError | None = None
         for place in _places():
@@ -50,16 +50,16 @@ class Entry:
         raise ConfigError(f"no private list of running systems can be kept: {problem}; set XDG_RUNTIME_DIR")
 
     def remove(self) -> None:
-        """Take it out of the list. Again is nothing."""
+        """Take the entry out of the list. A second call does nothing."""
         if self._place is not None:
             with contextlib.suppress(OSError), _opened(self._place) as folder:
                 folder.discard(self._name)
 
 
 def running_systems() -> list[Path]:
-    """Return the directories with the consoles of this user's running systems; those left behind are not in it.
+    """Return the directories of the consoles of this user's running systems, without the entries of killed systems.
 
-    It looks in the first place that can be used, as a system that starts does.
+    It reads the list in the first place that can be used, as a system that starts does.
     """
     found: list[Path] = []
     for place in _places():
@@ -71,7 +71,7 @@ def running_systems() -> list[Path]:
                         found.append(run_dir)
             break
         except FileNotFoundError:
-            if os.access(place[0], os.W_OK):  # nobody has made a list here yet
+            if os.access(place[0], os.W_OK):  # no system has made a list in this place yet
                 break
         except OSError:
             continue
@@ -79,7 +79,7 @@ def running_systems() -> list[Path]:
 
 
 def consoles_in(state_dir: Path) -> list[Path]:
-    """Return the directories with the consoles of the systems that run in a state directory: one, or none.
+    """Return the directories of the consoles of the systems that run in a state directory: one, or none.
 
     Raises:
         ConfigError: the directory cannot be read, or is a file.
@@ -98,7 +98,7 @@ def consoles_in(state_dir: Path) -> list[Path]:
 
 
 def _places() -> Iterator[tuple[str, str]]:
-    """Where the list may be: a directory, and its name there."""
+    """Yield the places where the list may be: a directory, and the list's name in it."""
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         yield runtime, "rr_actors"
     for parent in (*filter(None, map(os.environ.get, ("TMPDIR", "TEMP", "TMP"))), "/tmp", "/var/tmp"):
@@ -130,11 +130,11 @@ def _target(folder: Folder, name: str) -> Path | None:
 
 
 def _answers(run_dir: Path) -> bool:
-    """Whether somebody listens at the console's socket there."""
+    """Return whether a console listens at the socket in this directory."""
     sockets = SocketDir(run_dir)
     try:
         sockets.connect(SOCKET).close()
-    except BlockingIOError:  # too many wait there
+    except BlockingIOError:  # too many connections wait to be accepted
         return True
     except (OSError, ConfigError):
         return False
