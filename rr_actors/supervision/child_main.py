@@ -42,7 +42,7 @@ from rr_actors.system.hosting.node import Node, SystemInfo
 
 logger = logging.getLogger("rr_actors")
 
-# The fork server imports this module; what a child would import at its first need is then there already.
+# The fork server imports this module, and these two with it: a child need not import them later.
 for _module in ("concurrent.futures.thread", "uvloop"):
     with contextlib.suppress(ImportError):  # uvloop need not be installed
         importlib.import_module(_module)
@@ -51,7 +51,7 @@ _CLOSE_S = 2.0
 
 
 def main(inherited: Inherited) -> int:
-    """Live as the child that the payload describes; the exit code: 0 after a normal end or a shutdown, else 1."""
+    """Run the child that the payload describes. Return the exit code: 0 after a normal end or a shutdown, else 1."""
     interpreter.begin()
     info, path, spec = pickling.loads(inherited.payload)
     interpreter.name_process(f"rr: {path.rpartition('/')[2]}")
@@ -67,7 +67,7 @@ def main(inherited: Inherited) -> int:
 
 
 def _break(path: str, *args: Any, **kwargs: Any) -> Any:
-    """In place of sys.breakpointhook: a child has no standard input for Python's own debugger."""
+    """Replace sys.breakpointhook: a child has no standard input for Python's own debugger."""
     if "PYTHONBREAKPOINT" in os.environ:
         return sys.__breakpointhook__(*args, **kwargs)
     debugger = importlib.import_module("rr_actors.runtime.processes.terminal_debugger")  # it takes 10 ms
@@ -76,10 +76,10 @@ def _break(path: str, *args: Any, **kwargs: Any) -> Any:
 
 
 class ChildProcess:
-    """This process, as one child. Lives on the loop.
+    """This process, which runs one child. Used on the loop.
 
     Args:
-        spec: the pickled ChildSpec: it may import users' modules, so it is opened in a worker.
+        spec: the pickled ChildSpec. A worker unpickles it, since that may import users' modules.
     """
 
     def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes) -> None:
@@ -96,10 +96,10 @@ class ChildProcess:
         self._told_to_stop = asyncio.Event()
         self._ended = asyncio.Event()
         self._report: ExitReport | None = None
-        self._shutdown_s: Shutdown = "infinity"  # the parent keeps the time of the stops it asks for
+        self._shutdown_s: Shutdown = "infinity"  # the parent limits the stops that it asks for
 
     async def live(self) -> int:
-        """From the first to the last; returns the exit code."""
+        """Run the child until its end, and return the exit code."""
         self._channel = await Channel.open(self._inherited.control, self._received, self._lost)
         self.forward_logs()
         try:
@@ -113,7 +113,7 @@ class ChildProcess:
         return code
 
     def terminate(self) -> None:
-        """Stop gracefully: SIGTERM."""
+        """Stop the child gracefully, after SIGTERM or the loss of the supervisor."""
         if self._stop is None and self._spec_shutdown_s is not None:
             self._shutdown_s = self._spec_shutdown_s
         self._stop = self._stop or Stop()
@@ -141,7 +141,7 @@ class ChildProcess:
         self._spec_shutdown_s = spec.shutdown_s
         cls, args, kwargs = target_of(spec)
         self._hosted = prepare(self.node, cls, self._path, self._exited, once=spec.restart == "temporary")
-        starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent keeps the time
+        starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent has the time limit
         stopping = asyncio.ensure_future(self._told_to_stop.wait())
         await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
         stopping.cancel()
@@ -167,11 +167,11 @@ class ChildProcess:
         except Exception:
             logger.exception("%s: closing", self._path)
         if self._channel is not None:
-            channel, self._channel = self._channel, None  # what is logged from now on goes to standard error
+            channel, self._channel = self._channel, None  # log records go to standard error from now on
             channel.close()
             await asyncio.sleep(0)
 
-    # -- what it hears and says ------------------------------------------------------------------------------------
+    # -- messages --------------------------------------------------------------------------------------------------
 
     def _received(self, message: Message) -> None:
         match message:
@@ -187,7 +187,7 @@ class ChildProcess:
                 logger.error("%s: unexpected on the control channel: %r", self._path, message)
 
     def _directories(self) -> list[Path]:
-        """Where this process works: the system's directory, and its registrars' if they write."""
+        """Return the directories this process works in: the system's, and those of its registrars that write."""
         node = self.node
         state_dir = node.info.state_dir
         configs = [registrar.config for registrar in node.registrars.values()]
@@ -195,7 +195,7 @@ class ChildProcess:
         return [Path(state_dir), *catalogs]
 
     def _lost(self) -> None:
-        """Nobody supervises this process any more."""
+        """Stop the child: its supervisor is gone."""
         self.terminate()
 
     def _exited(self, report: ExitReport) -> None:
@@ -203,13 +203,13 @@ class ChildProcess:
         self._ended.set()
 
     def forward_logs(self) -> None:
-        """Have the application's logging hear what this process logs, also while it imports users' modules."""
+        """Send this process's log records to the application's logging, also while it imports users' modules."""
         info = self.node.info
         if info.config.logging:
             forwarded_logs.begin(self._path, info.log_levels, self._send_log)
 
     def _send_log(self, event: dict[str, Any]) -> bool:
-        """From any thread."""
+        """Send a log record as news, from any thread. Return False if that is not possible any more."""
         if self._channel is None:
             return False
         try:
@@ -237,9 +237,9 @@ async def _first(*events: asyncio.Event) -> None:
 
 
 def _failed(error: Exception) -> Failed:
-    """In a worker: pickling runs users' code."""
+    """Return the message for a failed start. In a worker, since pickling runs users' code."""
     trace = "".join(traceback.format_exception(error))
     try:
         return Failed(text_of(error), trace, pickling.dumps(error, "exception"))
-    except Exception:  # it goes as its text and its traceback then
+    except Exception:  # then only its text and its traceback are sent
         return Failed(text_of(error), trace)

@@ -1,8 +1,8 @@
-"""Run: one life of one child, from its start to its end, in a process of its own or in this one.
+"""Run: one run of one child, from its start to its end, in a process of its own or in this one.
 
 A supervisor makes a new Run for every start. Whatever happens, start() returns or raises once, stop() returns once, and
-a Run that came up and ended by itself tells so once. When any of them says that it is over, nothing of a process can
-act any more: it is dead, and so is its process group.
+a Run that became ready and ended by itself calls on_end once. When any of these reports the end of a process, that
+process and its process group are dead.
 """
 
 from __future__ import annotations
@@ -48,38 +48,38 @@ logger = logging.getLogger("rr_actors.supervision")
 
 ENTRY = "rr_actors.supervision.child_main:main"
 
-_LAST_WORDS_S = 0.05  # how long after a death its last messages are waited for
-_LEAVE_S = 2.0  # how long a process that said it leaves may take
+_LAST_WORDS_S = 0.05  # the longest wait for a dead process's last messages
+_LEAVE_S = 2.0  # the longest time from a process's last answer to its end
 
 
 OnEnd = Callable[[Exit], None]
 
 
 class Run(Protocol):
-    """One life of one child. All methods on the loop."""
+    """One run of one child. All methods are called on the loop."""
 
     pid: int | None
-    """The process it lives in, once there is one."""
+    """The id of its process, once it has one."""
 
     async def start(self) -> bool:
-        """Start it: True once it is ready, False if its on_start said IGNORE. Not after stop().
+        """Start the child. Return True once it is ready, False if its on_start returned IGNORE. Not after stop().
 
         Raises:
-            StartFailed: it did not become ready, or was stopped first.
-            BaseException: what its on_start raised.
+            StartFailed: the child did not become ready, or was stopped first.
+            BaseException: the error of its on_start.
         """
         ...
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
-        """Stop it, wherever it is: ask, wait for shutdown_s, kill. Once.
+        """Stop the child, also during its start: ask, wait for shutdown_s, kill. Call it once.
 
         Args:
-            final: it is not going to be started again.
+            final: the child will not be started again.
         """
         ...
 
     def kill(self) -> None:
-        """End it now, whatever becomes of it."""
+        """Kill or abandon the child at once."""
         ...
 
 
@@ -87,8 +87,8 @@ class LocalRun:
     """The Run of a child in this process.
 
     Args:
-        target: its class, args and kwargs.
-        on_end: called if it has become ready and then ends without stop().
+        target: the child's class, args and kwargs.
+        on_end: called if the child has become ready and then ends without stop().
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class LocalRun:
         return await self._hosted.start(args, kwargs, self._timeout_s)
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
-        """Stop it; what does not stop in time is abandoned."""
+        """Stop the child; abandon it if it does not stop in time."""
         return _exit_of(await self._hosted.stop(shutdown_s, final=final))
 
     def kill(self) -> None:
@@ -125,16 +125,16 @@ class ProcessRun:
     """The Run of a child in a process of its own.
 
     Args:
-        on_died: called at the death of the process: what it started is to be swept.
+        on_died: called at the death of the process, so that the processes that it started are swept.
     """
 
     on_end: OnEnd
-    """Called if it has become ready and then ends without stop(). To be set before start()."""
+    """Called if the child has become ready and then ends without stop(). Set it before start()."""
 
     def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
-        self.managers: set[str] = set()  # the paths of those below a supervisor
+        self.managers: set[str] = set()  # the paths of those that run below a supervisor
         self._node = node
         self.spec = spec
         self._path = path
@@ -143,12 +143,12 @@ class ProcessRun:
         self._process: Process | None = None
         self._channel: Channel | None = None
         self._launching: asyncio.Task[None] | None = None
-        self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: it died first
+        self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: the process died first
         self._end: asyncio.Future[Exit] = loop.create_future()
         self._exited: Exited | None = None
         self._exiting: Exiting | None = None
-        self._killed: Exit | None = None  # why we killed it
-        self._silent = False  # the channel is closed from the other end
+        self._killed: Exit | None = None  # why the supervisor killed it
+        self._silent = False  # the child's end of the channel is closed
         self._up = False
         self._stopping = False
         self._heartbeat: Heartbeat | None = None
@@ -173,7 +173,7 @@ class ProcessRun:
         return await self._judge(self._answer.result())
 
     def lay_out(self) -> None:
-        """Make the process, so that it is there when start() is called: nothing of the child runs in it until then."""
+        """Make the process before start() is called. Until then nothing of the child runs in it."""
         if self._launching is None:
             self._launching = self._loop.create_task(self._launch())
 
@@ -183,7 +183,7 @@ class ProcessRun:
             self._heartbeat.stop()
         if self._launching is not None:
             await asyncio.wait((self._launching,))
-            self._launching.exception()  # start() has raised it, or will
+            self._launching.exception()  # start() raises it
         if self._process is None:
             return Exit("shutdown", "not started")
         if shutdown_s == "brutal_kill":
@@ -208,7 +208,7 @@ class ProcessRun:
         try:
             process.watch(self._loop, self._died)
             self._channel = await Channel.open(process.control, self._received, self._lost)
-        except Exception:  # there are no descriptors left, say
+        except Exception:  # for instance, no descriptors are left
             self._process = self.pid = None
             process.close()
             raise
@@ -216,7 +216,7 @@ class ProcessRun:
             self._await_last_words()
 
     def _spawn(self) -> Process:
-        """In a worker: pickling and the launch block."""
+        """Pickle the ChildSpec and launch the process. In a worker, since both block."""
         spec = pickling.dumps(self.spec, f"the ChildSpec of {self._path}")
         payload = pickling.dumps((self._node.info, self._path, spec))
         return self._node.spawner.start(ENTRY, payload, name=self._path)
@@ -242,13 +242,13 @@ class ProcessRun:
                 raise error
 
     async def _leave(self) -> None:
-        """Wait for a process that said it leaves."""
+        """Wait until a process that has announced its end is dead; kill it after _LEAVE_S."""
         await wait_while_running(self._end, _LEAVE_S)
         if not self._end.done():
             self._kill(Exit("killed", f"had not left after {_LEAVE_S:g} s"))
         await asyncio.shield(self._end)
 
-    # -- what it says ----------------------------------------------------------------------------------------------
+    # -- its messages ----------------------------------------------------------------------------------------------
 
     def _received(self, message: Message) -> None:
         match message:
@@ -262,7 +262,7 @@ class ProcessRun:
                     self._heartbeat.heard(message.trouble)
             case News():
                 self._note(message.event)
-                if "path" not in message.event and self._channel is not None:  # of resources: there may be many
+                if "path" not in message.event and self._channel is not None:  # resource events may be many
                     self._channel.rest()
                 self._node.on_event(message.event)
             case _:
@@ -302,7 +302,7 @@ class ProcessRun:
             self._await_last_words()
 
     def _await_last_words(self) -> None:
-        """It is dead, but what it said last may still be on its way."""
+        """Conclude when the last messages of the dead process have had time to arrive."""
         if self._silent:
             self._conclude()
         else:
@@ -318,7 +318,7 @@ class ProcessRun:
             return
         assert self._process is not None
         assert self._exited is not None
-        steps = Steps()  # its supervisor waits for the end, whatever goes wrong with what is left of it
+        steps = Steps()  # the supervisor waits for the end, also if the clean-up fails
         if self._channel is not None:
             steps.take("closing the channel", self._channel.close)
         steps.take("ending what it started", self._on_died)
@@ -354,12 +354,12 @@ def _start_timeout_s(spec: ChildSpec, node: Node) -> float | None:
 
 
 def _unpack(failed: Failed, path: str) -> BaseException:
-    """The exception that the child raised, with its traceback there as a note. In a worker: it runs users' code."""
+    """Return the exception of the child, with its traceback as a note. In a worker, since it runs users' code."""
     error: BaseException | None = None
     if failed.error:
         try:
             error = pickling.loads(failed.error)
-        except Exception:  # its class cannot be had here: its text and traceback have to do
+        except Exception:  # its class cannot be imported here: its text and traceback must do
             error = None
     if not isinstance(error, BaseException):
         error = StartFailed(f"{path}: {failed.text}", id=path)
@@ -368,7 +368,7 @@ def _unpack(failed: Failed, path: str) -> BaseException:
     return error
 
 
-# Life: one run of one child as its supervisor sees it, and what is put on record of it.
+# Life: one run of one child as its supervisor sees it, and its Records.
 
 
 class Life:
@@ -388,17 +388,17 @@ class Life:
 
     @property
     def pid(self) -> int | None:
-        """The process it is in, once there is one."""
+        """The id of its process, once it has one."""
         return None if self.run is None else self.run.pid
 
     @property
     def up_s(self) -> float | None:
-        """For how many seconds it has been ready; a clock that is set changes nothing."""
+        """The seconds since it became ready, by the monotonic clock; None before."""
         return None if self.ready_at is None else time.monotonic() - self.ready_at
 
 
 def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record:
-    """What the core reports of a child, with what the run itself has to say."""
+    """Return the Record of a report of the core, completed with the facts of the run."""
     exit = report.exit
     code = _code_of_start(report) if exit is None else exit.code
     restarted = report.event == "started" and life is not None and life.why is Why.RESTART
@@ -423,7 +423,7 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
 
 
 def _code_of_start(report: Report) -> int | None:
-    """The exit code of a process that died before it was ready."""
+    """Return the exit code of a process that died before it was ready, else None."""
     return report.error.details.get("code") if isinstance(report.error, StartFailed) else None
 
 

@@ -1,7 +1,7 @@
-"""Control: what a supervisor and the process of one of its children say to each other, over a socket pair of their own.
+"""Control: the messages between a supervisor and the process of one of its children, over their own socket pair.
 
-Parent to child: Start, Stop, Ping. Child to parent: Ready, Ignored or Failed, once; Pong; News; Exiting, last. All of
-it is decoded by type; what users pickled stays packed here, and is opened off the loop.
+Parent to child: Start, Stop, Ping. Child to parent: Ready, Ignored or Failed, once; Pong; News; Exiting, last. Messages
+are decoded by type. Pickled values of users stay bytes here; a worker unpickles them.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ class Start(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 class Stop(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """Stop the actor and leave. `final`: it is not going to be started again."""
+    """Stop the actor and end the process. `final`: the actor will not be started again."""
 
     final: bool = False
 
 
 class Ping(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """Is the loop alive?"""
+    """Answer with a Pong if the loop is alive."""
 
 
 class Pong(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """It is. `trouble`: why the process cannot work any more, "" if it can."""
+    """The loop is alive. `trouble`: why the process cannot work any more, "" if it can."""
 
     trouble: str = ""
 
 
 class Ready(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """on_start has returned; the actor can be reached."""
+    """The actor's on_start has returned; others can reach it."""
 
 
 class Ignored(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """on_start returned IGNORE; the process leaves."""
+    """The actor's on_start returned IGNORE; the process ends."""
 
 
 class Failed(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """The actor did not start; the process leaves. `error`: the pickled exception, empty if it cannot be pickled."""
+    """The actor did not start; the process ends. `error`: the pickled exception, empty if it cannot be pickled."""
 
     text: str
     traceback: str
@@ -59,7 +59,7 @@ class Failed(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 class Exiting(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """The actor has ended, with this reason; the process leaves."""
+    """The actor has ended with this reason; the process ends, too."""
 
     reason: str
     detail: str
@@ -76,11 +76,11 @@ Message = Start | Stop | Ping | Pong | Ready | Ignored | Failed | Exiting | News
 
 
 class Channel(asyncio.Protocol):
-    """One end of the socket pair, on the loop. What travels are frames (rr_actors/wire/frames.py).
+    """One end of the socket pair, on the loop. Messages travel in frames (rr_actors/wire/frames.py).
 
     Args:
         received: called with each message.
-        lost: called once, when the other end is gone or said something that is no message.
+        lost: called once, when the other end is gone or has sent something that is no message.
     """
 
     def __init__(self, received: Callable[[Message], None], lost: Callable[[], None]) -> None:
@@ -92,14 +92,14 @@ class Channel(asyncio.Protocol):
 
     @classmethod
     async def open(cls, end: socket.socket, received: Callable[[Message], None], lost: Callable[[], None]) -> Channel:
-        """Take over `end`."""
+        """Return the channel on `end`, which belongs to it from now on."""
         end.setblocking(False)
         loop = asyncio.get_running_loop()
         _, channel = await loop.create_unix_connection(lambda: cls(received, lost), sock=end)
         return channel
 
     def send(self, message: Message) -> None:
-        """Send, unless the other end is gone. Call on the loop.
+        """Send a message, unless the other end is gone. Call on the loop.
 
         Raises:
             NotSerializable: the message has no MessagePack form, or is longer than 64 MiB.
@@ -108,7 +108,7 @@ class Channel(asyncio.Protocol):
             self._transport.write(framed(message, _LIMIT_BYTES))
 
     def rest(self) -> None:
-        """Read nothing for 10 ms: many messages wake this process once then. They wait in the socket; none is lost."""
+        """Read nothing for 10 ms, so that many messages wake this process once. They wait in the socket."""
         if self._resting is None and self._transport is not None and not self._transport.is_closing():
             self._transport.pause_reading()
             self._resting = asyncio.get_running_loop().call_later(_REST_S, self.go_on)
@@ -122,7 +122,7 @@ class Channel(asyncio.Protocol):
                 self._transport.resume_reading()
 
     def close(self) -> None:
-        """Send what is buffered and close. `lost` is not called any more."""
+        """Send the buffered messages and close the channel. `received` and `lost` are not called any more."""
         self.go_on()
         self._lost = _nobody
         self._received = _nobody
@@ -137,7 +137,7 @@ class Channel(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         for message in self._reader.feed(data):
             self._received(message)
-        if self._reader.error is not None or self._reader.ended:  # nobody here says goodbye with a frame
+        if self._reader.error is not None or self._reader.ended:  # neither end sends a last, empty frame
             logger.error("control channel: closed: %s", self._reader.error or "an empty frame")
             if self._transport is not None:
                 self._transport.abort()

@@ -1,7 +1,7 @@
-"""Supervision: performs what supervision/core/restarts.py decides, on real children. On the loop.
+"""Supervision: performs the decisions of supervision/core/restarts.py on real children. On the loop.
 
-It keeps one Tree. What happens to the children becomes a decision, the decision's actions are performed in their order,
-and what they lead to goes to the core again. The supervisor actor around it is in supervisor.py.
+It keeps one Tree. For each event of a child it takes a decision from the core, and performs the decision's actions in
+order. Their outcomes are the next events. The supervisor actor around it is in supervisor.py.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from rr_actors.wire.name_service import Status
 logger = logging.getLogger("rr_actors.supervision")
 
 SWEEP_DELAY_S = 0.05
-"""How long after a death what escaped the process group is looked for; by then its successor has mostly started."""
+"""Seconds from a death to the search for processes outside its group. Mostly the successor has started by then."""
 
 LAID_OUT = 2
-"""How many processes are made ahead of their turn: starting them one after another would leave processors idle."""
+"""How many processes are made before their turn. Otherwise processors would be idle."""
 
 FENCE_S = 1.0
-"""How long the processes below a dead supervisor are waited for; they are being killed, so it takes milliseconds."""
+"""The longest wait for the end of the processes below a dead supervisor. The kernel kills them within milliseconds."""
 
 DEATHS = 3
-"""How many deaths of its predecessors a child hears of: as many as a load may cause before it is given up."""
+"""How many deaths of earlier runs a child hears of: as many as a load may cause before it fails."""
 
 Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 
@@ -66,10 +66,10 @@ class Supervision:
     """The children of one supervisor.
 
     Args:
-        target_of: how to make the actor for a child in this process.
+        target_of: returns the class to start for a child in this process, and its arguments.
         on_started: called once when all children are ready.
-        on_exit: called once when all are down and the supervisor is to end; without on_started before it, its start has
-            failed.
+        on_exit: called once when all children are down and the supervisor must end. If on_started was not called
+            before, the start has failed.
     """
 
     def __init__(
@@ -92,29 +92,29 @@ class Supervision:
         self._on_exit = on_exit
         self._entries = Entries(node.directory)
         self._lives: dict[int, Life] = {}
-        self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
+        self._specs: dict[str, ChildSpec] = {}  # of the last start of each child
         self._tasks: set[asyncio.Task[None]] = set()
         self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
 
-    # -- what may be asked of it -----------------------------------------------------------------------------------
+    # -- requests --------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start the children; on_started or on_exit will be called."""
+        """Start the children, then call on_started or on_exit."""
         self.apply(restarts.decide_start(self.tree, time.monotonic()))
 
     def stop(self, *, final: bool) -> None:
-        """Stop the children, also in the middle of a start; on_exit will be called, if it was not.
+        """Stop the children, also in the middle of a start, then call on_exit if that has not been done.
 
         Args:
-            final: they are not going to be started again.
+            final: the children will not be started again.
         """
         self.final = self.final or final
         self.apply(restarts.decide_stop(self.tree, time.monotonic()))
 
     def kill(self) -> None:
-        """Stop, and wait for no one: processes are killed, actors in this process abandoned."""
+        """Stop without waiting: kill the children's processes, and abandon actors in this process."""
         self._brutal = True
         self.apply(restarts.decide_stop(self.tree, time.monotonic()))
         for life in list(self._lives.values()):
@@ -124,7 +124,7 @@ class Supervision:
             run.kill()
 
     def apply(self, decision: Decision) -> None:
-        """Make the decision's Tree the present one and perform its actions."""
+        """Keep the decision's Tree and perform its actions."""
         self.tree, actions = decision
         steps = Steps()
         for action in actions:
@@ -134,24 +134,25 @@ class Supervision:
             self._lay_out_next()
 
     def life_of(self, id: str) -> Life | None:
-        """The present run of a child, if it is running."""
+        """Return the present run of a child, or None if it is not running."""
         child = find_child(self.tree, id)
         return self._lives.get(child.run) if child.state == "running" else None
 
     def check_names(self, spec: ChildSpec) -> None:
-        """That a new child brings no registrar that is in the system already.
+        """Check that a new child has no registrar that is in the system already, and no client's name.
 
         Raises:
-            NameTaken: it does.
+            NameTaken: a registrar of that name exists.
+            InvalidSpec: the name is one of a client's.
         """
         self._entries.check_names(spec, self.path_of(spec.id))
 
     def path_of(self, id: str) -> str:
-        """The child's place in the tree."""
+        """Return the child's path in the tree."""
         return f"{self.path}/{id}"
 
     async def finish(self) -> None:
-        """After on_exit: wait for what is still being cleaned up."""
+        """Wait, after on_exit, until the clean-up has ended."""
         if self._sweeping is not None:
             self._sweeping.cancel()
             self._sweeping = None
@@ -228,7 +229,7 @@ class Supervision:
         return LocalRun(self._node, life.spec, life.path, self._target_of(life.spec), on_end)
 
     def _lay_out_next(self) -> None:
-        """Make the processes of those whose turn comes next while others start; drop those whose turn will not come."""
+        """Make the processes of the next children while others start, and discard processes that are not needed now."""
         due = [child for child in self.tree.children.values() if child.phase is Phase.DUE][:LAID_OUT]
         for child in due:
             spec = child.start_spec
@@ -248,7 +249,7 @@ class Supervision:
         self._apply_and_forget(life, decision)
 
     async def _end_of(self, life: Life, run: Run, action: StopChild) -> Exit:
-        """Stop it. If that goes wrong, kill it: its siblings, and the supervisor, are stopped all the same."""
+        """Stop a run, or kill it if stop() raises: its siblings and the supervisor must be stopped all the same."""
         try:
             return await run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
         except Exception as error:
@@ -260,17 +261,17 @@ class Supervision:
         return "brutal_kill" if self._brutal else shutdown_s
 
     def _is_final(self, id: str) -> bool:
-        """Whether a child that is being stopped is not going to be started again."""
+        """Return whether a child that is being stopped will not be started again."""
         child = self.tree.children.get(id)
         forgotten = child is None or (child.phase is Phase.STOPPING and child.spec.restart == "temporary")
         return forgotten or self.tree.dynamic or self._ends_with_supervisor(id)
 
     def _ends_with_supervisor(self, id: str) -> bool:
-        """Whether the supervisor is stopping and, when it is started again, will not have this child."""
+        """Return whether the supervisor is stopping and will not have this child at its next start."""
         stopping = self.tree.mode in (Mode.STOPPING, Mode.STOPPED)
         return self.final or (stopping and id not in {child.id for child in self.tree.spec.children})
 
-    # -- what happens ----------------------------------------------------------------------------------------------
+    # -- ends of children ------------------------------------------------------------------------------------------
 
     def _ended(self, life: Life, exit: Exit) -> None:
         if life.spec.type == "supervisor" and life.spec.placement == "process":
@@ -279,7 +280,7 @@ class Supervision:
             self._has_ended(life, exit)
 
     async def _ended_with_all_below(self, life: Life, exit: Exit) -> None:
-        """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
+        """Wait until the processes below a dead supervisor are gone: their successors must not meet them."""
         pids = self._entries.pids_below(life.path)
         await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
         if isinstance(life.run, ProcessRun):
@@ -305,7 +306,7 @@ class Supervision:
         if not task.cancelled() and (error := task.exception()) is not None:
             logger.critical("supervisor %s: a defect of rr_actors", self.path, exc_info=error)
 
-    # -- what others hear ------------------------------------------------------------------------------------------
+    # -- records and the directory ---------------------------------------------------------------------------------
 
     def _record(self, report: Report) -> None:
         path, kind = self.path_of(report.id), self._kind_of(report.id)
@@ -321,8 +322,8 @@ class Supervision:
         return "supervisor"
 
     def _deaths(self, life: Life) -> str:
-        """Say how the runs before this one died: its registrar tells that to those whose load they interrupted."""
-        if life.spec.type == "supervisor":  # what is below it may have ended in another way
+        """Say how earlier runs died. The child's registrar names that in the errors of loads that they interrupted."""
+        if life.spec.type == "supervisor":  # the actors below it may have ended in another way
             return ""
         return "; ".join(self.history.deaths(life.path, DEATHS))
 
@@ -336,12 +337,12 @@ class Supervision:
         self._retire(self._entries.mark(spec, self.path_of(report.id), status, _why(record)))
 
     def _retire(self, registrars: list[str]) -> None:
-        """Have what they held released by all who served them; when everything stops, they do so themselves."""
+        """Have all providers release what these registrars held, unless the children stop for good anyway."""
         if not self.final:
             for registrar in registrars:
                 self._task(self._node.retire(registrar))
 
-    # -- what dead processes left ----------------------------------------------------------------------------------
+    # -- leftovers of dead processes -------------------------------------------------------------------------------
 
     def _died(self) -> None:
         if self._sweeping is None:
@@ -354,14 +355,14 @@ class Supervision:
     async def _sweep(self) -> None:
         workers = self._node.dispatcher.workers
         swept = await workers.run(self._node.spawner.sweep)
-        with contextlib.suppress(OSError):  # what cannot be removed now goes with the run directory
+        with contextlib.suppress(OSError):  # a file that stays is removed with the run directory
             await workers.run(self._node.transport.sweep)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
 
 
 def _why(record: Record) -> str:
-    """What the directory says of how a child came to be where it is; nothing if somebody asked for it."""
+    """Return the reason of a child's state for the directory; "" if a caller or the child asked for it."""
     if record.event in ("stopped", "deleted", "ignored"):
         return ""
     if record.reason and record.detail:
@@ -370,5 +371,5 @@ def _why(record: Record) -> str:
 
 
 def _chance() -> float:
-    """A random number in [0, 1)."""
+    """Return a random number in [0, 1)."""
     return int.from_bytes(os.urandom(4), "big") / 2**32

@@ -1,4 +1,4 @@
-"""History: what happened to a supervisor's children and why, kept in memory and written to the log.
+"""History: the events of a supervisor's children and their reasons, kept in memory and written to the log.
 
 One line for each record on the logger rr_actors.supervision, "exited path=root/cameras reason=killed ...", with the
 same facts as the log record's attribute `supervision`.
@@ -23,27 +23,27 @@ KEPT = 1000
 
 
 class Record(msgspec.Struct, frozen=True):
-    """Something that happened to a child.
+    """An event of a child.
 
     Attributes:
         event: "started", "restarted", "ignored" (on_start said IGNORE), "start_failed", "exited" (by itself), "stopped"
-            (it was told to), "deleted", "gave_up" (too many restarts, the last one because of this child) or
+            (on request), "deleted", "gave_up" (too many restarts, the last one because of this child) or
             "auto_shutdown" (because of this significant child).
         path: the child's.
         kind: "manager", "actor" or "supervisor".
-        run: which of its starts this is about; they are numbered over all children of the supervisor.
+        run: the number of its start; starts are numbered over all children of the supervisor.
         at: when, seconds since the epoch.
         state: the child's from then on: "running", "starting", "restarting", "stopped"; None when it is forgotten.
-        pid: the process it lived in.
+        pid: the id of its process.
         reason: of an exit: "normal", "shutdown", "abnormal" or "killed".
         detail: for people: "SIGKILL", "ValueError: no such device".
-        code: exit code of its own process; -9 for signal 9; None where there is none, or nobody can tell.
+        code: exit code of its own process; -9 for signal 9; None without one, or if it is unknown.
         signal: "SIGKILL", or "".
         traceback: of the exception that ended it, as it was in its own process.
         restarts: restarts within the supervisor's window, this one included.
         delay_s: how long the restart that follows waits.
         ready_s: from its start until it was ready.
-        up_s: from then until its end.
+        up_s: from then until its end, in seconds.
     """
 
     event: str
@@ -69,7 +69,7 @@ class Record(msgspec.Struct, frozen=True):
         return self.path.rpartition("/")[2]
 
     def facts(self) -> dict[str, Any]:
-        """Everything but the event that says something, as plain data."""
+        """Return all fields except the event and the empty ones, as plain data. `state` is always in it."""
         facts = msgspec.structs.asdict(self)
         del facts["event"]
         return {key: value for key, value in facts.items() if value not in (None, "", 0)} | {"state": self.state}
@@ -99,18 +99,18 @@ class History:
         self._records: deque[Record] = deque(maxlen=KEPT)
 
     def add(self, record: Record) -> None:
-        """Keep it, and log it."""
+        """Keep a record, and log it."""
         self._records.append(record)
         logger.log(_level(record), "%s", record, extra={"supervision": {"event": record.event, **record.facts()}})
 
     def records(self) -> list[Record]:
-        """All that are kept."""
+        """Return all records that are kept."""
         return list(self._records)
 
     def deaths(self, path: str, count: int) -> list[str]:
         """Say how the child's last `count` runs died, oldest first: "SIGKILL", "exit code 3: ValueError: ...".
 
-        A run that ended as it should is no death, and neither is any before it.
+        The list ends at a run that ended as it should: neither that run nor any before it is a death.
         """
         found: list[str] = []
         for record in reversed(self._records):
@@ -126,7 +126,7 @@ def _how(record: Record) -> str:
     how = record.signal or (f"exit code {record.code}" if record.code is not None else "")
     if not how or record.event != "start_failed":
         return how if record.detail in ("", how) else ": ".join(filter(None, (how, record.detail)))
-    return how  # the detail says the same
+    return how  # the detail has the code or signal, too
 
 
 def _level(record: Record) -> int:

@@ -1,4 +1,4 @@
-"""Health: whether a child's process has what it needs to work: descriptors, rights, and its root."""
+"""Health: checks that a child's process has what it needs to work: descriptors, rights, and its root."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 _OF_ALL = (errno.ENFILE, errno.ENOMEM, errno.EINTR, errno.EIO, errno.ENOENT, errno.ENOTDIR)
-"""What a process in its place would suffer from as well."""
+"""Errors that a new process in its place would have as well."""
 
 
 _SPARE = 8
-"""Descriptors that must be free: a connection and a segment of a journal take some, and give them back."""
+"""How many descriptors must be free: a connection or a segment of a journal takes some for a while."""
 
 
 class Health:
-    """Looks after this process, from now on.
+    """The health of this process.
 
     Args:
-        directories: those it works in, now.
+        directories: returns the directories in which the process works now.
     """
 
     def __init__(self, directories: Callable[[], Iterable[Path]]) -> None:
@@ -29,8 +29,8 @@ class Health:
     def trouble(self) -> str:
         """Return why this process cannot go on, in words; "" if it can.
 
-        To open a directory takes free descriptors and the rights to it. Only what another process in its place would
-        not suffer from is trouble. Blocks for some 10 µs for each directory.
+        It opens each directory, which takes free descriptors and the rights to it. An error that a new process would
+        have as well is no trouble. Blocks for some 10 µs for each directory.
         """
         if not os.path.samestat(self._root, os.stat("/")):
             return "has another root directory than it was started in (chroot)"

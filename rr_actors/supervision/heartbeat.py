@@ -1,7 +1,7 @@
-"""Heartbeat: whether the loop of a child's process is alive, and the process able to work.
+"""Heartbeat: checks that the loop of a child's process is alive, and that the process can work.
 
-The answer is the loop's own: a user's callback may take as long as it likes, and a process that is stopped, holds
-the interpreter or blocks its loop is found out. With it comes what health.py finds there.
+The loop itself answers, so a user's callback may take any time. A process that is stopped, holds the interpreter or
+blocks its loop does not answer. The answer has the trouble that health.py finds in that process.
 
 A supervisor that itself stood still (SIGSTOP for the whole process group, a suspended machine, a debugger) does not
 count that time: the child may have stood still with it.
@@ -14,17 +14,17 @@ from collections.abc import Callable
 
 from rr_actors.runtime.time_limits import wait_while_running
 
-_LAST_LOOK = 1 / 20  # of the limit: how much longer an answer is waited for that has come and is not read yet
+_LAST_LOOK = 1 / 20  # of the limit: how much longer to wait for an answer that has arrived unread
 
 
 class Heartbeat:
-    """Asks twice in `limit_s` whether the child's loop is alive, from now on. On the loop.
+    """Asks twice in each `limit_s`, from now on, whether the child's loop is alive. On the loop.
 
     Args:
         ping: sends the question.
-        hung: called once there was no answer for `limit_s`; then no more is asked.
-        ill: called with the trouble that two answers in a row told of: what passes by itself is no reason. Then no more
-            is asked.
+        hung: called if there was no answer for `limit_s`. That ends the heartbeat.
+        ill: called with the trouble if two answers in a row had one: it may pass by itself after the first. That
+            ends the heartbeat.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Heartbeat:
         self._asking = asyncio.get_running_loop().create_task(self._ask())
 
     def heard(self, trouble: str) -> None:
-        """The answer has come, with the trouble that the process is in."""
+        """Note the answer, with the trouble of the process."""
         if self._answer is not None and not self._answer.done():
             self._answer.set_result(trouble)
 

@@ -1,8 +1,8 @@
-"""Imports: which modules are being imported now, and which a child process would import, too.
+"""Import guard: refuses to start children whose processes would import a module that is being imported now.
 
 A child process imports the modules that its ChildSpec refers to. If one of them starts the system while it is imported,
-the child would start a system as well, and so on without end. Before that, this process would hang: the module's import
-lock belongs to the thread that waits for the start, and the worker that pickles the ChildSpec waits for that lock.
+the child would start a system as well, and so on without end. Before that, this process would hang. The thread that
+waits for the start has the module's import lock, and the worker that pickles the ChildSpec waits for that lock.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ _INSTEAD = (
 
 
 def in_progress() -> set[str]:
-    """The names of the modules whose import has begun and is not over."""
+    """Return the names of the modules whose import has begun and is not over."""
     return {name for name, module in list(sys.modules.items()) if _is_initializing(module)}
 
 
 def check_children_can_import(spec: ChildSpec, path: str, what: str) -> None:
-    """That the child processes that start with this child can import what they need: none of it is being imported now.
+    """Check that no module which the processes of this child and of those below it need is being imported now.
 
     Args:
-        path: of the child.
+        path: the child's.
         what: the call that starts it, "system 'robot': start()".
 
     Raises:
-        UsageError: a module that one needs is being imported now.
-        NotSerializable: what one needs cannot travel. (It is looked at only while a module is being imported.)
+        UsageError: a module that such a process needs is being imported now.
+        NotSerializable: the ChildSpec cannot be pickled. (It is pickled only while a module is being imported.)
     """
     if not (now := in_progress()):
         return
@@ -59,10 +59,10 @@ def _check(modules: set[str], now: set[str], path: str, what: str) -> None:
 
 
 def check_no_child_imports(what: str) -> None:
-    """That this is no child process that is importing a module: the parent would not expect what that module starts.
+    """Check that this is no child process in the middle of an import: it would start one more system.
 
     Raises:
-        UsageError: it is.
+        UsageError: it is one.
     """
     if fork_server.inherited is not None and (now := in_progress()):
         modules = ", ".join(map(repr, sorted(now)))
@@ -73,7 +73,7 @@ def check_no_child_imports(what: str) -> None:
 
 
 def _is_initializing(module: object) -> bool:
-    try:  # not by getattr: a module that is loaded lazily would be loaded now
+    try:  # not by getattr: it would load a lazy module
         spec = cast("dict[str, object]", object.__getattribute__(module, "__dict__")).get("__spec__")
     except AttributeError:
         return False
@@ -81,6 +81,6 @@ def _is_initializing(module: object) -> bool:
 
 
 def _with_packages(module: str) -> list[str]:
-    """ "a", "a.b" and "a.b.c" for "a.b.c": importing it imports those."""
+    """Return "a", "a.b" and "a.b.c" for "a.b.c": the import of the last imports the others."""
     parts = module.split(".")
     return [".".join(parts[: count + 1]) for count in range(len(parts))]

@@ -1,6 +1,6 @@
-"""Entries: what a supervisor says in the directory of its children, and of all that is below them.
+"""Entries: a supervisor's entries in the directory for its children and for all actors below them.
 
-A child says itself that it is UP. Everything else is its supervisor's to say, since the dead cannot.
+A child itself writes that it is UP. Its supervisor writes every other status, since a dead child cannot.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Entries:
         self._directory = directory
 
     def mark(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> list[str]:
-        """Say where a child is now, and why, and its registrar, and what is below it. Returns those registrars.
+        """Mark a child, its registrar and all below it with a status. Return the registrars if the status is GONE.
 
-        The directory may be gone, with the system; that is logged.
+        An error is logged: the directory may be gone, with the system.
         """
         registrars: list[str] = []
         try:
@@ -41,7 +41,7 @@ class Entries:
         return registrars if status is Status.GONE else []
 
     def announce(self, spec: ChildSpec, path: str) -> None:
-        """Say of the top of a tree, of which no supervisor says anything, and of all below it that it is STARTING.
+        """Mark the top of a tree, which has no supervisor, and all below it as STARTING.
 
         Raises:
             ConfigError: the directory cannot be written.
@@ -54,16 +54,16 @@ class Entries:
         what = spec.actor_class_or_manager
         if isinstance(what, type) and issubclass(what, Manager):
             name = path.rpartition("/")[2]
-            if status is Status.STARTING:  # by its classes others find it: `load(Cameras.open_camera, ...)`
+            if status is Status.STARTING:  # others find it by its classes: `load(Cameras.open_camera, ...)`
                 self._directory.put_classes(name, class_names(what))
             self._directory.mark(registrar_key(name), status, why)
 
     def check_names(self, spec: ChildSpec, path: str) -> None:
-        """That no registrar that a new child would bring is there already, below another supervisor or opened by hand.
+        """Check that no registrar of a new child exists already, below another supervisor or opened by hand.
 
         Raises:
-            NameTaken: one is; it is left alone.
-            InvalidSpec: one has the name of a client's.
+            NameTaken: one does; it is left alone.
+            InvalidSpec: one has a client's name.
         """
         names = registrars_of(spec, path)
         check_managers(names, f"start_child: {path}")
@@ -74,18 +74,18 @@ class Entries:
                 raise NameTaken(text, name=name)
 
     def pids_below(self, path: str) -> list[int]:
-        """The processes of the actors below `path`."""
+        """Return the ids of the processes of the actors below `path`."""
         entries = [self._directory.lookup(key) for key in self._directory.actors_below(path)]
         pids = {pid_of(entry.address) for entry in entries if entry is not None and entry.status is Status.UP}
         return [pid for pid in pids if pid is not None]
 
     def forget_dynamic(self, spec: ChildSpec, path: str, managers: set[str]) -> list[str]:
-        """The supervisor at `path` has died with all below it; what was added there at run time will not come back.
+        """Mark the children that were added at run time below `path` as GONE: their supervisor there has died.
 
         Args:
             managers: the paths of the managers that were running below it.
 
-        Returns: the registrars of those that will not.
+        Returns: the registrars of those managers that will not come back.
         """
         static = {where for where, _ in starting_with(spec, path)}
         known = {actor_key(where) for where in static}
@@ -99,16 +99,16 @@ class Entries:
 
 
 def is_manager(spec: ChildSpec) -> bool:
-    """Whether the child has a registrar."""
+    """Return whether the child is a Manager, which has a registrar."""
     what = spec.actor_class_or_manager
     return isinstance(what, type) and issubclass(what, Manager)
 
 
 def check_managers(names: list[str], where: str) -> None:
-    """That no manager has the name of a client's registrar: these are given up when the application was killed.
+    """Check that no manager has the name of a client's registrar. Those are given up when their application is killed.
 
     Raises:
-        InvalidSpec: one has.
+        InvalidSpec: a manager has such a name.
     """
     for name in names:
         if name.startswith(CLIENTS):
@@ -117,5 +117,5 @@ def check_managers(names: list[str], where: str) -> None:
 
 
 def registrars_of(spec: ChildSpec, path: str) -> list[str]:
-    """The registrars of the child at `path` and of all that start with it: the names of managers are theirs."""
+    """Return the registrars of the child at `path` and of all that start with it. They are named like the managers."""
     return [where.rpartition("/")[2] for where, child in starting_with(spec, path) if is_manager(child)]

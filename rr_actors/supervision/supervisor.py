@@ -51,7 +51,7 @@ __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "tar
 logger = logging.getLogger("rr_actors.supervision")
 
 CALL_TIMEOUT_S = 60.0
-_LOOK_S = 1.0  # for each supervisor that an error is to name
+_LOOK_S = 1.0  # to ask each supervisor that an error names
 _SHOWN = 10  # supervisors in an error
 
 
@@ -72,11 +72,11 @@ class Child(NamedTuple):
 
 
 Answer = Callable[[Reply], None]
-"""The `caller` of the core's decisions: what to call with its Reply."""
+"""The `caller` of the core's decisions: a function that is called with the Reply."""
 
 
 class SupervisorActor(LoopActor):
-    """Starts, watches, restarts and stops its children, as supervision/core/restarts.py decides.
+    """The actor that starts, watches, restarts and stops its children, as supervision/core/restarts.py decides.
 
     Its on_start returns when all children are ready. It ends with reason "shutdown" when it has restarted too often, or
     by auto_shutdown.
@@ -104,11 +104,11 @@ class SupervisorActor(LoopActor):
 
     @property
     def is_starting(self) -> bool:
-        """Whether not all its children are ready yet, so that it answers nobody."""
+        """Whether some children are not ready yet. Until they are, the supervisor does not answer."""
         return not self._started.done()
 
     async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
-        if not self._all_down.done():  # told to stop already
+        if not self._all_down.done():  # it may have been asked to stop
             self._supervision.start()
         await self._all_up
 
@@ -121,7 +121,7 @@ class SupervisorActor(LoopActor):
             self._report = ExitReport("shutdown", str(ending.error), ending.error, text)
 
     async def on_failure(self, *_: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """A defect here must not leave children that nobody supervises."""
+        """Stop the children after a defect of this class: none must run without a supervisor."""
         if not self._all_down.done():
             self._supervision.stop(final=False)
         await self._all_down
@@ -146,7 +146,7 @@ class SupervisorActor(LoopActor):
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
         if isinstance(message, Change):
-            self._change(message, reply)  # answered later: it must not hold up other messages
+            self._change(message, reply)  # answered later, so that other messages do not wait
         elif reply is None and not is_stop(message):
             logger.error(
                 "supervisor %s: dropped a message that is no supervisor's call: %r", self._supervision.path, message
@@ -232,10 +232,10 @@ class SupervisorActor(LoopActor):
 
 
 def target_of(spec: ChildSpec) -> tuple[type[Any], Sequence[Any], Mapping[str, Any]]:
-    """The class to start for a child in this process, and its arguments.
+    """Return the class to start for a child in this process, and its arguments.
 
     Raises:
-        InvalidSpec: it is not a class that can be hosted.
+        InvalidSpec: the class cannot be hosted, or does not take its arguments.
     """
     what = spec.actor_class_or_manager
     if isinstance(what, Supervisor):
@@ -371,7 +371,7 @@ class SupervisorRef:
             raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
         self._ask(Change("update", spec))
         path, new = self.path, spec
-        while "/" in path:  # a supervisor that is respawned gets its specification from its parent
+        while "/" in path:  # the parent must have the new specification for the next start
             path, _, id = path.rpartition("/")
             new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(ChildUpdated(id, new))
 
@@ -411,10 +411,10 @@ class SupervisorRef:
 
 
 def supervisor_at(path: str, directory: Directory) -> SupervisorRef:
-    """The supervisor at `path`, below the root; one that is stopped, or being respawned, too.
+    """Return the supervisor at `path`, also if it is stopped or being respawned.
 
     Raises:
-        NotFound: the directory knows of nothing there, or that it is gone; `.known`.
+        NotFound: the directory has no such path, or says that it is gone; `.known`.
     """
     try:
         entry = directory.lookup(actor_key(path))
@@ -433,7 +433,7 @@ def _listed(known: Sequence[str]) -> str:
 
 
 def _asker_below(path: str) -> str | None:
-    """The actor whose handler asks, if it is below the supervisor at `path`."""
+    """Return the name of the actor whose handler asks, if it is below the supervisor at `path`."""
     me = activity.get()
     if me is None or not me.active or not me.target.urn.startswith(urn_of_path(path) + "/"):
         return None
@@ -455,7 +455,7 @@ def _too_early(path: str, asker: str) -> ActorUnavailable:
 
 
 def _supervisors(path: str) -> Iterator[str]:
-    """The paths of the supervisor at `path` and of those below it, as far as they can be asked."""
+    """Yield the paths of the supervisor at `path` and of the supervisors below it that answer."""
     try:
         children: list[Child] = ref_to(path).ask(Question("which_children"), timeout=_LOOK_S)
     except (RrError, ActorDeadError, pykka.Timeout):

@@ -1,4 +1,4 @@
-"""Backoff: how long to wait before a restart. Off unless a ChildSpec has one; OTP's supervisor knows none."""
+"""Backoff: how long to wait before a restart. It is off unless a ChildSpec has one. OTP's supervisor has none."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rr_actors.base.checks import check_number, invalid
 
 @dataclass(frozen=True)
 class Backoff:
-    """Growing waiting times before the restarts of a child. Its state is "restarting" meanwhile.
+    """Growing waiting times before the restarts of a child. The child's state is "restarting" meanwhile.
 
     The n-th restart in a row (n from 0) waits ``min(maximum_s, delay_s * factor**n)``. A random part of that, up to
     `jitter`, is taken off: children that failed together do not restart together. A child that has run for `maximum_s`
@@ -18,7 +18,7 @@ class Backoff:
 
     Args:
         delay_s: seconds before the first restart, at least 0.
-        factor: growth from one to the next, at least 1.
+        factor: growth from one wait to the next, at least 1.
         maximum_s: the longest wait in seconds, at least delay_s.
         jitter: 0 (none) to 1 (anything between no wait and all of it).
 

@@ -1,6 +1,6 @@
 """The administrative calls of a supervisor (OTP: start_child, terminate_child, restart_child, delete_child ...).
 
-`caller` is whatever tells the performer whom to answer: each call is answered by exactly one Reply(caller), at once or
+The performer knows by `caller` where an answer goes. Each call is answered by exactly one Reply(caller), at once or
 when the start or stop that it needs is done. OTP's answers are errors here:
 
     {error, {already_started, Pid}}  AlreadyStarted      {error, running}             ChildRunning
@@ -9,8 +9,8 @@ when the start or stop that it needs is done. OTP's answers are errors here:
     {error, Reason}                  StartFailed
 
 Calls on a supervisor that is stopping or has stopped are answered with NotFound. Manual starts and stops never count as
-restarts. A call about a child that a caller is starting or stopping waits for that; one about a child that is being
-restarted does not. Under one_for_all and rest_for_one a start waits for its turn while the group restarts.
+restarts. A call about a child that a caller is starting or stopping waits until that is done. A call about a child that
+is being restarted does not. Under one_for_all and rest_for_one a start waits for its turn while the group restarts.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ from rr_actors.supervision.core.transition import Draft
 def start_child(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, now: float) -> Decision:
     """Add a child after the others and start it; under simple_one_for_one `spec` is a list of additional arguments.
 
-    Reply: its id, or None when it said IGNORE (its specification is kept, unless temporary or dynamic); AlreadyStarted,
-    AlreadyPresent; StartFailed (then it is not a child); InvalidSpec; TooManyChildren.
+    Reply: the child's id, or None if its on_start returned IGNORE. (The specification is kept then, unless it is
+    temporary or dynamic.) Errors: AlreadyStarted, AlreadyPresent, StartFailed (nothing is added), InvalidSpec,
+    TooManyChildren.
     """
     draft = Draft(tree, now)
     try:
@@ -59,30 +60,35 @@ def start_child(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller
 
 
 def terminate_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decision:
-    """Stop a child, if it is up, coming up or about to be restarted. Its specification stays, unless it is temporary
-    or dynamic. Reply when it is down (as for a dynamic child that has ended already); NotFound; NotForDynamic for a
-    template."""
+    """Stop a child that runs, starts or is about to be restarted.
+
+    Its specification stays, unless it is temporary or dynamic. Reply when the child is down, at once for a dynamic
+    child that has ended already. Errors: NotFound, NotForDynamic for a template.
+    """
     return _perform(Draft(tree, now), Call("terminate", id, caller))
 
 
 def restart_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decision:
-    """Start a stopped child again. Reply: its id, or None (IGNORE); ChildRunning, ChildRestarting, NotFound,
-    NotForDynamic; StartFailed (it stays stopped)."""
+    """Start a stopped child again.
+
+    Reply: its id, or None (IGNORE). Errors: ChildRunning, ChildRestarting, NotFound, NotForDynamic, StartFailed (the
+    child stays stopped).
+    """
     return _perform(Draft(tree, now), Call("restart", id, caller))
 
 
 def delete_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decision:
-    """Drop a stopped child's specification. Reply; ChildRunning, ChildRestarting, NotFound, NotForDynamic."""
+    """Drop a stopped child's specification. Errors: ChildRunning, ChildRestarting, NotFound, NotForDynamic."""
     return _perform(Draft(tree, now), Call("delete", id, caller))
 
 
 def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decision:
     """Give the supervisor a new specification (OTP: code_change).
 
-    Children it names stay as they are and have their new specification from their next start on; new ones are added,
-    stopped; those it does not name are kept, after the others. Order, strategy and intensity are the new ones at once.
-    Its restart, shutdown_s, significant and placement are its parent's affair: see `update_child`.
-    Reply; InvalidSpec, with nothing changed: another id, or from or to simple_one_for_one.
+    Children that it names stay as they are, and get their new specification at their next start. New children are
+    added, stopped. Children that it does not name are kept, after the others. Order, strategy and intensity change at
+    once. The parent decides on restart, shutdown_s, significant and placement: `update_child` keeps them.
+    Error: InvalidSpec, with nothing changed, for another id, or a change from or to simple_one_for_one.
     """
     draft = Draft(tree, now)
     try:
@@ -106,9 +112,9 @@ def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decisi
 
 
 def update_child(tree: Tree, id: str, spec: Supervisor) -> Tree:
-    """Note that the child supervisor `id` has been given a new specification: its next start will be by that one.
+    """Note that the child supervisor `id` has been given a new specification, and use that one at its next start.
 
-    Only a static child's is kept in `tree.spec`, too, which the supervisor's own parent wants to know then.
+    The specification of a static child is also kept in `tree.spec`. The supervisor's own parent must hear of that.
     """
     child = find_child(tree, id)
     inner = child.spec.actor_class_or_manager
@@ -122,11 +128,11 @@ def update_child(tree: Tree, id: str, spec: Supervisor) -> Tree:
     return replace(tree, spec=dataclasses.replace(tree.spec, children=static), children=children)
 
 
-# -- questions -----------------------------------------------------------------------------------------------------
+# -- questions, answered at once in every mode ----------------------------------------------------------------------
 
 
 class Counts(NamedTuple):
-    """specs: specifications, of living and dead children; active: running children; the rest by their type."""
+    """Numbers of specifications (of living and dead children), of running children (`active`), and of each type."""
 
     specs: int
     active: int
@@ -135,12 +141,12 @@ class Counts(NamedTuple):
 
 
 def which_children(tree: Tree) -> list[Child]:
-    """All children, newest first, as OTP lists them. Any time, at once."""
+    """Return all children, newest first, as OTP lists them."""
     return list(reversed(tree.children.values()))
 
 
 def count_children(tree: Tree) -> Counts:
-    """How many there are. Any time, at once. Under simple_one_for_one specs is 1, the template."""
+    """Count the children. Under simple_one_for_one `specs` is 1, the template."""
     children = tree.children.values()
     supervisors = sum(child.spec.type == "supervisor" for child in children)
     active = sum(child.state == "running" for child in children)
@@ -148,8 +154,9 @@ def count_children(tree: Tree) -> Counts:
 
 
 def get_childspec(tree: Tree, id: str) -> ChildSpec:
-    """The specification of a child; of a dynamic one with its own id and all its arguments, by the template's id the
-    template.
+    """Return the specification of a child, or the template for the template's id.
+
+    The specification of a dynamic child has the child's own id and all its arguments.
 
     Raises:
         NotFound: there is no such child.
@@ -160,10 +167,10 @@ def get_childspec(tree: Tree, id: str) -> ChildSpec:
 
 
 def find_child(tree: Tree, id: str) -> Child:
-    """The child of that id.
+    """Return the child of that id.
 
     Raises:
-        NotFound: naming the supervisor, the id and the children there are.
+        NotFound: it names the supervisor, the id and the existing children.
     """
     child = tree.children.get(id)
     if child is None:
@@ -175,7 +182,7 @@ def find_child(tree: Tree, id: str) -> Child:
 
 
 def replay(draft: Draft, calls: Sequence[Call]) -> None:
-    """Do the calls that waited for a child's start or stop to end."""
+    """Do the calls that waited until a child's start or stop had ended."""
     for call in calls:
         _do(draft, call)
 
@@ -224,7 +231,7 @@ def _terminate(draft: Draft, child: Child, caller: Hashable) -> None:
     match child.phase:
         case Phase.STOPPED if not draft.forgets(child):
             draft.reply([caller])
-        case Phase.DUE | Phase.STOPPED:  # a temporary one can be stopped already if it came with an update
+        case Phase.DUE | Phase.STOPPED:  # a temporary child is STOPPED only if an update added it
             draft.down(child, "stopped")
             draft.reply([caller])
             replay(draft, child.waiting)
@@ -235,7 +242,7 @@ def _terminate(draft: Draft, child: Child, caller: Hashable) -> None:
 
 
 def _standing(child: Child) -> Literal["running", "restarting", "stopped"] | None:
-    """What a call finds; None: wait for its end, a start or stop that somebody asked for goes on."""
+    """Return a child's state for a call; None if the call must wait for a start or stop that a caller asked for."""
     match child.phase:
         case Phase.STOPPED:
             return "stopped"
@@ -274,7 +281,7 @@ def _not_found(tree: Tree, id: str) -> NotFound:
 
 
 def _absent(tree: Tree, id: str) -> RrError | None:
-    """What terminate_child is answered about a child that is not there: as in OTP, None for a dynamic one of old."""
+    """Return the answer to terminate_child for an unknown id: an error, or None for a past dynamic child, as in OTP."""
     if tree.dynamic and id == tree.template.id:
         return NotForDynamic(f"terminate_child({id!r}): this is the template of {tree.path}; name a child", id=id)
     if tree.dynamic and id.startswith(stem := tree.dynamic_id("")):
@@ -285,11 +292,11 @@ def _absent(tree: Tree, id: str) -> RrError | None:
 
 
 def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable) -> Child:
-    """The child that start_child is about.
+    """Return the child that start_child adds.
 
     Raises:
-        InvalidSpec: not what this supervisor takes.
-        TooManyChildren: it has max_children.
+        InvalidSpec: this supervisor does not take such a child.
+        TooManyChildren: the supervisor has max_children.
     """
     who = f"start_child of {tree.path}"
     if tree.dynamic:
@@ -303,11 +310,11 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
             raise TooManyChildren(text, id=tree.path, limit=limit)
         id = tree.dynamic_id(str(tree.last_dynamic + 1))
         child = Child(id, tree.template, tuple(spec), why=Why.NEW, starters=(caller,))
-        _ = child.start_spec  # raises what is wrong with the arguments
+        _ = child.start_spec  # raises InvalidSpec if the arguments are wrong
         return child
     if not isinstance(spec, ChildSpec | Supervisor):
         expected = "a ChildSpec or Supervisor"
-        # What it is and not what it says: this is on the loop, and a user's repr may do anything.
+        # The text has the type, not the repr: this runs on the loop, and a user's repr may do anything.
         text = f"{who}: expected {expected}, got a {type(spec).__name__}"
         raise InvalidSpec(text, field="spec", expected=expected, got=spec)
     check_significant(spec, tree.spec, spec.id)

@@ -1,7 +1,7 @@
 """Rendering: a supervisor tree as text, as a Mermaid graph and in DOT. It works on plain data.
 
 A node, of a running tree or of a specification, is a dict with "id", "path", "type" ("supervisor" or "worker") and, for
-a supervisor, "children". What else it has ("strategy", "state", "pid", "restarts", "what" ...) is shown, too.
+a supervisor, "children". Its other entries ("strategy", "state", "pid", "restarts", "what" ...) are shown, too.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Tree:
         return "\n".join([*lines, "}"])
 
     def svg(self) -> str:
-        """Return an SVG document, drawn here. Of more than 500 nodes it has the first."""
+        """Return an SVG document, drawn without other programs. It has the first 500 nodes."""
         return draw(svg_boxes(self.data), list(tree_edges(self.data)))
 
     def paths(self) -> list[str]:
@@ -91,7 +91,7 @@ def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") 
         format: "text", "mermaid", "dot" or "svg".
 
     Raises:
-        UsageError: it is no tree, or there is no such format.
+        UsageError: `what` is no tree, or the format is unknown.
     """
     if isinstance(what, Supervisor | ChildSpec):
         tree = Tree(describe_spec(what))
@@ -115,7 +115,7 @@ def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") 
 
 
 def describe_spec(spec: Supervisor | ChildSpec, above: str = "") -> dict[str, Any]:
-    """A specification as plain data."""
+    """Return a specification as plain data."""
     child = as_child_spec(spec)
     inner = child.actor_class_or_manager
     path = f"{above}/{child.id}" if above else child.id
@@ -134,7 +134,7 @@ def describe_spec(spec: Supervisor | ChildSpec, above: str = "") -> dict[str, An
 
 
 def describe_settings(spec: Supervisor) -> dict[str, Any]:
-    """What a supervisor does about ends, as plain data."""
+    """Return how a supervisor reacts when children end, as plain data."""
     settings: dict[str, Any] = {
         "strategy": spec.strategy,
         "max_restarts": spec.max_restarts,
@@ -145,7 +145,7 @@ def describe_settings(spec: Supervisor) -> dict[str, Any]:
 
 
 def svg_boxes(root: Node) -> dict[str, Box]:
-    """The boxes of a tree's nodes, by their paths: the state is a colour, and written."""
+    """Return the boxes of a tree's nodes, by path. A box shows the state by its colour and in words."""
     return {
         node["path"]: Box(_label(node), _SHADES.get(_state(node), _WELL), node["type"] == "supervisor")
         for node, _ in _walk(root)
@@ -156,7 +156,7 @@ def svg_boxes(root: Node) -> dict[str, Box]:
 
 
 def _facts(node: Node) -> tuple[str, ...]:
-    """The cells of a line after the id."""
+    """Return the cells that follow the id in a line."""
     return (
         node["type"],
         _settings(node) or node.get("what", ""),
@@ -169,7 +169,7 @@ def _facts(node: Node) -> tuple[str, ...]:
 
 
 def _label(node: Node) -> list[str]:
-    """The lines in a box of a graph."""
+    """Return the lines of a node's box in a graph."""
     _, settings, state, process, restarts, spec, significant = _facts(node)
     life = ", ".join(part for part in (state, process, restarts) if part)
     return [line for line in (node["id"], settings, life, spec, significant) if line]
@@ -200,7 +200,7 @@ def _settings(node: Node) -> str:
 
 
 def _walk(root: Node, first: str = "", then: str = "") -> Iterator[tuple[Node, str]]:
-    """Each node with the branches that lead to it."""
+    """Yield each node with the branches that are drawn before it."""
     yield root, first
     children = root.get("children", ())
     for number, child in enumerate(children, 1):
@@ -209,7 +209,7 @@ def _walk(root: Node, first: str = "", then: str = "") -> Iterator[tuple[Node, s
 
 
 def tree_edges(root: Node) -> Iterator[tuple[str, str]]:
-    """From each supervisor to its children, by their paths."""
+    """Yield an edge from each supervisor to each of its children, as paths."""
     for child in root.get("children", ()):
         yield root["path"], child["path"]
         yield from tree_edges(child)
@@ -224,10 +224,10 @@ def _escape_dot(text: str) -> str:
 
 
 def mermaid_text(text: str) -> str:
-    """Return a text as Mermaid reads it in a label."""
+    """Return a text in the quoted form of a Mermaid label."""
     return f'"{_escape_mermaid(text)}"'
 
 
 def dot_text(text: str) -> str:
-    """Return a text as Graphviz reads it as a name or a label."""
+    """Return a text in the quoted form of a Graphviz name or label."""
     return f'"{_escape_dot(text)}"'

@@ -1,7 +1,7 @@
-"""What a supervisor does when a child starts, fails to start, ends or has been stopped: decisions, no deeds.
+"""Decides what a supervisor does when a child starts, fails to start, ends or has been stopped.
 
-Every function takes the Tree and returns the next one with the actions to perform (state.py, which also says what the
-performer owes in return). `now` is monotonic seconds, `chance` a random number in [0, 1] for the backoff's jitter.
+Every function takes the Tree, and returns the next Tree with the actions to perform. (state.py has them, and the duties
+of the performer.) `now` is monotonic seconds, `chance` a random number in [0, 1] for the backoff's jitter.
 Administrative calls (start_child, terminate_child ...) are in child_calls.py.
 """
 
@@ -33,11 +33,11 @@ from rr_actors.supervision.core.transition import Draft, exceeded
 PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
 """The least wait after a start that failed for want of descriptors, memory or threads.
 
-More starts make it worse. With this pause the default intensity of a supervisor, 3 in 5 s, is not exceeded."""
+More starts would make it worse. With this pause the default intensity of a supervisor, 3 in 5 s, is not exceeded."""
 
 
 def needs_restart(restart: RestartType, reason: Reason) -> bool:
-    """OTP's manual, "restart type": permanent always, temporary never, transient unless it ended normal or shutdown."""
+    """Return whether a child is restarted after this reason, as OTP's manual says under "restart type"."""
     match restart:
         case "permanent":
             return True
@@ -51,10 +51,10 @@ def needs_restart(restart: RestartType, reason: Reason) -> bool:
 
 
 def decide_start(tree: Tree, now: float) -> Decision:
-    """Start the supervisor: its children one after another, each once the one before it is ready.
+    """Start the supervisor: start each child when the child before it is ready.
 
-    SupervisorStarted follows when all are; or, when one fails, those before it are stopped in reverse order and
-    ExitSupervisor has StartFailed. A child that ends meanwhile is restarted as it would be later.
+    SupervisorStarted follows when all children are ready. If one fails, the children before it are stopped in reverse
+    order, and ExitSupervisor has StartFailed. A child that ends meanwhile is restarted as usual.
     """
     if tree.mode is not Mode.NEW:
         raise UsageError(f"supervisor {tree.path}: started twice (it is {tree.mode.name.lower()})")
@@ -66,9 +66,9 @@ def decide_start(tree: Tree, now: float) -> Decision:
 
 
 def decide_stop(tree: Tree, now: float) -> Decision:
-    """Stop the supervisor: children in reverse order (under simple_one_for_one all at once), then ExitSupervisor.
+    """Stop the children in reverse order (under simple_one_for_one all at once), then the supervisor.
 
-    Any time: running starts and backoffs are cut short. A second one changes nothing.
+    Starts and backoffs in progress are cut short. A second call changes nothing.
     """
     if tree.mode is Mode.NEW:
         return replace(tree, mode=Mode.STOPPED), [ExitSupervisor("shutdown")]
@@ -83,7 +83,7 @@ def decide_stop(tree: Tree, now: float) -> Decision:
 
 
 def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool = False) -> Decision:
-    """That run is ready. `ignored`: its on_start returned IGNORE and nothing of it runs."""
+    """Note that this run is ready, or, with `ignored`, that its on_start returned IGNORE and nothing of it runs."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
@@ -100,7 +100,7 @@ def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool =
         case Child(phase=Phase.CONDEMNED):
             draft.put(child, up_at=now)
         case _:
-            return tree, []  # it is being stopped: decide_stopped will come
+            return tree, []  # the child is being stopped: decide_stopped follows
     draft.advance()
     return draft.done()
 
@@ -108,13 +108,13 @@ def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool =
 def decide_start_failed(
     tree: Tree, id: str, run: int, reason: BaseException, now: float, chance: float = 0.0
 ) -> Decision:
-    """That run did not become ready; nothing of it is left. `reason` is what its on_start raised, or what killed it."""
+    """Decide on a run that did not become ready and has ended. `reason` is the error of its on_start or of its end."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
         case Child(phase=Phase.STARTING):
             _start_failed(draft, child, reason, chance)
-        case Child(phase=Phase.CONDEMNED):  # its start was called off already: it does not count
+        case Child(phase=Phase.CONDEMNED):  # a group restart was about to stop it: the failure does not count
             draft.report("start_failed", child, child.state, error=reason)
             draft.put(child, phase=Phase.DUE)
         case _:
@@ -146,13 +146,13 @@ def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: flo
 
 
 def decide_exit(tree: Tree, id: str, run: int, exit: Exit, now: float, chance: float = 0.0) -> Decision:
-    """That run, which had been ready, ended without having been told to by a StopChild."""
+    """Decide on a run that had been ready and has ended without a StopChild."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
         case Child(phase=Phase.RUNNING):
             _exited(draft, child, exit, chance)
-        case Child(phase=Phase.CONDEMNED):  # it went before its turn: does not count, as it would have been stopped
+        case Child(phase=Phase.CONDEMNED):  # a group restart was about to stop it: its end does not count
             _gone_early(draft, child, exit)
         case Child(phase=Phase.STARTING):
             return decide_start_failed(tree, id, run, StartFailed(f"ended before it was ready: {exit}"), now, chance)
@@ -163,7 +163,7 @@ def decide_exit(tree: Tree, id: str, run: int, exit: Exit, now: float, chance: f
 
 
 def decide_stopped(tree: Tree, id: str, run: int, exit: Exit, now: float) -> Decision:
-    """The StopChild of that run is done; `exit` says how it went (normal or shutdown, or killed when it overstayed)."""
+    """Note that the StopChild of this run is done. `exit` is normal or shutdown, or killed after the time limit."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
@@ -205,7 +205,7 @@ def _gone_early(draft: Draft, child: Child, exit: Exit) -> None:
 def _restart(
     draft: Draft, child: Child, event: Event, reason: str, chance: float, least_s: float = 0.0, **details: Any
 ) -> None:
-    """It is down and needs a restart: count it, and start it or its group; or, when that was one too many, give up."""
+    """Count a restart of a child that is down, and start it or its group; give up if that restart is one too many."""
     spec, count = draft.tree.spec, draft.count_restart(child, reason)
     if count > spec.max_restarts:
         error = exceeded(draft.tree.path, draft.tree.restarts, spec.max_restarts, spec.max_seconds, draft.now)
@@ -220,7 +220,7 @@ def _restart(
 
 
 def _auto_shutdown(draft: Draft, child: Child) -> None:
-    """A significant child has ended by itself (OTP: any_significant, all_significant)."""
+    """Stop the supervisor if this child's own end demands it (OTP: any_significant, all_significant)."""
     when = draft.tree.spec.auto_shutdown
     if when == "never" or not child.spec.significant:
         return

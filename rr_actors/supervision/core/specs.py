@@ -1,8 +1,8 @@
-"""ChildSpec and Supervisor: what to start, when to restart it, how to stop it. Backoff is in backoff.py.
+"""ChildSpec and Supervisor: how to start, restart and stop children. Backoff is in backoff.py.
 
-They are checked when they are made: a specification that exists is a valid one, except for what needs to know the class
-(whether it is a Manager, an Actor or a plain Pykka actor: checked where it is used). Names and meanings are those of
-Erlang/OTP's supervisor, the default intensity is Elixir's; docs/otp.md goes through the differences.
+A specification is checked when it is made, so each one is valid. One check comes later, when the class is used: that
+it is a Manager, an Actor or a plain Pykka actor. Names and meanings are those of Erlang/OTP's supervisor. The
+default intensity is Elixir's. docs/otp.md lists the differences.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class ChildSpec:
     """
 
     actor_class_or_manager: type[Any] | Supervisor
-    id: str = ""  # None does, too; afterwards it is a name
+    id: str = ""  # None means the same; after the check it is a name
     args: Sequence[Any] = ()
     kwargs: Mapping[str, Any] = field(default_factory=dict[str, Any])
     restart: RestartType = "permanent"
@@ -89,7 +89,7 @@ class ChildSpec:
         for key in cast("Mapping[object, object]", kwargs):
             if not isinstance(key, str):
                 raise invalid(who, "kwargs", "a dict with names as keys", key)
-        object.__setattr__(self, "args", tuple(self.args))  # copies: what the caller changes later is not ours
+        object.__setattr__(self, "args", tuple(self.args))  # copies, which the caller cannot change later
         object.__setattr__(self, "kwargs", dict(self.kwargs))
         if isinstance(self.actor_class_or_manager, Supervisor):
             for name, value in (("args", self.args), ("kwargs", self.kwargs)):
@@ -211,7 +211,7 @@ def child_from_toml(text: bytes, file: str) -> ChildSpec | Supervisor:
 
 
 def as_child_spec(child: ChildSpec | Supervisor) -> ChildSpec:
-    """The ChildSpec itself; for a Supervisor one around it with its restart, shutdown_s, significant and placement."""
+    """Return the ChildSpec, or one around a Supervisor with its restart, shutdown_s, significant and placement."""
     if isinstance(child, ChildSpec):
         return child
     return ChildSpec(
@@ -225,9 +225,9 @@ def as_child_spec(child: ChildSpec | Supervisor) -> ChildSpec:
 
 
 def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]]:
-    """The child at `path` and all that start with it, each with its own path, supervisors before their children.
+    """Yield the child at `path` and all that start with it, with their paths, supervisors before their children.
 
-    What a simple_one_for_one supervisor will have below it is not known beforehand.
+    The children of a simple_one_for_one supervisor are not known beforehand, and left out.
     """
     yield path, child
     inner = child.actor_class_or_manager
@@ -237,7 +237,7 @@ def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]
 
 
 def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, where: str) -> None:
-    """That `child` may be one of `supervisor`: no significant child where auto_shutdown is "never".
+    """Check that `child` may be one of `supervisor`: none is significant where auto_shutdown is "never".
 
     Raises:
         InvalidSpec: of the field `where`.significant.
@@ -248,7 +248,7 @@ def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, whe
 
 
 def _check_as_child(who: str, restart: object, shutdown_s: object, significant: object, placement: object) -> None:
-    """The fields that ChildSpec and Supervisor share."""
+    """Check the fields that ChildSpec and Supervisor share."""
     check_one_of(restart, who, "restart", get_args(RestartType))
     if isinstance(shutdown_s, str) and shutdown_s not in ("infinity", "brutal_kill"):
         raise invalid(who, "shutdown_s", "seconds, 'infinity' or 'brutal_kill'", shutdown_s)

@@ -1,17 +1,17 @@
 """The state of one supervisor as a value, and the actions that its decisions ask for.
 
 A Tree is never changed: every decision in restarts.py and child_calls.py returns a new one with the actions to perform.
-Nothing here starts, stops or waits for anything; supervision/supervisor.py does.
+Nothing here starts, stops or waits for anything; supervision/engine.py does.
 
-What the performer owes the core, for the decisions to be right:
+The duties of the performer, without which the decisions are wrong:
 
-- It calls the decisions one at a time, keeps the Tree each returns, and performs the actions in their order, at once.
-- Every StartChild has a number of its own, `run`. For each it reports one `decide_started` or `decide_start_failed`
-  (after the delay, the start, the time limit). Reports about a run that is no longer the child's are ignored, so late
-  ones do no harm.
-- A child that was reported started and ends without having been told to: one `decide_exit`.
-- Every StopChild(run) is answered by exactly one `decide_stopped`, once nothing of that run can act any more (or it has
-  been abandoned): also when that run was still waiting out its delay, was starting, or had ended by itself meanwhile.
+- It calls the decisions one at a time, keeps the Tree that each returns, and performs the actions at once, in order.
+- Every StartChild has a number of its own, `run`. For each it calls one `decide_started` or `decide_start_failed`
+  (after the delay, the start, the time limit). Late reports do no harm: those about an earlier run of the child are
+  ignored.
+- If a child that was reported as started ends without a StopChild, it calls `decide_exit` once.
+- For every StopChild(run) it calls exactly one `decide_stopped`, when nothing of that run can act any more or it is
+  abandoned: also if that run was waiting out its delay, was starting, or had ended by itself meanwhile.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Exit(Struct, frozen=True):
         reason: normal (stopped itself, exit code 0), shutdown (asked to), abnormal (exception, exit code) or killed
             (signal).
         detail: for people: "ValueError: no such device", "exit code 3", "SIGKILL".
-        code: exit code of its process, -N for signal N; None without a process or where nobody can tell.
+        code: exit code of its process, -N for signal N; None without a process, or if the code is unknown.
         traceback: of the exception that ended it, as text.
     """
 
@@ -51,7 +51,7 @@ class Exit(Struct, frozen=True):
 
 
 class Phase(enum.Enum):
-    """Where a child is between start and stop, as the core sees it."""
+    """The phase of a child between start and stop, as the core sees it."""
 
     STOPPED = enum.auto()  # down, and nothing will start it by itself (OTP: undefined)
     DUE = enum.auto()  # down, to be started when its turn comes
@@ -63,16 +63,16 @@ class Phase(enum.Enum):
 
 
 class Why(enum.Enum):
-    """What a start is for: it decides what a failure of it means."""
+    """The purpose of a start. It decides what a failed start leads to."""
 
-    INIT = enum.auto()  # the supervisor's own start: it fails with it
-    NEW = enum.auto()  # start_child: the specification is dropped, the caller told
-    MANUAL = enum.auto()  # restart_child: the child stays stopped, the caller told
-    RESTART = enum.auto()  # counted, and tried again
+    INIT = enum.auto()  # the supervisor's own start, which fails, too
+    NEW = enum.auto()  # start_child: the specification is dropped, the caller gets the error
+    MANUAL = enum.auto()  # restart_child: the child stays stopped, the caller gets the error
+    RESTART = enum.auto()  # a restart: the failure counts, and the start is tried again
 
 
 class Call(Struct, frozen=True):
-    """An administrative call. `caller` is whom to Reply to; `child` what a start would add."""
+    """An administrative call. The Reply goes to `caller`; a start adds `child`."""
 
     kind: Literal["start", "terminate", "restart", "delete"]
     id: str
@@ -87,11 +87,11 @@ class Child(Struct, frozen=True):
         id: its name; under simple_one_for_one a generated one.
         spec: its specification. Under simple_one_for_one the template's; `extra` are this child's additional arguments.
         run: number of its present or last start; 0 before the first.
-        why: what its present start is for; RESTART once it is up, as the next one will be that.
+        why: the purpose of its present start; RESTART once it is up, since the next start will be a restart.
         up_at: when this run became ready, monotonic seconds; None before.
-        attempts: restarts since it was last up long enough (for the backoff).
+        attempts: restarts since it last ran for long enough (for the backoff).
         wanting: starts in a row that failed for want of resources (base/scarcity.py).
-        starters, stoppers: callers to be told when it is up (or has failed), or down.
+        starters, stoppers: callers that get a Reply when it is up (or has failed), or down.
         waiting: calls to be made again when its start or stop has ended.
     """
 
@@ -110,7 +110,7 @@ class Child(Struct, frozen=True):
 
     @property
     def state(self) -> ChildState:
-        """What which_children shows. A child on its way down by hand is "running" until it is down."""
+        """The state that which_children shows. A child that a caller stops is "running" until it is down."""
         match self.phase:
             case Phase.STOPPED:
                 return "stopped"
@@ -121,12 +121,12 @@ class Child(Struct, frozen=True):
 
     @property
     def down(self) -> bool:
-        """Nothing of it runs."""
+        """Whether nothing of the child runs."""
         return self.phase in (Phase.STOPPED, Phase.DUE)
 
     @property
     def start_spec(self) -> ChildSpec:
-        """What to start it by: the template with its own id and extra arguments, if it is a dynamic child."""
+        """The specification for its next start; of a dynamic child the template with its own id and extra arguments."""
         if self.id == self.spec.id:
             return self.spec
         return replace(self.spec, id=self.id, args=(*self.spec.args, *self.extra))
@@ -141,7 +141,7 @@ class Restart(Struct, frozen=True):
 
 
 class Mode(enum.Enum):
-    """Where the supervisor itself is."""
+    """The phase of the supervisor itself."""
 
     NEW = enum.auto()
     STARTING = enum.auto()
@@ -151,17 +151,17 @@ class Mode(enum.Enum):
 
 
 class Tree(Struct, frozen=True):
-    """One supervisor. Make it with `Tree.of(spec, path)`.
+    """The state of one supervisor. Make it with `Tree.of(spec, path)`.
 
     Attributes:
         spec: its specification as last given (strategy, intensity, auto_shutdown ...; the children are in `children`).
         path: its place in the tree, "root/inner", for messages.
         children: by id, in start order. Not to be changed.
-        restarts: those that count, oldest first.
+        restarts: the restarts that count, oldest first.
         last_run, last_dynamic: the last numbers given out.
-        generation: part of the ids of dynamic children, see `of`.
+        generation: part of the ids of dynamic children (`of`).
         delay_s: backoff still to be waited out before the group's next start.
-        error: why it is stopping, if not because it was told to.
+        error: why it is stopping; None if it was asked to, or by auto_shutdown.
     """
 
     spec: Supervisor
@@ -177,31 +177,31 @@ class Tree(Struct, frozen=True):
 
     @staticmethod
     def of(spec: Supervisor, path: str | None = None, generation: str = "") -> Tree:
-        """The supervisor before its start: its static children stopped, or a template and no children.
+        """Return a supervisor before its start: its static children stopped, or a template and no children.
 
         Dynamic children are called "template-1", "template-2" ...; with a generation "a7", "template-a7.1". Give each
-        incarnation of a supervisor another one: a reference to a dynamic child of the last must not reach one of this.
+        incarnation of a supervisor another one. A reference to an earlier dynamic child must not reach a new one.
         """
         specs = () if spec.strategy == "simple_one_for_one" else spec.child_specs
         return Tree(spec, path or spec.id, children={s.id: Child(s.id, s) for s in specs}, generation=generation)
 
     @property
     def dynamic(self) -> bool:
-        """Its children are made at run time from one template."""
+        """Whether the children are made at run time from one template."""
         return self.spec.strategy == "simple_one_for_one"
 
     @property
     def template(self) -> ChildSpec:
-        """What all dynamic children are made by."""
+        """The specification from which all dynamic children are made."""
         return as_child_spec(self.spec.children[0])
 
     def dynamic_id(self, number: str) -> str:
-        """The id of the dynamic child with that number; not longer than an id may be."""
+        """Return the id of the dynamic child with that number, within the length limit of ids."""
         return f"{self.template.id[:40]}-{self.generation}{'.' if self.generation else ''}{number}"
 
     @property
     def grouped(self) -> bool:
-        """A restart may concern several children."""
+        """Whether a restart may concern several children."""
         return self.spec.strategy in ("one_for_all", "rest_for_one")
 
 
@@ -209,9 +209,9 @@ class Tree(Struct, frozen=True):
 
 
 class StartChild(Struct, frozen=True):
-    """Wait `delay_s`, then start it by `spec` (a dynamic child's extra arguments are in it already).
+    """Wait `delay_s`, then start the child by `spec` (which has a dynamic child's extra arguments already).
 
-    Answer with decide_started or decide_start_failed, or, if a StopChild of the same run came meanwhile, with
+    Answer with decide_started or decide_start_failed. If a StopChild of the same run came meanwhile, answer with
     decide_stopped alone.
     """
 
@@ -234,15 +234,15 @@ Event = Literal["started", "ignored", "start_failed", "exited", "stopped", "dele
 
 
 class Report(Struct, frozen=True):
-    """Something to log, keep in the history and tell subscribers.
+    """An event to log, to keep in the history and to send to subscribers.
 
     Attributes:
-        event: started, ignored (on_start returned IGNORE), start_failed, exited (by itself), stopped (it was told to),
+        event: started, ignored (on_start returned IGNORE), start_failed, exited (by itself), stopped (on request),
             deleted (by hand), gave_up (restart intensity exceeded because of this child), auto_shutdown (because of
             this significant child).
         id, run: the child and the start it is about.
-        state: the child's state from now on; None when its specification is gone, and nobody will start it again.
-        exit: how it ended, for exited and stopped (None when it was waiting for a start that will not be).
+        state: the child's state from now on; None when its specification is gone, so that it never starts again.
+        exit: how it ended, for exited and stopped (None if it only waited for a start, which is dropped).
         error: for start_failed and gave_up.
         restarts: restarts within the window, this one included.
         delay_s: the delay before the restart that follows, for exited and start_failed.
@@ -259,7 +259,7 @@ class Report(Struct, frozen=True):
 
 
 class Reply(Struct, frozen=True):
-    """The answer to an administrative call: `error` if set, else `id`: the child's, or None when it said IGNORE.
+    """The answer to an administrative call: `error` if set, else the child's `id`, or None if it returned IGNORE.
 
     start_child, restart_child: the child's id; terminate_child, delete_child, update: None.
     """
@@ -270,13 +270,13 @@ class Reply(Struct, frozen=True):
 
 
 class SupervisorStarted(Struct, frozen=True):
-    """Every child is ready (or said IGNORE). Comes once."""
+    """Every child is ready, or returned IGNORE. Comes once."""
 
 
 class ExitSupervisor(Struct, frozen=True):
-    """All children are down: end, with this reason. Comes once, last.
+    """All children are down: end the supervisor with this reason. Comes once, last.
 
-    `error`: StartFailed, RestartIntensityExceeded, or None (told to stop, auto_shutdown). If no SupervisorStarted came
+    `error`: StartFailed, RestartIntensityExceeded, or None (asked to stop, auto_shutdown). If no SupervisorStarted came
     before it, the start has failed: `error` says why, unless decide_stop cut it short.
     """
 

@@ -1,4 +1,4 @@
-"""Supervisor calls: what a SupervisorRef asks, and what it hears if there is no supervisor where it asks."""
+"""Supervisor calls: the messages of a SupervisorRef, and the error of other actors."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from rr_actors.supervision.core.specs import Supervisor
 
 
 class SupervisorCall(msgspec.Struct, frozen=True):
-    """What only a supervisor understands: no other actor is bothered with it."""
+    """A message that only a supervisor understands. Handlers of other actors never get it."""
 
 
 class Change(SupervisorCall, frozen=True):
-    """A call that is answered when a child has started or stopped. `name`: of the function in
-    supervision/core/child_calls.py.
-    """
+    """A call that is answered when a child has started or stopped. core/child_calls.py has the function `name`."""
 
     name: Literal["start_child", "terminate_child", "restart_child", "delete_child", "update"]
     subject: Any
@@ -38,14 +36,14 @@ class ChildUpdated(SupervisorCall, frozen=True):
 
 
 class NoSupervisor(NotFound):
-    """An actor of another class was asked."""
+    """The call went to an actor that is no supervisor."""
 
 
 def check_for_actor(message: object, actor: object) -> None:
-    """That a message is not one for a supervisor; `actor` is none.
+    """Check that a message to `actor`, which is no supervisor, is not a call for one.
 
     Raises:
-        NoSupervisor: it is.
+        NoSupervisor: the message is one.
     """
     if isinstance(message, SupervisorCall):
         raise NoSupervisor(f"it is no supervisor, but a child of class {type(actor).__qualname__}")

@@ -1,14 +1,13 @@
-"""A Tree on the drawing board: the working copy of one decision, and the steps all decisions are made of.
+"""Draft: the working copy of a Tree during one decision, and the steps of which all decisions are made.
 
-What to do next is never remembered but read off the children's phases by `advance`: whatever came in between, the same
-phases lead to the same next action.
+Nothing remembers what to do next: `advance` derives it from the children's phases, whatever came before.
 
-- Stopping: the last child that is up is stopped, one at a time; under simple_one_for_one all at once.
+- Stopping: children that are up are stopped one at a time, the last first; under simple_one_for_one all at once.
 - one_for_one, simple_one_for_one: a child that is due is started at once, whatever its siblings do. (OTP's supervisor
   does one thing at a time. Here a child's start may wait for a sibling's restart, which must not wait for the start.)
-- one_for_all, rest_for_one: first the condemned are stopped, last first; then those due are started, first first, each
-  when the one before it is ready.
-- The supervisor's own start: the same, in order, with any strategy.
+- one_for_all, rest_for_one: first the condemned children are stopped, the last first. Then the due children are started
+  in order, each when the child before it is ready.
+- The supervisor's own start: the due children are started in this way with any strategy.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from rr_actors.supervision.core.state import (
 
 
 class Draft:
-    """One decision in the making. `done()` ends it."""
+    """The working copy of one decision. `done()` ends it."""
 
     def __init__(self, tree: Tree, now: float = 0.0) -> None:
         self.tree = tree
@@ -50,35 +49,35 @@ class Draft:
         self.actions: list[Action] = []
 
     def done(self) -> Decision:
-        """The new Tree and the actions."""
+        """Return the new Tree and the actions."""
         return replace(self.tree, children=self.children), self.actions
 
     @property
     def alive(self) -> bool:
-        """It is neither stopping nor stopped, and has been started."""
+        """Whether the supervisor has been started and is not stopping."""
         return self.tree.mode in (Mode.STARTING, Mode.RUNNING)
 
     # -- one child ---------------------------------------------------------------------------------------------------
 
     def find(self, id: str, run: int) -> Child | None:
-        """The child, if that run is its present one."""
+        """Return the child if that run is its present one."""
         child = self.children.get(id)
         return child if child is not None and child.run == run else None
 
     def put(self, child: Child, **changes: Any) -> Child:
-        """The child with these changes, in its place."""
+        """Put the child with these changes in its place, and return it."""
         changed = replace(child, **changes)
         self.children[child.id] = changed
         return changed
 
     def start(self, child: Child, delay_s: float = 0.0) -> None:
-        """Start it, as the next run."""
+        """Start the child, as the next run."""
         self.tree = replace(self.tree, last_run=self.tree.last_run + 1)
         child = self.put(child, phase=Phase.STARTING, run=self.tree.last_run, up_at=None)
         self.actions.append(StartChild(child.id, child.run, child.start_spec, delay_s, child.why))
 
     def due(self, child: Child, delay_s: float = 0.0) -> None:
-        """To be started: now, or when its turn comes."""
+        """Start the child now, or, in a group, make it due until its turn comes."""
         if self.tree.grouped:
             self.tree = replace(self.tree, delay_s=max(delay_s, self.tree.delay_s))
             self.put(child, phase=Phase.DUE)
@@ -86,18 +85,18 @@ class Draft:
             self.start(child, delay_s)
 
     def stop(self, child: Child, phase: Phase = Phase.STOPPING) -> Child:
-        """Stop this run of it; `phase`: STOPPING, or RECYCLING."""
+        """Stop the child's present run; `phase` is STOPPING or RECYCLING."""
         self.actions.append(StopChild(child.id, child.run, child.spec.shutdown_s))
         return self.put(child, phase=phase)
 
     def forgets(self, child: Child) -> bool:
-        """Whether nothing is kept of it once it is down: dynamic, temporary, or its start_child has not succeeded."""
+        """Return whether a child is dropped when down: dynamic, temporary, or its start_child has not succeeded."""
         return self.tree.dynamic or child.spec.restart == "temporary" or child.why is Why.NEW
 
     def down(self, child: Child, event: Event, exit: Exit | None = None, *, keep: bool = False, **details: Any) -> None:
-        """It is down and stays so. Its callers must have been answered, or be answered from `child`.
+        """Note that a child is down and stays so. The caller answers its callers before, or afterwards from `child`.
 
-        `keep` the specification even of a temporary one: restart_child does, if it did not come up.
+        With `keep`, the specification even of a temporary child stays: so it does after a restart_child that failed.
         """
         forgotten = self.forgets(child) and not keep
         self.report(event, child, None if forgotten else "stopped", exit=exit, **details)
@@ -109,41 +108,41 @@ class Draft:
     # -- what to tell ------------------------------------------------------------------------------------------------
 
     def report(self, event: Event, child: Child, state: ChildState | None, **details: Any) -> None:
-        """Something for the log."""
+        """Add a report for the log and the history."""
         self.actions.append(Report(event, child.id, child.run, state, **details))
 
     def reply(self, callers: Iterable[Hashable], id: str | None = None, error: RrError | None = None) -> None:
-        """Answer them all alike."""
+        """Give all these callers the same answer."""
         self.actions.extend(Reply(caller, id, error) for caller in callers)
 
     def start_error(self, child: Child, cause: BaseException | str) -> StartFailed:
-        """The error for a start that failed, or that was cut short."""
+        """Return the error for a start that failed or was cut short."""
         text = str(cause) if isinstance(cause, str | RrError) else f"{type(cause).__name__}: {cause}"
         error = StartFailed(f"child {self.tree.path}/{child.id} did not start: {text}", id=child.id)
         error.__cause__ = cause if isinstance(cause, BaseException) else None
         return error
 
     def gone(self) -> NotFound:
-        """What a call on a supervisor that cannot take it any more is answered."""
+        """Return the error for a call on a supervisor that is stopping or has stopped."""
         return NotFound(f"supervisor {self.tree.path} is {self.tree.mode.name.lower()}", id=self.tree.path)
 
     # -- restarts ----------------------------------------------------------------------------------------------------
 
     def count_restart(self, child: Child, reason: str) -> int:
-        """One more restart that counts; how many do now."""
+        """Count one more restart, and return the number of those that count now."""
         counted = within(self.tree.restarts, self.now, self.tree.spec.max_seconds)
         self.tree = replace(self.tree, restarts=(*counted, Restart(self.now, child.id, reason)))
         return len(self.tree.restarts)
 
     def restart(self, child: Child, delay_s: float) -> None:
-        """It is down: start it, or its group, again."""
+        """Start a child that is down, or its group, again."""
         child = self.put(child, phase=Phase.DUE, why=Why.RESTART, attempts=child.attempts + 1, starters=())
         self.due(child, delay_s)
         if self.tree.grouped:
             self._condemn(child.id)
 
     def _condemn(self, cause: str) -> None:
-        """Take the others of its group into the restart of `cause`: those that are up will be stopped first."""
+        """Take the rest of the group into the restart of `cause`: children that are up will be stopped first."""
         ids = list(self.children)
         if self.tree.spec.strategy == "rest_for_one":
             ids = ids[ids.index(cause) :]
@@ -151,11 +150,11 @@ class Draft:
             match child.phase:
                 case Phase.RUNNING:
                     self.put(child, phase=Phase.CONDEMNED)
-                case Phase.STARTING:  # not a member yet: its start is done again, for what it was
+                case Phase.STARTING:  # not up yet: its start is repeated, for the same purpose
                     self.put(child, phase=Phase.CONDEMNED, why=Why.RESTART if child.why is Why.MANUAL else child.why)
-                case Phase.STOPPED if self.forgets(child):  # it came with an update and was never started
+                case Phase.STOPPED if self.forgets(child):  # an update added it, and it was never started
                     self.down(child, "stopped")
-                case Phase.STOPPED:  # OTP: the whole group is started, also what was stopped by hand before
+                case Phase.STOPPED:  # OTP: the whole group is started, also children stopped by hand
                     self.put(child, phase=Phase.DUE, why=Why.RESTART)
                 case Phase.STOPPING if not self.forgets(child):
                     self.put(child, phase=Phase.RECYCLING, why=Why.RESTART)
@@ -165,7 +164,7 @@ class Draft:
     # -- the supervisor ----------------------------------------------------------------------------------------------
 
     def give_up(self, error: RrError | None) -> None:
-        """Begin to stop. Starts that go on are cut short at once; what is up is stopped in its turn."""
+        """Begin to stop the supervisor. Starts are cut short at once; children that are up stop in their turn."""
         self.tree = replace(self.tree, mode=Mode.STOPPING, error=error)
         for child in list(self.children.values()):
             self.reply(child.starters, error=self.start_error(child, f"supervisor {self.tree.path} is stopping"))
@@ -182,7 +181,7 @@ class Draft:
                 self.put(child, phase=Phase.STOPPING)
 
     def advance(self) -> None:
-        """Do what the phases allow next."""
+        """Take the next steps that the phases allow."""
         if self.tree.mode is Mode.STOPPING:
             self._stop_next()
         elif self.alive:
@@ -198,7 +197,7 @@ class Draft:
         return [c for c in self.children.values() if c.phase is phase and (why is None or c.why is why)]
 
     def _regrouping(self) -> bool:
-        """A group restart goes on, though an update has changed the strategy since: it is finished as begun."""
+        """Return whether a group restart is in progress. An update of the strategy does not change how it ends."""
         if self.tree.dynamic:
             return False
         begun = (Phase.CONDEMNED, Phase.RECYCLING)
@@ -211,7 +210,7 @@ class Draft:
         if not condemned:
             self._start_next(self._of(Phase.STARTING), self._of(Phase.DUE))
         elif condemned[-1].spec.restart == "temporary" and condemned[-1].why is Why.RESTART:
-            self.stop(condemned[-1])  # it had been up: a temporary sibling is not started again
+            self.stop(condemned[-1])  # a temporary sibling is not started again
         else:
             self.stop(condemned[-1], Phase.RECYCLING)
 
@@ -231,26 +230,26 @@ class Draft:
             self.stop(last)
 
     def _ready(self) -> bool:
-        """Nothing of the start is left to do: restarts of what fell meanwhile are waited for, callers' starts not."""
+        """Return whether the supervisor's start is complete: no first start and no restart is left; callers' may be."""
         coming = (Phase.DUE, Phase.STARTING, Phase.CONDEMNED, Phase.RECYCLING)
         return not any(c.phase in coming and c.why in (Why.INIT, Why.RESTART) for c in self.children.values())
 
 
-# Restart intensity: how many restarts count, over a sliding window, and when they are too many.
+# Restart intensity: how many restarts count, in a sliding window, and when they are too many.
 #
 # OTP's manual: more than `intensity` restarts within `period` seconds end the supervisor. Inclusive on both sides: a
 # restart exactly max_seconds old still counts, and exactly max_restarts of them are still allowed.
 
 
 def within(restarts: tuple[Restart, ...], now: float, max_seconds: float) -> tuple[Restart, ...]:
-    """Those that still count at `now`."""
+    """Return the restarts that still count at `now`."""
     return tuple(restart for restart in restarts if now <= restart.at + max_seconds)
 
 
 def exceeded(
     path: str, restarts: tuple[Restart, ...], limit: int, max_seconds: float, now: float
 ) -> RestartIntensityExceeded:
-    """The error for too many, naming each: the child, how many seconds ago, and why."""
+    """Return the error for too many restarts. It names the child of each, how many seconds ago, and why."""
     listed = [(restart.id, now - restart.at, restart.reason) for restart in restarts]
     text = "; ".join(f"{id} {ago:.3g} s ago: {reason}" for id, ago, reason in listed)
     needed = f"{len(restarts)} restart{'s' if len(restarts) > 1 else ''}"

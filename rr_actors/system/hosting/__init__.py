@@ -1,1 +1,1 @@
-"""What one process of a system has: its loop, its connections, the registrars and actors that live in it."""
+"""The parts of one process of a system: its loop, its connections, and the registrars and actors in it."""

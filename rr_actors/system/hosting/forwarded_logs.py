@@ -1,8 +1,8 @@
-"""Forwarded logs: what the code of a child process logs reaches the logging of the application.
+"""Forwarded logs: the log records of a child process reach the logging of the application.
 
-In a child, a record that no handler takes is sent up, by the way of all events, as plain data. Python would write it to
-standard error. The process of the application hands it to its own logger of the same name, whose levels, filters and
-handlers decide what becomes of it. Code in the child that configures handlers, say by basicConfig, keeps its records.
+In a child, a record that no handler takes is sent up like an event, as plain data. Python would write it to standard
+error. The application's process gives it to its own logger of the same name, with that logger's levels, filters and
+handlers. Code in the child that configures handlers, for instance by basicConfig, keeps its records.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ _FORMATTER = logging.Formatter()
 
 
 class Forwarder(logging.Handler):
-    """The handler of what has no other, in a child. What cannot be sent any more goes to standard error.
+    """The handler of a child's records that have no other. It writes to standard error what it cannot send.
 
     Args:
         path: the child's, "root/cameras".
-        send: sends an event up, from any thread; False if there is no way any more.
+        send: sends an event up, from any thread; returns False if that is not possible any more.
     """
 
     def __init__(self, path: str, send: Callable[[dict[str, Any]], bool]) -> None:
@@ -36,7 +36,7 @@ class Forwarder(logging.Handler):
         """Send a record."""
         try:
             sent = self._send(_facts_of(record, self._path))
-        except Exception:  # its own arguments, mostly
+        except Exception:  # mostly the fault of the record's arguments
             self.handleError(record)
             return
         if not sent and self._last is not None and record.levelno >= self._last.level:
@@ -52,7 +52,7 @@ def levels() -> dict[str, int]:
 
 
 def begin(path: str, levels: dict[str, int], send: Callable[[dict[str, Any]], bool]) -> None:
-    """Have the records of this process sent up, from these levels on."""
+    """Send up the records of this process from now on, and set these levels for its loggers."""
     logging.lastResort = Forwarder(path, send)  # pyright: ignore[reportAttributeAccessIssue] - a handler is what it is
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)

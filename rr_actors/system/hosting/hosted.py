@@ -1,7 +1,7 @@
 """Hosted: one actor that lives in this process, from its start to its end.
 
-An actor placed as a thread cannot be killed. One that does not stop within its time is reported as killed, and
-abandoned: taken out of the directory, waited for no longer, its thread left to itself.
+An actor placed as a thread cannot be killed. One that does not stop in time is reported as killed and abandoned: it is
+taken out of the directory, and nothing waits for its thread any more.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ logger = logging.getLogger("rr_actors.supervision")
 
 
 def prepare(node: Node, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False) -> Hosted:
-    """An actor of the class `cls` that is to live in this process under `path`; start() it. On the loop.
+    """Return an actor of the class `cls` for this process, under `path`, which start() starts. On the loop.
 
     Args:
-        on_exit: called on the loop, once, when the actor has ended by itself. Not if its start failed, nor for what
-            stop() returns.
-        once: it is temporary: when it has ended, nobody starts it again.
+        on_exit: called on the loop, once, when the actor has ended by itself. Not called if its start failed, or
+            after stop().
+        once: the actor is temporary: it is not started again when it has ended.
 
     Raises:
         InvalidSpec: the class cannot be hosted.
@@ -51,7 +51,7 @@ def prepare(node: Node, cls: type[Any], path: str, on_exit: OnExit, *, once: boo
 
 
 def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None) -> None:
-    """That `cls` is a class that can be a child, and that somebody takes its arguments.
+    """Check that `cls` is a class that can be a child, and that it takes the arguments, if there are any.
 
     Raises:
         InvalidSpec: of the field actor_class_or_manager, args or kwargs.
@@ -64,26 +64,26 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
         if declared:  # nobody would ever reach them
             expected = f"a subclass of rr_actors.Manager, as {declared[0]} is declared with @rr.server"
             raise invalid(where, "actor_class_or_manager", expected, cast("object", cls))
-    if cls.__init__ in (BaseActor.__init__, pykka.Actor.__init__):  # those take anything, and do nothing with it
+    if cls.__init__ in (BaseActor.__init__, pykka.Actor.__init__):  # they accept any arguments and ignore them
         for field, given in (("args", args), ("kwargs", kwargs)):
             if given:
                 raise invalid(where, field, f"none, as {cls.__name__} has no __init__ of its own", given)
 
 
 BRUTAL_GRACE_S = 0.1
-"""What "brutal_kill" leaves an actor that is no process of its own: it cannot be killed, only asked and abandoned."""
+"""The time limit of "brutal_kill" for an actor in this process, which cannot be killed, only asked and abandoned."""
 
 
 class Place:
-    """Where an actor lives; given to its hook _before_start.
+    """The place of an actor in a process, given to its hook _before_start.
 
     Attributes:
         node: the process's runtime.
         path: the actor's, "root/cameras".
         id: its name among its siblings, "cameras".
         cut_short: set by an actor whose start may take long and can be ended at once.
-        kill: set by an actor below which there is something that can be killed.
-        abandoned: set by an actor that holds what its successor will need; called when its thread is left to itself.
+        kill: set by an actor that has processes below it, which can be killed.
+        abandoned: set by an actor that holds what its successor needs; called when the actor is abandoned.
     """
 
     def __init__(self, node: Node, path: str) -> None:
@@ -96,7 +96,7 @@ class Place:
 
 
 class Hosted(abc.ABC):
-    """One actor in this process, from its start to its end. Made by prepare(); used on the loop."""
+    """One actor in this process, from its start to its end. prepare() makes it; it is used on the loop."""
 
     def __init__(self, node: Node, cls: type[Any], path: str, on_exit: OnExit, *, once: bool) -> None:
         loop = asyncio.get_running_loop()
@@ -114,11 +114,11 @@ class Hosted(abc.ABC):
         self._stopping = False
 
     async def start(self, args: Sequence[Any], kwargs: Mapping[str, Any], timeout_s: float | None) -> bool:
-        """Start it: True once its on_start has returned and it can be reached, False if it said IGNORE.
+        """Start the actor. Return True once others can reach it, False if its on_start returned IGNORE.
 
         Raises:
-            StartFailed: it was not ready within `timeout_s`, or kill()ed; it is stopped as soon as that is possible.
-            BaseException: what `__init__` or on_start raised.
+            StartFailed: it was not ready within `timeout_s`, or killed; it is stopped as soon as that is possible.
+            BaseException: the error of `__init__` or on_start.
         """
         starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
         try:
@@ -135,23 +135,23 @@ class Hosted(abc.ABC):
             self._ready = starting.result() is not IGNORE
             if not self._ready:
                 self._end(ExitReport("normal", "ignored"))
-            elif self._ended.done():  # it has ended since
+            elif self._ended.done():  # it has ended meanwhile
                 self._tell()
             elif self.ref is not None:
                 self._node.hub.add(self.path, self.ref, once=self._once)
             return self._ready
         except BaseException:
-            self._ask_to_stop(final=False)  # what runs all the same; mostly nothing
+            self._ask_to_stop(final=False)  # in case it runs all the same
             self._end(ExitReport("abnormal", "did not start"))
             raise
         finally:
             self._started.set_result(None)
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> ExitReport:
-        """Stop it and return how it ended; if it has not within `shutdown_s`, it is killed or abandoned.
+        """Stop the actor and return how it ended. After `shutdown_s` kill or abandon it.
 
         Args:
-            final: it is not going to be started again.
+            final: the actor will not be started again.
         """
         self._stopping = True
         if not self._started.done():
@@ -174,12 +174,12 @@ class Hosted(abc.ABC):
             await asyncio.shield(self._ended)
 
     def cut_short(self) -> None:
-        """End a start that goes on, if it is one that can be ended: start() raises then."""
+        """End a start in progress, if the actor allows that. Then start() raises."""
         if self._place.cut_short is not None:
             self._place.cut_short()
 
     def kill(self) -> None:
-        """Kill what can be killed of it, abandon the rest."""
+        """Kill the processes below the actor, if it has set Place.kill; else abandon the actor."""
         self._stopping = True
         if self._place.kill is not None:
             self._place.kill()
@@ -189,11 +189,11 @@ class Hosted(abc.ABC):
 
     @abc.abstractmethod
     async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
-        """Return when on_start has. Cancelled: stop it as soon as that is possible."""
+        """Return when on_start has returned. If cancelled, stop the actor as soon as that is possible."""
 
     @abc.abstractmethod
     def _ask_to_stop(self, *, final: bool) -> None:
-        """Ask it to stop; `_end` will be called."""
+        """Ask the actor to stop. It calls `_end` at its end."""
 
     async def _abandon_start(self, starting: asyncio.Future[Any]) -> None:
         if self._place.kill is None:
@@ -211,7 +211,7 @@ class Hosted(abc.ABC):
         self._abandon(ExitReport("killed", f"{why}; abandoned"))
 
     def _abandon(self, report: ExitReport) -> None:
-        """Take its place away from an actor that cannot be made to leave it; it ends when its thread comes back."""
+        """Take an actor that does not stop out of its place. It ends when its thread returns from the user's code."""
         if self._starting is not None:
             self._starting.cancel()
         if self._place.abandoned is not None:
@@ -255,9 +255,9 @@ class HostedActor(Hosted):
 
 
 class HostedThread(Hosted):
-    """Any other Pykka actor, in the thread it makes for itself. Its end is normal, or abnormal.
+    """Any other Pykka actor, in a thread of its own. Its end is normal or abnormal.
 
-    Pykka tells nobody when an actor has started or ended, so these of the instance's own methods are wrapped.
+    Pykka has no hook for the start and the end of an actor, so methods of the instance are wrapped.
     """
 
     _answer: asyncio.Future[Ignore | None]
@@ -273,7 +273,7 @@ class HostedThread(Hosted):
             raise
 
     def _make(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """In a worker thread, as __init__ would run in the thread that calls start()."""
+        """Make the actor, wrap its methods and start its thread. In a worker, since __init__ is users' code."""
         actor: Any = self._cls(*args, **kwargs)
         call = self._node.dispatcher.call
         ref = ref_to(self.path)

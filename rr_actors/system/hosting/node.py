@@ -1,4 +1,4 @@
-"""Node: what one process of a system has: loop, transports, directory, the registrars it hosts, the way to actors."""
+"""Node: one process's part of a system: loop, transports, directory, hosted registrars, the way to other actors."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ logger = logging.getLogger("rr_actors")
 
 _GONE = Status.GONE
 _RECONCILE_S = 1.0
-"""How long a registrar that comes back waits for providers that are up to say what it holds, before it is used."""
-_LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile says nothing
+"""How long a registrar that comes back waits for the lists of running providers before it is used."""
+_LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile sends nothing
 
 
 class SystemInfo(msgspec.Struct, frozen=True):
-    """What every process of a system must know; it travels to children over their private control channel."""
+    """The facts that every process of a system needs. Children get them with the payload of their launch."""
 
     name: str
     state_dir: str
@@ -69,16 +69,16 @@ class SystemInfo(msgspec.Struct, frozen=True):
     key: bytes
     config: SystemConfig
     log_levels: dict[str, int] = {}
-    """Of the application's loggers, by name, when the system started: what children need not send up."""
+    """The application's loggers' levels, by name, at the system's start. Children send up no record below them."""
 
 
 class Node:
-    """This process's part of a system. Lives on the loop; `start` and `close` are awaited there.
+    """This process's part of a system. It is used on the loop; `start` and `close` are awaited there.
 
     Args:
         info: the system's.
-        path: of the supervisor or child this process runs, "root" for the system's own process.
-        on_event: hears on the loop what happens here and in the processes below, as plain data.
+        path: the path of the supervisor or child that this process runs, "root" for the system's own process.
+        on_event: called on the loop with each event of this process and of those below, as plain data.
     """
 
     def __init__(self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None]) -> None:
@@ -103,7 +103,7 @@ class Node:
         self.registrars: dict[str, RegistrarActor] = {}
         self._opening: set[str] = set()  # names of registrars whose catalogs are being read
         self.stopping = ""  # why all registrars here are being closed
-        self.owner: object | None = None  # is not to be dropped while a registrar is open that somebody uses
+        self.owner: object | None = None  # kept alive while a registrar is open that the application uses
         self.on_event = on_event
         self.recorder = Recorder(path, self.dispatcher, self.emit)
         self._handles: dict[str, HandleLine] = {}
@@ -121,12 +121,12 @@ class Node:
         dead_letters.office.listener = self._dead_letter
 
     async def close(self) -> None:
-        """Let everything go: the fork server, the links, every registrar (nothing is released), and the loop at last.
+        """Close the fork server, the links, every registrar (nothing is released), and at last the loop.
 
         All actors here and all processes started from here must have ended. Each step is tried.
 
         Raises:
-            Exception, ExceptionGroup: what went wrong.
+            Exception, ExceptionGroup: the errors of the steps.
         """
         steps = Steps()
         try:
@@ -156,11 +156,11 @@ class Node:
             await steps.take_async("closing the links to other processes", self.transport.close())
         finally:
             steps.take("closing the directory of names", self.directory.close)
-            self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+            self.dispatcher.loop.call_soon(release)  # after the callbacks of the closed transports
         steps.end(f"{self.path}: not closed altogether")
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
-        """Let a link in, to whom it is for."""
+        """Accept a link for a registrar or for the actors of this process."""
         if hello.kind not in ("registrar", THREADS, KIND):
             return self.hub.accept(hello)
         registrar = self.registrars.get(hello.to)
@@ -174,7 +174,7 @@ class Node:
         raise UnknownRegistrar(f"registrar {hello.to!r}: not in this process", registrar=hello.to)
 
     def handle(self, registrar: str) -> HandleLine:
-        """The line to a registrar of another process, for its handle."""
+        """Return the line to a registrar of another process, for its handle."""
         line = self._handles.get(registrar)
         if line is None:
             line = self._handles[registrar] = HandleLine(self, registrar)
@@ -185,10 +185,10 @@ class Node:
 
         Args:
             id: the actor's child id, or its path, with or without the root's name.
-            near: the path of the actor that asks: of several with that id its own sibling is meant.
+            near: the path of the asking actor. If several actors have that id, its sibling is returned.
 
         Raises:
-            NotFound: there is none, or there are several and none is a sibling; `.known` are the paths there are.
+            NotFound: no actor has that id, or several have and none is a sibling; `.known` has the paths of all.
         """
         top = self.path.partition("/")[0]
         siblings = near.rpartition("/")[0] or top
@@ -211,23 +211,23 @@ class Node:
         return entry is not None and entry.status is not _GONE
 
     def find(self, registrar: str) -> Entry | None:
-        """Where a registrar is: in this process, or as the directory says."""
+        """Return the entry of a registrar: this process's if it is open here, else the directory's; None if unknown."""
         if registrar in self.registrars:
             return Entry(Status.UP, self.local.address)
         return self.directory.lookup(registrar_key(registrar))
 
     def statuses(self) -> dict[str, Status]:
-        """The registrars of the system that are not gone, by name, and whether each is up."""
+        """Return the statuses of the system's registrars that are not gone, by name."""
         entries = ((name, self.find(name)) for name in sorted({*self.directory.registrars(), *self.registrars}))
         return {name: entry.status for name, entry in entries if entry is not None and entry.status is not _GONE}
 
     # -- registrars ----------------------------------------------------------------------------------------------
 
     async def open_registrar(self, name: str, config: RegistrarConfig) -> RegistrarActor:
-        """Lock and read a catalog and take up what it says; `serve_registrar` lets others in.
+        """Lock and read a catalog, and continue its unfinished work. `serve_registrar` accepts the links of others.
 
         Raises:
-            NameTaken: it is open in this process already, or up in another.
+            NameTaken: the registrar is open in this process already, or up in another.
             CatalogError: the catalog is locked, damaged or of another version, or cannot be written.
         """
         if name in self.registrars or name in self._opening:
@@ -240,7 +240,7 @@ class Node:
         path = config.catalog_path(self.info.state_dir)
         self._opening.add(name)
         try:
-            with left_alone():  # what is read stays, a million rows perhaps
+            with left_alone():  # the rows stay, perhaps a million of them
                 witness = Witness(self.info.state_dir, name)
                 store = await self._open_store(path, config, witness)
                 registrar = RegistrarActor(self, name, config, store)
@@ -252,7 +252,7 @@ class Node:
         return registrar
 
     async def _open_store(self, path: Path, config: RegistrarConfig, witness: Witness) -> Store:
-        """Open a catalog. If it is cancelled meanwhile, as by Ctrl-C, the catalog is closed."""
+        """Open a catalog. If that is cancelled, as by Ctrl-C, close the catalog."""
         opening = asyncio.ensure_future(self.dispatcher.workers.run(_open, path, config, witness))
         try:
             return await asyncio.shield(opening)
@@ -263,7 +263,7 @@ class Node:
             raise
 
     async def settle(self, registrar: RegistrarActor) -> None:
-        """Wait until every recover callback has ended, and providers that are up have said what is held there."""
+        """Wait until every recover callback has ended, and at most 1 s for the lists of providers that are up."""
         while registrar.catalog.recovering and not registrar.closed:
             await registrar.next_change(_LOOK_AGAIN_S)
         deadline = time.monotonic() + _RECONCILE_S
@@ -281,7 +281,7 @@ class Node:
         return entry is not None and entry.status is Status.UP
 
     def serve_registrar(self, registrar: RegistrarActor) -> None:
-        """Let others in, and say where it is."""
+        """Accept the links of others, and publish the registrar's address. First drop origins that are gone."""
         with registrar.lock:
             catalog = registrar.whole()
             origins = {**catalog.by_origin, **catalog.notices_to}
@@ -293,7 +293,7 @@ class Node:
         self.directory.publish(registrar_key(registrar.name), self.transport.address)
 
     def close_registrar(self, name: str, status: Status | None, *, erase: bool = False) -> None:
-        """Close a registrar, and leave word of what has become of it; None: say nothing."""
+        """Close a registrar, and write its status into the directory; None: write nothing."""
         registrar = self.registrars.pop(name, None)
         if registrar is not None:
             steps = Steps()
@@ -306,7 +306,7 @@ class Node:
             steps.end(f"registrar {name!r}: not closed altogether")
 
     def registrar_failed(self, name: str) -> None:
-        """A registrar that no supervisor starts again has closed by itself: it is dormant, and may be opened again."""
+        """Mark a registrar that has closed by itself as dormant. No supervisor starts it; it may be opened again."""
         self.close_registrar(name, Status.DORMANT)
 
     def _ours(self, name: str) -> bool:
@@ -317,20 +317,20 @@ class Node:
         """Wind a registrar down, and close it for good.
 
         Raises:
-            Exception, ExceptionGroup: what went wrong; it is closed all the same.
+            Exception, ExceptionGroup: the errors of the steps; the registrar is closed all the same.
         """
         steps = Steps()
         await steps.take_async("releasing what it holds, and unloading what it serves", self.wind_down(name, timeout_s))
         registrar = self.registrars.get(name)
-        if registrar is not None:  # else somebody else has closed it meanwhile
+        if registrar is not None:  # else it was closed meanwhile
             erase = registrar.config.erase_on_destruct
             steps.take("closing it", lambda: self.close_registrar(name, _GONE, erase=erase))
-        if all(actor.on_failure is not None for actor in self.registrars.values()):  # managers' alone are left
+        if all(actor.on_failure is not None for actor in self.registrars.values()):  # only those of managers are left
             self.owner = None
         steps.end(f"registrar {name!r}: not closed as it should be")
 
     async def wind_down(self, name: str, timeout_s: float | None) -> None:
-        """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
+        """Wind a registrar down for good: release all it holds and unload all it serves, within `timeout_s`."""
         registrar = self.registrars.get(name)
         if registrar is None or registrar.closed:
             return
@@ -350,7 +350,7 @@ class Node:
         self._withdraw_loads(registrar)
         try:
             await self._unload_everything(registrar)
-        except asyncio.CancelledError:  # a callback does not come to an end: that holds up nothing but its own parts
+        except asyncio.CancelledError:  # a callback does not end: only its own resource's parts wait for it
             with registrar.lock:
                 held = registrar.whole().held
                 queries = [query_id for query_id in registrar.newest_first() if not held[query_id].parent]
@@ -371,7 +371,7 @@ class Node:
         return self.stopping or f"registrar {registrar.name!r} is being closed"
 
     def _withdraw_loads(self, registrar: RegistrarActor) -> None:
-        """End the loads of this registrar's own that are in flight; those who wait for them hear why."""
+        """End this registrar's own loads in flight. The waiting callers get the reason as their error."""
         for query_id in list(registrar.loads):
             held = registrar.catalog.held.get(query_id)
             if held is not None:
@@ -389,12 +389,12 @@ class Node:
             await unloaded.future
 
     async def retire(self, name: str) -> None:
-        """A registrar is gone for good: say so, and have what it held released by every provider that is up.
+        """Mark a registrar as gone for good, and have every provider that is up release what it held.
 
-        Those that are down hear of it from the directory when they are back.
+        Other providers read it in the directory when they are back.
         """
         entry = self.find(name)
-        if entry is None or entry.status is not _GONE:  # what is there may say why, too
+        if entry is None or entry.status is not _GONE:  # an existing entry may also have the reason
             self.directory.mark(registrar_key(name), _GONE)
         for registrar in list(self.registrars.values()):
             registrar.monitor.receive(Gone(name), name)
@@ -417,7 +417,7 @@ class Node:
             logger.warning("could not tell %s that %s is gone: %s", provider, name, error)
 
     def emit(self, event: str, **facts: Any) -> None:
-        """Tell those who watch what has happened."""
+        """Pass an event with its facts to on_event."""
         self.on_event({"event": event, **facts})
 
     def _dead_letter(self, letter: DeadLetter, count: int) -> None:
@@ -429,13 +429,13 @@ class Node:
 
 
 def _unheard(_query_id: str, _error: RrError | None) -> None:
-    """Whom how a release has ended does not concern any more."""
+    """Ignore the outcome of a release, for which nothing waits any more."""
 
 
 def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
-    """Resources that nothing else here depends on; what they hold here is released with them, and newest first.
+    """Return the untried resources on which nothing else here depends. Their own parts are released with them.
 
-    At last what is left all the same, as what holds it could not be unloaded.
+    If there are none, return the rest: their holders could not be unloaded.
     """
 
     def is_part(id: str) -> bool:
@@ -448,20 +448,20 @@ def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
 
 
 class _AllDone:
-    """The waiter of so many calls; `future` is done when all of them are."""
+    """The outcome of `count` calls. It is called at the end of each; `future` is done after the last."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, count: int, name: str) -> None:
         self.future: asyncio.Future[None] = loop.create_future()
         self._left = count
         self._name = name
-        self._told: Counter[str] = Counter()  # a full disk says the same of each
+        self._told: Counter[str] = Counter()  # a full disk gives the same error each time
         if not count:
             self.future.set_result(None)
 
     def __call__(self, error: RrError | None) -> None:
-        if self.future.done():  # given up
+        if self.future.done():  # cancelled
             return
-        if error is not None and not isinstance(error, UnknownQuery):  # it has gone with something else
+        if error is not None and not isinstance(error, UnknownQuery):  # it was released with another resource
             text = str(error)
             self._told[text] += 1
             if self._told[text] == 1:

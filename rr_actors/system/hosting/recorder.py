@@ -1,7 +1,7 @@
-"""Recorder: what one process sends up of its messages and callbacks while somebody records.
+"""Recorder: sends the messages and callbacks of one process up while somebody records.
 
-An entry costs its making and a list's append; a batch of them leaves for the application's process at most 10 ms later.
-A process that is killed takes what it has not sent with it. While nobody records, nothing of this is called.
+The caller's thread makes an entry and appends it to a list. At most 10 ms later the loop sends a batch to the
+application's process. The unsent entries of a killed process are lost. While nobody records, nothing of this is called.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from rr_actors.registrar.model.recorded import Entry, message_entry
 from rr_actors.runtime.event_loop import Dispatcher
 
 RECORDED = "recorded"
-"""The event that carries a batch: "entries", encoded, and "dropped", how many there was no room for."""
+"""The event that carries a batch: "entries", encoded, and "dropped", the number of entries without room."""
 KEPT = 10_000
-"""How many entries may wait for the loop; more are counted, and dropped."""
+"""How many entries may wait for the loop. More are counted and dropped."""
 BATCH_S = 0.01
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -30,11 +30,11 @@ _decode = msgspec.msgpack.Decoder(list[Entry]).decode
 
 
 class Recorder:
-    """That of one process. From any thread.
+    """The recorder of one process. Call it from any thread.
 
     Args:
         path: the process's, "root/cameras".
-        emit: tells the application's process; on the loop.
+        emit: sends an event to the application's process; called on the loop.
     """
 
     def __init__(self, path: str, dispatcher: Dispatcher, emit: Callable[..., None]) -> None:
@@ -48,16 +48,16 @@ class Recorder:
         self._pid = os.getpid()
 
     def message(self, event: str, registrar: str, peer: str, message: Message, at: float | None = None) -> None:
-        """A registrar of this process has "sent" a message to `peer`, or "received" one from it.
+        """Record that a registrar of this process has "sent" a message to `peer`, or "received" one from it.
 
         Args:
-            at: when, in seconds since the epoch; None: now. What is sent may be read before this call.
+            at: seconds since the epoch; None: now. The peer may read a message before this call.
         """
         at = time.time() if at is None else at
         self._add(message_entry(at, event, self._path, self._pid, registrar, peer, message))
 
     def callback(self, event: str, server: str, role: str, resource: str, detail: str = "") -> None:
-        """A callback of "registrar/server" has "began", or "ended"; `detail` is the error that it has ended with."""
+        """Record that a callback of "registrar/server" "began" or "ended"; `detail` is the error that ended it."""
         registrar = server.partition("/")[0]
         where = (self._path, self._pid, registrar)
         self._add(Entry(time.time(), event, 0, *where, "", role, "", resource, "", server, detail))
@@ -68,14 +68,14 @@ class Recorder:
                 self._dropped += 1
                 return
             self._waiting.append(entry)
-        if not self._scheduled:  # set by the loop: a thread that is interrupted here leaves it to the next entry
+        if not self._scheduled:  # set by the loop: if a thread is interrupted here, the next entry does this
             try:
                 self._dispatcher.call(self._flush_soon)
-            except Unavailable:  # the loop has ended, and with it all that is sent from here
+            except Unavailable:  # the loop has ended, and nothing more can be sent
                 self._waiting.clear()
 
     def close(self) -> None:
-        """Send what waits: this process's part of the system ends. On the loop."""
+        """Send the waiting entries before this process's part of the system ends. On the loop."""
         if self._waiting:
             self._flush()
 
@@ -96,6 +96,6 @@ def entries_of(event: dict[str, Any]) -> list[Entry]:
     """Return the entries of a batch.
 
     Raises:
-        msgspec.MsgspecError: it is none.
+        msgspec.MsgspecError: the event has no valid batch.
     """
     return _decode(event["entries"])

@@ -1,8 +1,9 @@
 """Handles: calling the methods of a registrar in another process.
 
-A link of kind "handle" carries calls by number; arguments and results travel by cloudpickle, between processes of one
-system only, and are opened in workers, never on the loop. Calls run side by side. One that finds its registrar about to
-start, or being respawned, is patient for a while; what had been sent when a process died is sent again only if it asks.
+A link of kind "handle" carries numbered calls. Arguments and results travel by cloudpickle, between processes of one
+system only. They are unpickled by workers or callers, never on the loop. Calls run side by side. A call waits a while
+for a registrar that is being started or respawned. If the process dies during a call, only a call that changes nothing
+is sent again.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ KIND = "handle"
 
 
 class Call(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """Call a method; `body` has its arguments. Its `timeout_s` is less by `late_s`, which it had waited to be sent."""
+    """Call a method; `body` has its arguments. Its `timeout_s` is shortened by `late_s`, its wait to be sent."""
 
     number: int
     method: str
@@ -39,7 +40,7 @@ class Call(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """What a call returned, or a part of it, as all of it would not fit a frame; then `more` follows."""
+    """The result of a call, or a part of it, if it does not fit a frame; then `more` parts follow."""
 
     number: int
     body: bytes
@@ -47,7 +48,7 @@ class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
 
 
 class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """What a call raised."""
+    """The error of a call."""
 
     number: int
     failure: Failure
@@ -58,7 +59,7 @@ HandleMessage = Call | Returned | Raised
 _ASKING = frozenset(
     {"_page", "children", "clients", "fetch_queries", "owed", "queries", "resources", "servers", "stats"}
 )
-"""Those that change nothing, and may be called again."""
+"""The methods that change nothing, and may be called again."""
 
 METHODS = _ASKING | {
     *("load", "load_all", "load_catalog", "on_status", "save_catalog", "send_status", "unload", "unload_all"),
@@ -78,7 +79,7 @@ class Door:
         self._calling = described(self._call, "a handle's call", failure_of)
 
     def received(self, link: Link, message: Any) -> None:
-        """Run the call in a worker and answer."""
+        """Run the call in a worker and send its answer."""
         workers = self._node.dispatcher.workers
 
         def done(body: bytes, error: BaseException | None) -> None:
@@ -103,23 +104,23 @@ class Door:
         return pickling.dumps(getattr(self._registrar, message.method)(*args, **kwargs), "result")
 
     def _send_parts(self, link: Link, number: int, left: memoryview) -> None:
-        """Send what a call returned, as much of it as the link takes now, and the rest a little later."""
+        """Send as much of a call's result as the link takes now, and the rest every 10 ms."""
         size = max(1, self._node.config.frame_limit_bytes // 2)
         try:
             while len(left) > size:
                 link.send(Returned(number, bytes(left[:size]), more=True))
                 left = left[size:]
             link.send(Returned(number, bytes(left)))
-        except MailboxFull:  # the caller has to read some of it first
+        except MailboxFull:  # the caller must read a part of it first
             self._node.dispatcher.loop.call_later(_RETRY_S, self._send_parts, link, number, left)
         link.flush()
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """The caller has gone; what runs goes on."""
+        """Do nothing when the caller is gone: its calls run to their end."""
 
 
 class _Coming(Exception):
-    """A registrar that is not up, but will be; a caller that is not patient gets `error`."""
+    """The registrar is not up yet, but will be. When the caller's patience ends, it gets `error`."""
 
     def __init__(self, error: RrError) -> None:
         super().__init__(str(error))
@@ -127,7 +128,7 @@ class _Coming(Exception):
 
 
 class _Open(msgspec.Struct):
-    """A call that was sent: what its answer will be, and the parts of that so far."""
+    """A call that was sent: the future of its answer, and the parts that have arrived."""
 
     method: str
     answer: asyncio.Future[bytes]
@@ -135,7 +136,7 @@ class _Open(msgspec.Struct):
 
 
 class HandleLine:
-    """The caller's end: calls methods of one registrar, wherever it is now."""
+    """The caller's end of a handle's link. It calls methods of one registrar, in whatever process that is now."""
 
     def __init__(self, node: Any, registrar: str) -> None:
         self._node = node
@@ -150,12 +151,12 @@ class HandleLine:
     def call(
         self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], patience_s: float | None = 0.0
     ) -> Reply[Any]:
-        """Call a method; the reply is set with what it returned or raised. From any thread.
+        """Call a method. The reply gets its result or error. From any thread.
 
-        A registrar that is being started, or respawned, is waited for `patience_s` seconds, or as long as that takes.
+        It waits `patience_s` seconds for a registrar that is being started or respawned; None: without limit.
 
         Raises:
-            NotSerializable: an argument cannot travel.
+            NotSerializable: an argument cannot be pickled.
         """
         body = pickling.dumps((args, kwargs), f"{self._registrar}.{method}()")
         reply: Reply[Any] = Reply()
@@ -178,10 +179,10 @@ class HandleLine:
             reply.set_unopened(functools.partial(pickling.loads, result))
 
     async def _result(self, method: str, body: bytes, patience_s: float | None) -> bytes:
-        """Call the method, again if that makes sense, as long as the caller is patient.
+        """Call the method. Try again while the registrar is not up yet and the caller is patient.
 
         Raises:
-            RrError: what it raised, or why it was not called.
+            RrError: the error of the method, or why it was not called.
         """
         loop = asyncio.get_running_loop()
         since = loop.time()
@@ -206,11 +207,11 @@ class HandleLine:
             del self._open[number]
 
     async def _linked(self) -> Link:
-        """The link, opened if there is none.
+        """Return the link, and open it first if there is none.
 
         Raises:
-            _Coming: the registrar is not up, but it will be.
-            RrError: it will not.
+            _Coming: the registrar is not up yet, but will be.
+            RrError: the registrar is not up, and will not be.
         """
         async with self._dialing:
             if self._closed:
@@ -220,7 +221,7 @@ class HandleLine:
                 hello = Hello(KIND, self._registrar, self._node.path, 0)
                 try:
                     self._link = await self._node.transport.connect(address, hello, self._attach)
-                except (Unavailable, UnknownRegistrar) as error:  # it has just died; or not serving yet
+                except (Unavailable, UnknownRegistrar) as error:  # its process has just died, or does not serve it yet
                     raise _Coming(error) from error
             assert self._link is not None
             return self._link
@@ -243,7 +244,7 @@ class HandleLine:
         return RegistrarDown(text, registrar=self._registrar, status=str(status))
 
     def received(self, link: Link, message: Any) -> None:
-        """An answer, or a part of one."""
+        """Note an answer, or a part of one, for its call."""
         call = self._open.get(message.number)
         if call is None or call.answer.done():
             return
@@ -255,7 +256,7 @@ class HandleLine:
             call.answer.set_result(b"".join(call.parts))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """Its process is gone, or the registrar closed: what was sent fails, if it cannot be asked again."""
+        """Fail the open calls, as the process or the registrar is gone. Calls that change nothing are sent again."""
         if self._link is link:
             self._link = None
         text = f"registrar {self._registrar!r}: its process went away during the call"
@@ -265,7 +266,7 @@ class HandleLine:
                 call.answer.set_exception(_Coming(error) if call.method in _ASKING else error)
 
     def close(self) -> None:
-        """Let the link go; nothing waits any more. On the loop."""
+        """Close the link and cancel all calls. On the loop."""
         self._closed = True
         if self._link is not None:
             self._link.close()

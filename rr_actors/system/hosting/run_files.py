@@ -1,4 +1,4 @@
-"""The files of a running system: kept while it runs, and the byte that says whether anybody listens."""
+"""The files of a running system, which are restored while it runs, and the byte that says whether anybody watches."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from rr_actors.base.steps import Steps
 from rr_actors.wire.name_service import Directory
 from rr_actors.wire.unix_transport import UnixTransport
 
-# Watched: whether anybody wants to hear what happens in the system. One byte that all its processes share.
+# Watched: one byte that all processes of a system share. It says whether anybody watches the system's events.
 #
-# Most systems run unwatched, and telling the system's own process of every load costs as much as a tenth of the
-# load: so nothing is sent then. What changes here is seen everywhere at once, and asked for without a system call.
+# Most systems run unwatched. To send every load to the system's own process costs as much as a tenth of the load, so
+# nothing is sent then. All processes see a change of the byte at once, and read it without a system call.
 
 _NAME = "watched"
 _EVENTS, _MESSAGES = 1, 3
-"""What the byte says: events are wanted; events and messages are."""
+"""Values of the byte: send events; send events and messages."""
 
 
 class Watched:
@@ -35,11 +35,11 @@ class Watched:
         run_dir: the system's StateDir.run_dir.
 
     Attributes:
-        level: the byte: 0 nobody watches, 1 events are wanted, above 1 the messages between registrars, too. What is
-            passed by every load reads it here, in 20 ns; the property `recording` takes five times as long.
+        level: the byte: 0 nobody watches, 1 events are wanted, above 1 the messages between registrars, too. Code
+            that runs in every load reads it here, in 20 ns; the property `recording` takes five times as long.
 
     Raises:
-        ConfigError: it cannot be made there.
+        ConfigError: the file cannot be made there.
     """
 
     def __init__(self, run_dir: Path) -> None:
@@ -64,12 +64,12 @@ class Watched:
             raise ConfigError(text, file=str(path), key="state_dir") from error
 
     def restore(self) -> None:
-        """Make the file again, or use the one that another process has made, if it was removed.
+        """Make the file again if it was removed, or use the one that another process has made.
 
         Raises:
-            ConfigError: it cannot be made.
+            ConfigError: the file cannot be made.
         """
-        with contextlib.suppress(OSError):  # it is not there
+        with contextlib.suppress(OSError):  # the file is gone
             if os.path.samestat(os.lstat(self._run_dir / _NAME), self._file):
                 return
         wanted = self.level[0]
@@ -86,26 +86,26 @@ class Watched:
         return self.level[0] == _MESSAGES
 
     def set(self, watched: bool, recording: bool = False) -> None:
-        """Say so, to all processes of the system; `recording` wants events and messages."""
+        """Set the byte for all processes of the system; `recording` wants events and messages."""
         self.level[0] = _MESSAGES if recording else _EVENTS if watched else 0
 
 
 # Keeper: looks after the files of a running system that a cleaner of temporary files, or a person, may remove.
 #
-# What is gone is made again, and the log says so. What is there is touched each hour: most cleaners take what is old.
+# It makes removed files again, and logs that. It touches the others each hour, since most cleaners remove old files.
 
 LOOK_S = 5.0
-"""Seconds from one look to the next."""
+"""Seconds from one check to the next."""
 _TOUCH_S = 3600.0
 
 logger = logging.getLogger("rr_actors")
 
 
 class Keeper:
-    """Of one process: its names, its socket, and the byte that all share. On the loop.
+    """Looks after one process's names and socket, and the byte that all processes share. On the loop.
 
     Attributes:
-        also: what else to look after; called on the loop, and quick.
+        also: further checks, which the loop calls; they must be quick.
     """
 
     def __init__(self, directory: Directory, transport: UnixTransport, watched: Watched) -> None:
@@ -116,11 +116,11 @@ class Keeper:
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Look from now on."""
+        """Check the files from now on, every LOOK_S."""
         self._task = asyncio.get_running_loop().create_task(self._keep())
 
     def stop(self) -> None:
-        """Look no more."""
+        """End the checks."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
@@ -135,7 +135,7 @@ class Keeper:
                 self._directory.touch()
 
     async def look(self) -> None:
-        """Make again what is gone."""
+        """Make removed files again."""
         steps = Steps()
         steps.take("looking after the directory of names", self._restore_names)
         await steps.take_async("looking after the socket", self._restore_socket())
