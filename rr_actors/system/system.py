@@ -329,7 +329,8 @@ class System:
             starting.give_up()
         return limit_s
 
-    def _stop_now(self, limit_s: float) -> None:
+    def _stop_now(self, limit_s: float, report: ExitReport | None = None) -> None:
+        """Stop everything; then the threads in wait() and run() go on. `report`: for `ended`, if it was no stop()."""
         with self._lock:
             node, dispatcher = self._node, self._dispatcher
             if node is None or dispatcher is None:
@@ -339,6 +340,8 @@ class System:
             steps.take("stopping what runs", self._stopping.wait)
             self._stopping = None
             steps.take("giving back what it used", self._give_back)
+            self._end = self._end or report
+            self._ended.set()
             steps.end(f"system {self.name!r}: stopped, with errors")
 
     def _shut_down(self) -> None:
@@ -346,13 +349,11 @@ class System:
         threading.Thread(target=self._stop_for_console, name="rr-shut-down").start()
 
     def _stop_for_console(self) -> None:
+        report = ExitReport("shutdown", "a console has shut the system down")
         try:
-            self.stop()
+            self._stop_now(self._check_stop(None), report)
         except Exception:
             logger.exception("system %s: a console has shut it down", self.name)
-        finally:
-            self._end = self._end or ExitReport("shutdown", "a console has shut the system down")
-            self._ended.set()
 
     def _stop_at_once(self) -> None:
         if (stopping := self._stopping) is not None:
@@ -443,14 +444,15 @@ class System:
         await _in_thread(functools.partial(self._stop_now, self._check_stop(None)), self._stop_at_once)
 
     def run(self) -> signal.Signals | None:
-        """Start the system unless it runs; wait for SIGTERM, Ctrl-C (SIGINT) or the end of the tree; then stop it.
+        """Start the system unless it runs; wait for SIGTERM, Ctrl-C (SIGINT) or its end; then stop it.
 
         Use it for a service or a container, where the program is process 1 and SIGTERM does nothing by default.
         A second signal kills what has not stopped yet. Only the main thread can call run(), and run() replaces the
         handlers of both signals meanwhile.
 
         Returns:
-            The signal that ended it; or None, if the tree ended by itself in order, or a console shut the system down.
+            The signal that ended it; or None, if the tree ended by itself in order, or the system was stopped by
+            another thread or a console.
 
         Raises:
             The errors of start() and stop().
@@ -460,6 +462,8 @@ class System:
         with Termination(f"system {self.name!r}: run()", self._stop_at_once) as termination:
             try:
                 termination.awaited = True
+                if termination.told is not None:  # before it was awaited
+                    raise Told
                 if self._node is None:
                     self.start()
                 while not self._ended.wait(_LOOK_S):
@@ -484,10 +488,10 @@ class System:
             logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the tree ends by itself (restart intensity, auto_shutdown), or a console shuts the system down.
+        """Wait until the tree ends by itself (restart intensity, auto_shutdown), or the system is stopped.
 
         Returns:
-            Whether the tree ended or the system was shut down.
+            Whether the tree ended or the system was stopped, by another thread or a console.
 
         Raises:
             UsageError: timeout_s is no number of seconds.

@@ -15,6 +15,7 @@ import psutil
 import pytest
 
 import rr_actors as rr
+from rr_actors.system.termination import Termination
 from support import TEST_PATHS, Workshop, kill
 
 LIMIT_S = 40.0
@@ -132,6 +133,30 @@ def test_a_tree_that_gives_up_ends_it_with_an_error(state_dir: Path) -> None:
     assert signal.getsignal(signal.SIGTERM) is before
     with pytest.raises(rr.UsageError, match="not running"):
         system.tree()
+
+
+def test_a_stop_by_another_thread_ends_run_and_wait(state_dir: Path) -> None:
+    system = rr.System([], state_dir=state_dir).start()
+    waited: list[bool] = []
+    waiting = threading.Thread(target=lambda: waited.append(system.wait(LIMIT_S)))
+    waiting.start()
+    threading.Timer(0.1, system.stop).start()
+    assert system.run() is None
+    waiting.join(LIMIT_S)
+    assert waited == [True]
+    assert system.ended is None
+
+
+def test_a_signal_in_the_moment_before_it_is_awaited_is_heard(state_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter = Termination.__enter__
+
+    def interrupted(termination: Termination) -> Termination:
+        enter(termination)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return termination
+
+    monkeypatch.setattr(Termination, "__enter__", interrupted)
+    assert rr.System([], state_dir=state_dir).run() == signal.SIGTERM
 
 
 def test_another_thread_than_the_main_one_is_told_that_it_hears_no_signals(state_dir: Path) -> None:
