@@ -256,7 +256,8 @@ def _check_statuses(world: World) -> None:
     ledger = world.ledger
     for registrar, part, resource_id, event, query_id in ledger.on_the_way:
         told = (event, query_id) in ledger.told or (resource_id, event) in ledger.handled
-        if ledger.provider.get(part) in world.retired and part not in world.registrars[registrar].catalog.held:
+        held = world.registrars[registrar].catalog.held.get(part)
+        if held.hold is Hold.OWED if held is not None else ledger.provider.get(part) in world.retired:
             continue  # it waited for a load that a crash cut short, and the next attempt does not have this part
         if not told and not ledger.let_go & {query_id, part} and registrar not in world.retired:
             raise Violation("statuses", f"{event} reached {resource_id}, and went no further up to {query_id}")
