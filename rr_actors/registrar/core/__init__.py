@@ -1,1 +1,1 @@
-"""What a registrar decides, as pure functions of its catalog: decide.py is the table of contents."""
+"""The decisions of a registrar, as pure functions of its catalog: decide.py is the table of contents."""

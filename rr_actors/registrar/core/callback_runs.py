@@ -1,4 +1,4 @@
-"""Runs of load and unload callbacks: starting them, limiting them, and telling whether one that ended still matters."""
+"""Runs of load and unload callbacks: start them, limit them, and check whether a run that ended still matters."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _replace = msgspec.structs.replace
 
 
 def start_load(decision: Decision, resource: Resource) -> None:
-    """Have the load callback run; without its server (yet) the resource waits for it to be registered."""
+    """Run the load callback; if the server is not registered (yet), the resource waits for it."""
     if resource.server in decision.catalog.servers:
         decision.cause(StartLoad(resource))
         limit_load(decision, resource)
 
 
 def load_again(decision: Decision, resource: Resource) -> None:
-    """Run the load callback of a load again that a crash has interrupted; its server is there."""
+    """Run the load callback again after a crash has interrupted it; the server is registered."""
     resource = _replace(resource, tries=0)
     decision.put(resource)
     start_load(decision, resource)
 
 
 def limit_load(decision: Decision, resource: Resource) -> None:
-    """Have LoadOverdue come, if the server limits its loads."""
+    """Set a timer for LoadOverdue, if the server limits its loads."""
     server = decision.catalog.servers.get(resource.server)
     if server is not None and server.load_timeout_s is not None:
         failure = failures.overdue(decision.catalog, resource, server.load_timeout_s)
@@ -37,14 +37,14 @@ def limit_load(decision: Decision, resource: Resource) -> None:
 
 
 def end_limit(decision: Decision, resource: Resource) -> None:
-    """The load callback has ended."""
+    """Cancel the timer for LoadOverdue, as the load callback has ended."""
     server = decision.catalog.servers.get(resource.server)
     if server is not None and server.load_timeout_s is not None:
         decision.cause(SetTimer("load:" + resource.id, None, None))
 
 
 def start_unload(decision: Decision, resource: Resource) -> None:
-    """Have the unload callback run (once more); without its server the resource waits for it to be registered."""
+    """Run the unload callback, perhaps once more; if the server is not registered, the resource waits for it."""
     resource = _replace(resource, phase=UNLOADING, tries=resource.tries + 1)
     decision.put(resource)
     if resource.server in decision.catalog.servers:
@@ -52,7 +52,7 @@ def start_unload(decision: Decision, resource: Resource) -> None:
 
 
 def start_queued(decision: Decision, resource: Resource) -> None:
-    """Let a QUEUED resource load, if nothing of the same request is being unloaded any more."""
+    """Load a QUEUED resource, if no resource of the same request is being unloaded any more."""
     if (resource.server, resource.request) not in decision.catalog.unloading:
         resource = _replace(resource, phase=LOADING)
         decision.put(resource)
@@ -60,7 +60,7 @@ def start_queued(decision: Decision, resource: Resource) -> None:
 
 
 def running(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> Resource | None:
-    """The resource, if it is still that run of its callback that has ended."""
+    """Return the resource if `run` is the present run of its callback in `phase`; else None."""
     resource = catalog.resources.get(resource_id)
     if resource is None or resource.phase is not phase:
         return None

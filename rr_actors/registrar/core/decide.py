@@ -1,4 +1,4 @@
-"""decide: one message or command, and what it changes and causes. The whole registrar on one page.
+"""decide: what one message or command changes and causes. The whole registrar on one page.
 
 Pure: no I/O, clock, thread or randomness.
 """
@@ -33,12 +33,13 @@ Item = tuple[Any, str | None]
 
 
 def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
-    """Decide messages and commands in their order, as one: either all of it happens, or nothing.
+    """Decide messages and commands in their order as one decision: either all of them happen, or none.
 
-    The catalog in memory is changed at once. Commit the decision, then close() it and do its effects; or undo() it.
+    The catalog in memory is changed at once. Then either commit the decision, close() it and carry out its effects, or
+    undo() it.
 
     Raises:
-        TypeError: one of them is none that a registrar handles.
+        TypeError: an item is no message or command that a registrar handles.
     """
     decision = Decision(catalog)
     for item, sender in items:
@@ -57,7 +58,7 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
 
 
 def _describe(decision: Decision, sender: str, message: m.Describe) -> None:
-    """Answer with the types of a server; of one that is not there nothing is said."""
+    """Answer with the types of a server; if there is no such server, send nothing."""
     server = decision.catalog.servers.get(message.server)
     if server is not None:
         decision.cause(Reply(sender, m.Described(message.server, server.types)))
@@ -100,7 +101,7 @@ _MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
     m.Noticed: status_delivery.noticed,
     m.Describe: _describe,
 }
-"""Those that do not name their sender, and whose function has to know it."""
+"""The messages that do not name their sender, and whose function needs it."""
 
 _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.BeginAgain: _begin_again,
@@ -136,16 +137,17 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
 }
 
 
-# Uncommitted: what becomes of messages and commands whose changes could not be written.
+# Uncommitted messages and commands: their changes could not be written.
 #
-# Nothing of them has happened. Those who wait hear so; the rest is done again, in its order, and what comes later
-# waits behind it, as the order of messages is relied upon.
+# Nothing of them has happened. Callers that wait get the error. The other items are decided again in their order, and
+# later messages wait behind them, because the decisions rely on the order of messages.
 
 
 def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure) -> tuple[Decision, list[Item]]:
-    """Refuse what can be refused, for `failure`; return that, and what is to be done again.
+    """Refuse the items that can be refused, with `failure`; return that decision, and the items to be decided again.
 
-    Causes effects alone, no changes: it needs no room on the disk. The decision of the items has been undone.
+    The decision has effects only and no changes, so it needs no room on the disk. The caller has undone the decision of
+    the items.
     """
     decision = Decision(catalog)
     again: list[Item] = []
@@ -159,7 +161,7 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure
                 decision.cause(UnloadResolved(item.query_id, failure))
             case c.ReleaseOverdue():
                 held = decision.catalog.held.get(item.query_id)
-                if held is not None and held.hold is Hold.OWED:  # as it was before, and it is late already
+                if held is not None and held.hold is Hold.OWED:  # its row stays; its caller has waited
                     decision.cause(UnloadResolved(item.query_id, item.failure))
             case c.SetStatus() | c.SetResponse() | c.Swap() | c.ForceUnload() | c.Unregister():
                 decision.cause(Answer(item.ticket, failure))

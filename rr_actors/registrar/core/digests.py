@@ -1,9 +1,10 @@
-"""Spans: a consumer's list of queries in digests, so that only what differs is sent when a link comes.
+"""Spans: a consumer's list of queries in digests, so that a new link carries only the queries that differ.
 
-The consumer cuts what it holds at a provider into spans of its running numbers and tells the digest of each. The
-provider makes the same digests of what it has, and lists the queries of the spans that differ, and of those behind the
-last. In a span that does not differ there is nothing to agree on: the same queries with the same resources, responses
-and states. Where one side has anything that the other has not (a load in flight, one that is owed), the span differs.
+The consumer sorts the queries that it holds at a provider by their running numbers, cuts them into spans, and sends the
+digest of each span. The provider makes the same digests of its own rows. It lists the queries of the spans that differ,
+and those behind the last span. In a span that does not differ, both sides have the same queries with the same
+resources, responses and states. If one side has a query that the other has not (a load in flight, an owed release), the
+span differs.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from rr_actors.registrar.model.rows import Held, Hold, Query, Resource
 R = TypeVar("R")
 
 LENGTH = 1024
-"""Queries in a span: with one that differs, so many are listed."""
+"""The queries in a span: if one of them differs, all are listed."""
 
 _HELD = Hold.HELD
 _number, _id, _resource_id = map(attrgetter, ("seq", "id", "resource_id"))
@@ -33,34 +34,34 @@ _FIRST, _LAST = -1, 2**63 - 1  # below and above all running numbers
 _encode = msgspec.msgpack.Encoder().encode
 
 Spans = list[tuple[int, bytes]]
-"""The last running number of each, in their order, and its digest."""
+"""The last running number of each span, and its digest, in order."""
 
 Bounds = list[tuple[int, int]]
-"""Spans that do not differ: from above a number, up to a number; in their order."""
+"""Spans that do not differ, in order: the number before the first query, and the last number."""
 
 
 class Known(msgspec.Struct, frozen=True):
-    """What is held at a provider: the rows, and what is said of them."""
+    """The rows held at a provider, and their spans."""
 
     rows: list[Held]
     spans: Spans
 
 
 def held_at(catalog: Catalog, provider: str) -> list[Held]:
-    """What is held at a provider, in the order of its table, or of the index.
+    """Return the rows that are HELD at a provider, in the order of the table, or of the index.
 
-    Pending and owed queries are left out: they differ.
+    Pending and owed queries are left out: their spans differ anyway.
     """
     return [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is _HELD]
 
 
 def known(rows: list[Held], before: Known | None = None) -> Known:
-    """What is said of rows that are held at a provider; the digests are those of `before` if it is still the same."""
+    """Return the rows with their digests. If the rows are those of `before`, its digests are reused."""
     return before if before is not None and rows == before.rows else Known(rows, list(cut(rows)))
 
 
 def cut(rows: list[Held]) -> Iterator[tuple[int, bytes]]:
-    """The spans, each when it is asked for: a million rows take most of a second."""
+    """Yield the spans of the rows, each when it is asked for: a million rows take most of a second."""
     oldest_first = sorted(rows, key=_number)
     for begin in range(0, len(rows), LENGTH):
         some = oldest_first[begin : begin + LENGTH]
@@ -68,7 +69,7 @@ def cut(rows: list[Held]) -> Iterator[tuple[int, bytes]]:
 
 
 def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[Query]]:
-    """Compare what a consumer has told with the catalog: where nothing differs, and the queries elsewhere."""
+    """Compare a consumer's spans with the catalog; return the bounds where nothing differs, and all other queries."""
     queries = sorted(_rows(catalog.queries, catalog.by_origin.get(origin, ())), key=_number)
     resource_ids = list(map(_resource_id, queries))
     resources = _resources(catalog, resource_ids)
@@ -86,15 +87,16 @@ def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[
             same.append((above, last))
         begin, above = end, last
     if begin == len(queries) and same and same[-1][1] == above:
-        same[-1] = (same[-1][0], _LAST)  # nothing is behind the last, either
+        same[-1] = (same[-1][0], _LAST)  # and there is no query behind the last span
     return same, differing + queries[begin:]
 
 
 def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], list[Held]]:
-    """What is held where nothing differs, as far as anything is still noted about it; and all else, oldest first.
+    """Return the `kept` rows within `same`, and all rows outside of it, oldest first.
 
-    What is held with a greater number than any that was told has come meanwhile, by a line of its own or behind the
-    provider's look at its own; it is where nothing differs if the provider has said that nothing was there.
+    Rows within `same` agree with the provider; the caller has a note to remove only for the `kept` ones. A row whose
+    number is greater than all that Fetch told came meanwhile: by a thread's own line, or after the provider compared.
+    It counts as agreed if the provider has said that it has nothing behind the last span.
     """
     held = catalog.held
     bounds = [number for bound in same for number in bound]
@@ -113,18 +115,18 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
 
 
 def _rows(table: dict[str, R], ids: Collection[str]) -> Iterable[R]:
-    """The rows with these ids, which are those of some in the table or, often, of all."""
+    """Return the rows with these ids: some rows of the table or, often, all of them."""
     return table.values() if len(ids) == len(table) else map(table.__getitem__, ids)
 
 
 def response_of(catalog: Catalog, query: Query) -> bytes | None:
-    """What is said of a query's response: None while its resource is loading, or being released."""
+    """Return a query's response as Fetched gives it: None while its resource is loading, or being unloaded."""
     resource = catalog.resources[query.resource_id]
     return None if resource.id in catalog.moving else resource.response or b""
 
 
 def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:
-    """Those with these ids. Often queries are on one each, in the same order: then none is looked for."""
+    """Return the resources with these ids. If each resource has one query, in the same order, no id is looked up."""
     resources = catalog.resources
     if len(ids) == len(resources) and ids == list(resources):
         return list(resources.values())
@@ -132,7 +134,7 @@ def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:
 
 
 def _facts(catalog: Catalog, queries: list[Query], ids: list[str], resources: list[Resource]) -> list[list[Any]]:
-    """What is said of queries on resources with these ids, as their holder has it."""
+    """Return the facts about these queries that a digest covers, in the form in which their holder has them."""
     responses = list(map(_response, resources))
     if catalog.moving:
         responses = [None if row.id in catalog.moving else row.response for row in resources]

@@ -1,7 +1,7 @@
-"""What a registrar decides as a consumer: its own queries at other registrars (and at itself).
+"""The decisions of a consumer about its own queries at other registrars (and at itself).
 
 A held row's life: PENDING (asked) -> HELD (loaded) -> OWED (released, not yet confirmed) -> gone. The provider's record
-is the truth: rows here are written a moment later, except OWED ones, which the provider does not know of yet.
+is the truth, so rows here are written a moment later. OWED rows are not: the provider does not know of the release yet.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _replace = msgspec.structs.replace
 
 
 def ask(decision: Decision, command: Ask) -> None:
-    """Ask a provider for something. That it is one of ours to look for after a crash is on disk before."""
+    """Ask a provider for a query. The provider's Peer row is on disk before the request is sent."""
     catalog = decision.catalog
     attempt = 0
     parent = command.parent
@@ -58,7 +58,7 @@ def ask(decision: Decision, command: Ask) -> None:
 
 
 def _asked_again(decision: Decision, held: Held) -> None:
-    """A part is asked for under its old id: it is there already, unless it is being released."""
+    """Answer a load whose id has a row: the part is held already, or it is being released."""
     if held.hold is HELD:
         decision.cause(LoadResolved(held, None))
     elif held.hold is OWED:
@@ -66,9 +66,9 @@ def _asked_again(decision: Decision, held: Held) -> None:
 
 
 def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
-    """Decide Got by the fast path, which comes to the same as got(); False: got() is to decide it.
+    """Decide Got by the fast path, with the same result as got(); return False if got() has to decide it.
 
-    That is a load of which nobody has heard anything, answered by a provider whose link is up: one row more.
+    The fast path is for a load that no decision has concerned, from a provider whose link is up: it adds one row.
     """
     id = answer.query_id
     asked = catalog.in_flight.get(id)
@@ -89,19 +89,19 @@ def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
 
 
 def got(decision: Decision, command: Got) -> None:
-    """Take up a load that was answered on the connection of its caller's thread."""
+    """Take the answer to a load that came on the connection of its caller's thread."""
     catalog, id = decision.catalog, command.query_id
     add_in_flight(decision, id)
     decision.forget(catalog.direct, id)
     held = catalog.held.get(id)
-    if held is None:  # it was loaded, then taken away, and its holders know: the load itself succeeded
+    if held is None:  # the query was loaded and taken away, and its holders know: the load itself succeeded
         taken = _unknown(id)
         decision.cause(LoadResolved(_replace(taken, resource_id=command.resource_id, response=command.response), None))
         return
     if held.registrar not in catalog.up:
         decision.note(catalog.fresh, id, True)
         decision.cause(Connect(held.registrar))
-    if held.hold is not HELD:  # else reconciling was faster
+    if held.hold is not HELD:  # else reconciling has made it HELD before
         loaded(decision, held.registrar, Loaded(id, command.resource_id, command.response))
     # The row is as it was before: loaded() has caused its own LoadResolved.
     if held.hold is HELD or (held.hold is PENDING and id in catalog.ending):
@@ -109,25 +109,25 @@ def got(decision: Decision, command: Got) -> None:
 
 
 def send_again(decision: Decision, command: SendAgain) -> None:
-    """Go on with a load or unload whose caller has lost its own line; the provider knows it by its id."""
+    """Send a load or unload again by the link, as its thread's line broke; the provider knows it by its id."""
     add_in_flight(decision, command.query_id)
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
         _end_unknown(decision, command.query_id, failures.taken_before_heard(command.query_id))
-    elif held.hold is PENDING and held.id in decision.catalog.ending:  # its resource hears when its load returns
+    elif held.hold is PENDING and held.id in decision.catalog.ending:  # taken away; its holders are hearing of it
         decision.cause(LoadResolved(held, failures.taken_before_heard(held.id)))
     elif held.hold is PENDING:
         request(decision, held.registrar, load_of(decision, held))
     elif held.hold is HELD:
         decision.cause(LoadResolved(held, None))
     else:
-        decision.put(held)  # it may not be owed on disk yet
+        decision.put(held)  # the disk may not have it as owed yet
         request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def _end_unknown(decision: Decision, query_id: str, failure: Failure) -> None:
-    """It was taken away, and has gone when that had been heard: who still waits for its load hears it now."""
+    """Fail a load whose query was taken away, and whose row went when its holders had heard of that."""
     decision.cause(LoadResolved(_unknown(query_id), failure))
 
 
@@ -136,38 +136,38 @@ def _unknown(query_id: str) -> Held:
 
 
 def pending(ask: Ask, attempt: int, seq: int) -> Held:
-    """The row of what is asked for."""
+    """Return the row of a query that is asked for."""
     return Held(ask.query_id, ask.registrar, ask.server, ask.request, None, "", ask.parent, attempt, seq, PENDING, OK)
 
 
 def load_of(decision: Decision, held: Held) -> Load:
-    """The message that asks for it: the first time and every time."""
+    """Return the Load that asks for a query; it is the same the first time and every time."""
     return Load(held.id, held.server, held.request, decision.catalog.name, held.parent, held.attempt, held.seq)
 
 
 def loaded(decision: Decision, provider: str, message: Loaded) -> None:
-    """The query is ours. One that we do not know of is released.
+    """Mark a query as held, or release it if this registrar does not want it.
 
-    So is another resource of a query that is being taken away: its Load was sent again after its provider fell, though
-    its caller's own connection had answered it.
+    A query without a row is not wanted. Nor is a new resource of a query that is being taken away: its Load was sent
+    again after its provider crashed, though its caller's own connection had answered it.
     """
     add_in_flight(decision, message.query_id)
     held = decision.catalog.held.get(message.query_id)
     if held is None or (held.id in decision.catalog.ending and held.resource_id != message.resource_id):
         request(decision, provider, Unload(message.query_id, decision.catalog.name))
     elif held.hold is PENDING:
-        response = message.response if held.response is None else held.response  # an update has overtaken it
+        response = message.response if held.response is None else held.response  # an UPDATE has come before it
         held = _replace(held, hold=HELD, resource_id=message.resource_id, response=response)
         decision.put_later(held)
         decision.cause(LoadResolved(held, None))
 
 
 def load_refused(decision: Decision, message: LoadRefused) -> None:
-    """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice.
+    """Remove the row of a query that does not exist. If it is held, it was taken away since, and a notice says so.
 
-    Such a notice may also wait for a query whose answer was lost with its link: `acked` has a link opened for it. And
-    while its caller's own connection has not answered, or broken (`direct`), nothing is decided: its answer may say
-    that the query is loaded.
+    Such a notice may also wait for a query whose answer was lost with its link: the entry in `acked` has a link opened
+    for it. While its caller's own connection has neither answered nor broken (`direct`), nothing is decided: its answer
+    may say that the query is loaded.
     """
     held = decision.catalog.held.get(message.query_id)
     if held is None:
@@ -182,7 +182,7 @@ def load_refused(decision: Decision, message: LoadRefused) -> None:
 
 
 def end_direct(decision: Decision, query_id: str) -> None:
-    """The row goes while the caller's own line has not answered."""
+    """Note that the row of a query goes while its caller's own connection has not answered."""
     if query_id in decision.catalog.direct:
         decision.note(decision.catalog.direct, query_id, False)
 
@@ -202,7 +202,10 @@ def give_up(decision: Decision, command: GiveUp) -> None:
 
 
 def release(decision: Decision, command: Release) -> None:
-    """Let a query go. On disk before the provider hears of it: found held here but not there, it would seem lost."""
+    """Release a query, and write that it is owed before the provider hears of it.
+
+    Otherwise a crash could leave it held here and not at the provider, and it would seem lost.
+    """
     held = decision.catalog.held.get(command.query_id)
     if held is None or held.hold is OWED:
         decision.cause(UnloadResolved(command.query_id, failures.unknown_query(decision.catalog, command.query_id)))
@@ -212,10 +215,10 @@ def release(decision: Decision, command: Release) -> None:
 
 
 def owed(catalog: Catalog, query_id: str) -> Held | None:
-    """Return the row that says a query is owed, for a caller who lets it go by its own line; None: not this one.
+    """Return the owed row of a query that a thread releases by its own line; None if release() has to decide it.
 
-    The fast path of release(). Not one from before a crash: a list that its provider made before may come after the
-    answer, and bring it back.
+    release() decides queries from before a crash: a list that their provider made earlier may arrive after the answer,
+    and would bring them back.
     """
     held = catalog.held.get(query_id)
     if held is None or held.hold is not HELD or held.seq <= catalog.since:
@@ -226,13 +229,13 @@ def owed(catalog: Catalog, query_id: str) -> Held | None:
 
 
 def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
-    """Make the query owed, by the row that owed() has returned.
+    """Mark a query as owed, with the row that owed() has returned; return False if write() has not written it.
 
-    If any of it is on disk, write(row) writes it first. If nothing is, nothing need be: after a crash its provider says
-    what became of it. False: write() has not written it, and nothing has changed.
+    If the disk has anything of the query, write(row) writes it first. If it has nothing, nothing is written: after a
+    crash the provider says whether the query is held. After False nothing has changed.
 
     Raises:
-        CatalogError: of write(); nothing has changed.
+        CatalogError: write() has raised it; nothing has changed.
     """
     id = row.id
     catalog.unfinished = [("held", id, catalog.held[id])]
@@ -254,7 +257,7 @@ def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], b
 
 
 def forget_released(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
-    """Decide Unloaded by the fast path, which comes to the same as unloaded(); False: that is to decide it."""
+    """Decide Unloaded by the fast path, as unloaded() does; return False if unloaded() has to decide it."""
     row = catalog.held.get(query_id)
     if row is None:
         return True
@@ -269,15 +272,18 @@ def forget_released(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
 
 
 def release_overdue(decision: Decision, command: ReleaseOverdue) -> None:
-    """The provider has not answered in time: the caller goes on, the release stays owed."""
+    """Fail an unload that its provider has not answered in time; the release stays owed."""
     held = decision.catalog.held.get(command.query_id)
     if held is not None and held.hold is OWED:
-        decision.put(held)  # it may not be owed on disk yet
+        decision.put(held)  # the disk may not have it as owed yet
         decision.cause(UnloadResolved(command.query_id, command.failure))
 
 
 def unloaded(decision: Decision, provider: str, message: Unloaded) -> None:
-    """A release is done. If it was said to have failed before (it was asked twice, and tried twice), it is a loss."""
+    """End a release that the provider has confirmed. A query that is HELD again is lost.
+
+    That happens if the unload was tried twice: the first time it failed, and the query was held again.
+    """
     held = decision.catalog.held.get(message.query_id)
     if held is None:
         return
@@ -288,7 +294,7 @@ def unloaded(decision: Decision, provider: str, message: Unloaded) -> None:
 
 
 def end_release(decision: Decision, held: Held) -> None:
-    """The provider does not have the query any more, as was wanted."""
+    """Remove the row of an owed query that its provider does not have any more."""
     end_direct(decision, held.id)
     decision.drop_later(held)
     decision.forget(decision.catalog.kept, held.id)
@@ -297,9 +303,9 @@ def end_release(decision: Decision, held: Held) -> None:
 
 
 def unload_refused(decision: Decision, message: UnloadRefused) -> None:
-    """The unload callback raised there: the query is ours again, if there is somebody who could want it.
+    """Hold a query again whose unload callback raised, if anybody could want it.
 
-    What was withdrawn, and what a resource owes that is gone or has been loaded anew, stays owed; it is sent again with
+    A withdrawn query stays owed. So does one whose resource is gone or was loaded anew. Their Unload is sent again over
     the next link.
     """
     catalog = decision.catalog
@@ -316,9 +322,9 @@ def unload_refused(decision: Decision, message: UnloadRefused) -> None:
 
 
 def lose(decision: Decision, held: Held, event: str, why: str) -> None:
-    """What we held is there no more: as though its provider had said so, when statuses may be heard.
+    """Give the holders of a query a notice that it is lost, as though its provider had sent one.
 
-    It may have been heard before, if it was asked for before a crash.
+    The notice is marked as repeated if the query is from before a crash: its holders may have heard it before.
     """
     if held.id in decision.catalog.ending:
         return
@@ -332,11 +338,11 @@ def lose(decision: Decision, held: Held, event: str, why: str) -> None:
 
 
 def begin_again(decision: Decision) -> None:
-    """At the start of an incarnation: nobody waits any more, and interrupted loads start clean."""
+    """Clean up at the start of an incarnation: drop pending rows, and owe the parts of interrupted loads."""
     catalog = decision.catalog
     for held in list(catalog.held.values()):
         parent = catalog.resources.get(held.parent)
         if held.hold is PENDING:
-            decision.drop_later(held)  # if the provider has it, reconciling brings it back or releases it
+            decision.drop_later(held)  # if the provider has the query, reconciling takes it back or releases it
         elif held.hold is HELD and held.parent and (parent is None or parent.phase is Phase.LOADING):
             decision.put(_replace(held, hold=OWED))

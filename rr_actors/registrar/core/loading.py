@@ -1,4 +1,4 @@
-"""What a registrar decides as a provider about loads.
+"""The decisions of a provider about loads.
 
 A resource's life, by phase::
 
@@ -7,9 +7,9 @@ A resource's life, by phase::
          │          └─> (gone)         └─> UNLOAD_FAILED ─> UNLOADING ...
          └─> QUEUED, while one of the same request is UNLOADING, then LOADING
 
-FATAL is a status, not a phase: such a resource stays with those who hold it and is not found by new requests.
+FATAL is a status, not a phase. A FATAL resource stays with its holders, and new requests do not join it.
 
-A Load may come twice, by two ways, and the second after the first was refused: it is refused again, and not run.
+A Load may come twice, by two ways. If the first was refused, the second is refused again, and no callback runs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _WAITS = (LOADING, QUEUED)
 
 
 def load(decision: Decision, message: Load) -> None:
-    """Join the resource of an identical request, or begin a new one. `message.request` is canonical."""
+    """Let a Load join the resource of an identical request, or begin a new one. `message.request` is canonical."""
     catalog = decision.catalog
     known = catalog.queries.get(message.query_id)
     if known is not None:
@@ -87,10 +87,10 @@ def _join(decision: Decision, message: Load, resource: Resource) -> None:
 
 
 def join(catalog: Catalog, message: Load) -> Query | None:
-    """Return the one row that a Load adds to the catalog if it is answered at once; None: load() is to decide it.
+    """Return the one row that a Load adds if it can be answered at once; None if load() has to decide it.
 
-    The fast path, which decides as load() does: what is loaded and held by somebody gets one holder more, and nothing
-    else follows.
+    This fast path decides as load() does: a resource that is loaded and held gets one more holder, and nothing else
+    changes.
     """
     resource_id = catalog.by_request.get(message.server, _NONE).get(message.request)
     resource = None if resource_id is None else catalog.resources[resource_id]
@@ -105,7 +105,7 @@ def join(catalog: Catalog, message: Load) -> Query | None:
 
 
 def _load_again(decision: Decision, message: Load, query: Query) -> None:
-    """The same query once more: its answer was lost, or is still to come."""
+    """Decide a Load of a known query: its answer was lost, or is still to come."""
     catalog = decision.catalog
     resource = catalog.resources[query.resource_id]
     if resource.id in catalog.recovering:
@@ -123,7 +123,7 @@ def _look_for_ring(decision: Decision, message: Load, resource: Resource) -> Non
 
 
 def _begin_query(decision: Decision, message: Load, resource_id: str) -> None:
-    """The row. What was said about one of the same id before, which its origin has not held, is not about this one."""
+    """Add the query's row, and drop notices about an earlier query of the same id, which its origin has not held."""
     decision.put(_query_of(message, resource_id))
     if message.origin in decision.catalog.notices_to:
         drop_notices(decision, message.origin, message.query_id)
@@ -134,7 +134,7 @@ def _query_of(message: Load, resource_id: str) -> Query:
 
 
 def load_done(decision: Decision, done: LoadDone) -> None:
-    """Answer everybody who waits; if nobody does any more, release what came too late."""
+    """Answer all consumers that wait; unload the resource if nobody holds it any more."""
     catalog = decision.catalog
     resource = running(catalog, done.resource_id, LOADING, done.attempt)
     if resource is None:
@@ -153,12 +153,12 @@ def load_done(decision: Decision, done: LoadDone) -> None:
             reply = Loaded(query_id, resource.id, done.response)
             decision.cause(Reply(catalog.queries[query_id].origin, reply))
     for answer in answers_to_owners(decision, resource, None):
-        decision.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
+        decision.cause(answer)  # the owner unloaded it while it was loading; its present holders came after that
     start_deferred(decision, resource.id)
 
 
 def load_erred(decision: Decision, erred: LoadErred) -> None:
-    """Leave nothing behind: the resource, its queries and what the callback had loaded go; then everybody hears."""
+    """Remove the resource and its queries, release what the callback had loaded, and only then answer all that wait."""
     resource = running(decision.catalog, erred.resource_id, LOADING, erred.attempt)
     if resource is None:
         return
@@ -172,25 +172,25 @@ def load_erred(decision: Decision, erred: LoadErred) -> None:
 
 
 def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
-    """Refuse everybody who waits; the callback goes on, and what it brings is unloaded when it comes."""
+    """Refuse all consumers that wait. The callback goes on; the resource is unloaded when it returns."""
     resource = running(decision.catalog, overdue.resource_id, LOADING, overdue.attempt)
     if resource is not None:
         for reply in refuse_all(decision, resource, overdue.failure):
             decision.cause(reply)
 
 
-# Probing: finding rings of loads that wait for one another. Edge chasing, after Chandy, Misra and Haas (1983).
+# Probing finds rings of loads that wait for one another, by edge chasing (Chandy, Misra and Haas 1983).
 #
-# The last edge of a ring is always a load that joins one in flight (a first one has nothing to wait for yet), so a
-# probe starts there. All other edges are known at their providers by then, so it does not matter that a load may go by
-# another connection than the probe that follows it. A probe may be lost with its link: all that waits there is then
-# sent again over the next, and starts another.
+# The last edge of a ring is always a load that joins one in flight, because a new resource waits for nothing yet. So a
+# probe starts at a load that joins. All other edges are known at their providers by then. Therefore a load may go by
+# another connection than the probe that follows it. A link may break and lose a probe. The loads that wait at that
+# provider are then sent again over the next link, and each starts another probe.
 
 _RING_LIMIT = 256
 
 
 def probe(decision: Decision, message: Probe) -> None:
-    """Pass a probe on along everything the query's resource waits for; at the waiter itself it has found a ring."""
+    """Pass a probe on to all that the query's resource waits for. Back at the waiter, it has found a ring."""
     query = decision.catalog.queries.get(message.query_id)
     resource_id = query.resource_id if query is not None else parked_on(decision.catalog, message.query_id)
     if resource_id is not None:
@@ -198,7 +198,7 @@ def probe(decision: Decision, message: Probe) -> None:
 
 
 def chase(decision: Decision, resource: Resource, message: Probe) -> None:
-    """As probe(), from this resource on."""
+    """Pass a probe on from this resource to all that it waits for."""
     catalog = decision.catalog
     ring = [*message.ring, catalog.origin_of(resource)]
     waits = resource.phase in (LOADING, QUEUED) or resource.id in catalog.recovering

@@ -1,4 +1,4 @@
-"""What both sides decide when the link between a consumer and a provider comes and goes."""
+"""The decisions of consumer and provider when the link between them opens and breaks."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Requ
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Query, State
 
-# What a registrar decides as a consumer when the link to a provider comes and goes.
+# The decisions of a consumer when its link to a provider opens and breaks.
 #
-# The provider's list of our queries is the truth about those it has; what we know about our own doings in this
-# incarnation (which of them we have released since) is the truth about which of them we want.
+# The provider's list says which of our queries it has. Our own rows of this incarnation say which of these we want: we
+# may have released some since.
 
 _replace = msgspec.structs.replace
 
 
 def reconcile(decision: Decision, command: Reconcile) -> None:
-    """A provider is back, or we are: agree on what we hold there, then send everything open again."""
+    """Agree with a provider, over a new link, on the queries held there; then send all open messages again."""
     catalog = decision.catalog
-    add_all_in_flight(decision, command.registrar)  # a provider may have dropped what came by a line before this link
+    add_all_in_flight(decision, command.registrar)  # the provider may have dropped those sent before this link
     decision.note(catalog.up, command.registrar, command.link)
     theirs = {query.query_id for query in command.queries}
     for held in catalog.unsettled_at(command.registrar):
         _forget_what_was_heard(decision, held)
     for query in command.queries:
         _agree(decision, command.registrar, query)
-    if command.registrar in catalog.outbound:  # perhaps only since this list came, which somebody has asked for
+    if command.registrar in catalog.outbound:  # perhaps the list has brought the first row at this provider
         look_there(decision, command.registrar)
     owed: list[Held] = []
     agreed, others = digests.split(catalog, command.registrar, command.same)
@@ -49,7 +49,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
             lose(decision, held, command.event, why)
             decision.note(
                 catalog.acked, command.registrar, True
-            )  # a notice may follow: if the link is lost, on the next
+            )  # a notice may follow; if this link is lost, over the next
     for id in list(catalog.fresh):
         if id not in catalog.held or catalog.held[id].registrar == command.registrar:
             decision.forget(catalog.fresh, id)
@@ -58,7 +58,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
 
 
 def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
-    """One query of ours in a provider's catalog."""
+    """Take over what a provider's list says of one query."""
     held = decision.catalog.held.get(query.query_id)
     if held is None:
         _take_back(decision, registrar, query)
@@ -68,29 +68,32 @@ def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     elif held.hold is Hold.HELD and query.response is not None:
         now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
         _is_agreed(decision, held)
-        if now != held:  # a status was acknowledged, and a crash came before the row was written
+        if now != held:  # a crash came after a status was acknowledged, and before the row was written
             decision.put_later(now)
 
 
 def _forget_what_was_heard(decision: Decision, held: Held) -> None:
-    """Of what is asked for, a link before this one may have brought a new response, and not that it was taken away.
+    """Forget a response or status that an earlier link brought for a pending query.
 
-    The list is newer than that, and says what there is now; what it does not have is loaded anew.
+    That link may have lost the news that the query was taken away. The list is newer: if it does not have the query,
+    the query is loaded anew.
     """
     if held.hold is Hold.PENDING and (held.response is not None or held.state is not State.OK):
         decision.put_here(_replace(held, response=None, state=State.OK))
 
 
 def _is_agreed(decision: Decision, held: Held) -> None:
-    """What the links before this one brought has been done, and how it is we know."""
+    """Note that provider and consumer agree on a query: nothing of an earlier link is open."""
     decision.forget(decision.catalog.kept, held.id)
 
 
 def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
-    """A query we do not know of: from before a crash, its row not written yet; or released, but the provider missed it.
+    """Add a row for a query that only the provider knows: hold it again, or release it.
 
-    One without a response was never acknowledged to anybody; one of an earlier attempt of its parent is not the
-    parent's any more; one of this incarnation was released, or we would know it. Those are released.
+    It may be from before a crash, its row not written yet; or the provider missed its release. It is released in three
+    cases. It has no response: then its load was never acknowledged. It is of an earlier attempt of its parent: the
+    parent does not have it any more. It is of this incarnation: then we have released it, as otherwise we would have
+    its row.
     """
     catalog = decision.catalog
     parent = catalog.resources.get(query.parent)
@@ -104,10 +107,10 @@ def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
 
 
 def link_lost(decision: Decision, command: LinkLost) -> None:
-    """Nothing is sent to this provider until it is reconciled again.
+    """Note that a link is lost: nothing is sent to its provider until that is reconciled again.
 
-    Nor what this decision has decided before, over the link that was lost: on the next it might come to a provider that
-    has been restarted, and knows no longer that it has answered.
+    Requests that this decision has made before, for the lost link, are dropped, too. Over the next link they might
+    reach a provider that was restarted and does not know that it has answered them.
     """
     catalog = decision.catalog
     kept = [e for e in decision.effects if not (isinstance(e, Request) and e.registrar == command.registrar)]
@@ -118,18 +121,18 @@ def link_lost(decision: Decision, command: LinkLost) -> None:
     unsettled = catalog.unsettled_at(command.registrar)
     waited_for = any(held.hold is Hold.PENDING and held.id not in catalog.direct for held in unsettled)
     if command.registrar in catalog.outbound and not waited_for:
-        decision.cause(Connect(command.registrar))  # what direct lines got, or owe, may be known only since the loss
+        decision.cause(Connect(command.registrar))  # rows of direct lines may have been added only since the loss
 
 
 def peer_gone(decision: Decision, command: PeerGone) -> None:
-    """A provider cannot be reached: who waits for a load hears at once; what is gone for good is lost."""
+    """Fail the loads that wait for a provider that cannot be reached; if it is gone for good, lose what it had."""
     catalog = decision.catalog
     for id in list(catalog.outbound.get(command.registrar, ())):
         held = catalog.held[id]
         if command.final:
             decision.forget(catalog.fresh, id)
         if held.hold is Hold.PENDING and id in catalog.direct:
-            continue  # its line breaks, and it is asked for by the link then
+            continue  # its thread's line breaks, and then the link asks for it
         if held.hold is Hold.PENDING:
             decision.cause(LoadResolved(held, command.failure))
             if command.final:
@@ -148,16 +151,16 @@ def peer_gone(decision: Decision, command: PeerGone) -> None:
         decision.drop(catalog.peers[command.registrar])
 
 
-# What a registrar decides as a provider when a consumer's link comes and goes.
+# The decisions of a provider when a consumer's link opens and breaks.
 
 _CHUNK = 500
-_CHUNK_BYTES = 2**16  # of requests and responses: a frame must not be too long, however much is held
+_CHUNK_BYTES = 2**16  # requests and responses of one message: a frame must not be too long, however much is held
 
 
 def fetch(decision: Decision, message: Fetch) -> None:
-    """List the consumer's queries; on a new link (`resume`) send the notices it has not dealt with behind them.
+    """List the consumer's queries; on a new link (`resume`), then send the notices that it has not dealt with.
 
-    In that order: a notice for a query that the consumer has lost in a crash must find it again.
+    The order matters: the consumer may have lost a query in a crash, and a notice for it must find its row again.
     """
     catalog = decision.catalog
     same, queries = digests.compared(catalog, message.origin, message.spans)
@@ -173,8 +176,8 @@ def fetch(decision: Decision, message: Fetch) -> None:
         size += more
     decision.cause(Reply(message.origin, Fetched(rows, False, message.number, same)))
     if message.resume:
-        drop_parked(decision, lambda parked: parked.origin == message.origin)  # sent again, if its incarnation lives
-        for id in list(catalog.unanswered):  # an Unload that is not answered is sent again over the new link
+        drop_parked(decision, lambda parked: parked.origin == message.origin)  # a consumer that lives sends them again
+        for id in list(catalog.unanswered):  # the consumer sends these Unloads again over the new link
             query = catalog.queries.get(id)
             if query is None or query.origin == message.origin:
                 decision.forget(catalog.unanswered, id)
@@ -191,5 +194,5 @@ def _fetched(catalog: Catalog, query: Query) -> FetchedQuery:
 
 
 def consumer_lost(decision: Decision, command: ConsumerLost) -> None:
-    """The link is down: notices wait until there is a new one. What the consumer holds it keeps."""
+    """Note that a consumer's link is down: its notices wait for a new link, and its queries stay."""
     decision.forget(decision.catalog.consumers, command.origin)

@@ -1,9 +1,10 @@
-"""Taking up again what a catalog says was going on when its process died, or stopped.
+"""Recovery: a registrar goes on with all that was in progress when its process died, or stopped.
 
-At opening: `begin_again`. Then, as each server is registered: an interrupted load or unload runs again, and each live
-resource is asked after, or kept, reloaded or given up as the server's policy says.
+The first decision is `begin_again`, at the opening of the catalog. Then follows `register` for each server: an
+interrupted load or unload runs again, and each live resource is recovered, kept, reloaded or lost, as the server's
+policy says.
 
-An interrupted load that nobody holds any more is not run again: its unload callback runs, with no response.
+An interrupted load whose resource nobody holds any more does not run again. Its unload callback runs, with no response.
 """
 
 from __future__ import annotations
@@ -29,30 +30,33 @@ _replace = msgspec.structs.replace
 
 
 ATTEMPTS = 3
-"""How often a load is begun whose process dies each time. With the default restart intensity, once more would end the
-supervisor: one request could take a whole tree down, and again at each start."""
+"""How often a load begins whose process dies each time. With the default restart intensity, one more death would end
+the supervisor: one request could take a whole tree down, and again at each start."""
 
 
 def begin_again(decision: Decision) -> None:
-    """The first decision of an incarnation, before any server is registered."""
+    """Make the first decision of an incarnation, before any server is registered.
+
+    A load that was interrupted is prepared for its next attempt; after ATTEMPTS of them it is refused and cleaned up.
+    """
     holding.begin_again(decision)
     for id in list(decision.catalog.moving):
         resource = decision.catalog.resources[id]
         if resource.phase is not Phase.LOADING:
             continue
-        if resource.tries == NOT_BEGUN:  # its server was not there: not an attempt
+        if resource.tries == NOT_BEGUN:  # its server was not registered: that was not an attempt
             continue
         if resource.attempt < ATTEMPTS:
             decision.put(_replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
         else:
             for reply in refuse_all(decision, resource, failures.interrupted(decision.catalog, resource)):
                 decision.cause(reply)
-            # It may be half there, or wholly; the number says what its last attempt loaded, and that is released.
+            # A part or all of it may be loaded. With the next number, the parts of the last attempt are released.
             decision.put(_replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
 
 
 def register(decision: Decision, command: Register) -> None:
-    """A server is there: take up its resources."""
+    """Add a server, and go on with its resources."""
     catalog = decision.catalog
     server = command.server
     decision.note(catalog.servers, server.name, server)
@@ -74,7 +78,7 @@ def register(decision: Decision, command: Register) -> None:
 
 
 def _interrupted(decision: Decision, resource: Resource) -> None:
-    """Run a load again that somebody holds; clean up what one has left that nobody wants."""
+    """Run an interrupted load again if somebody holds its resource; otherwise clean up what it left."""
     if resource.id in decision.catalog.holders:
         load_again(decision, resource)
     else:
@@ -82,11 +86,11 @@ def _interrupted(decision: Decision, resource: Resource) -> None:
 
 
 def _to_recover(catalog: Catalog, server: Server) -> list[Resource]:
-    """The server's resources that something is to be done about."""
+    """Return the server's resources that need a decision."""
     ids = catalog.by_server.get(server.name, ())
-    if server.recovery == "keep" and not server.has_recover:  # nothing is asked about those that are held: most of them
+    if server.recovery == "keep" and not server.has_recover:  # held resources, which are most, need no decision then
         moving, holders = catalog.moving, catalog.holders
-        if len(holders) == len(catalog.resources):  # all of them
+        if len(holders) == len(catalog.resources):  # every resource is held
             ids = [id for id in moving if id in ids]
         else:
             ids = [id for id in ids if id in moving or id not in holders]
@@ -95,12 +99,12 @@ def _to_recover(catalog: Catalog, server: Server) -> list[Resource]:
 
 def _recover(decision: Decision, resource: Resource, has_recover: bool, policy: str, event: str) -> None:
     if resource.id not in decision.catalog.holders:
-        if has_recover or policy != "keep":  # it may be lost, and nobody needs to know
+        if has_recover or policy != "keep":  # it may be lost, so it is not kept warm
             begin_unload(decision, resource)
         else:
             retire(decision, resource)
     elif resource.state is State.FATAL:
-        return  # what an interrupted reload had loaded stays with it until its holders release it
+        return  # parts of an interrupted reload stay with it until its holders release it
     elif has_recover:
         decision.note(decision.catalog.recovering, resource.id, ())
         decision.cause(StartRecover(resource, reload=False))
@@ -115,7 +119,7 @@ def _recover(decision: Decision, resource: Resource, has_recover: bool, policy: 
 
 
 def recover_done(decision: Decision, done: RecoverDone) -> None:
-    """It lives; a changed response is an UPDATE to its holders."""
+    """Keep a resource that lives; send its holders an UPDATE if its response has changed."""
     resource = _asked_after(decision, done.resource_id, done.attempt)
     if resource is None:
         return
@@ -126,7 +130,7 @@ def recover_done(decision: Decision, done: RecoverDone) -> None:
 
 
 def recover_erred(decision: Decision, erred: RecoverErred) -> None:
-    """It is lost: FATAL to its holders."""
+    """Send the holders of a lost resource a FATAL status."""
     resource = _asked_after(decision, erred.resource_id, erred.attempt)
     if resource is None:
         return
@@ -136,7 +140,7 @@ def recover_erred(decision: Decision, erred: RecoverErred) -> None:
 
 
 def _asked_after(decision: Decision, resource_id: str, attempt: int) -> Resource | None:
-    """The resource, if it is being asked after; it cannot go as long as it is."""
+    """Return the resource if this attempt of its recovery still runs. No decision removes it before that ends."""
     if resource_id not in decision.catalog.recovering:
         return None
     resource = decision.catalog.resources[resource_id]
@@ -144,7 +148,7 @@ def _asked_after(decision: Decision, resource_id: str, attempt: int) -> Resource
 
 
 def _go_on(decision: Decision, resource_id: str, parked: tuple[Load | Unload, ...]) -> None:
-    """Do what came in while the resource was being asked after: first what its owner wants, then the rest in turn."""
+    """Decide what waited for the recovery of a resource: its owner's unload first, then the parked messages."""
     resource = decision.catalog.resources[resource_id]
     if condemned(decision, resource):
         begin_unload(decision, resource)

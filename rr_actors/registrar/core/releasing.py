@@ -1,8 +1,8 @@
-"""What a registrar holds elsewhere: its loads in flight, and releasing what a resource held.
+"""The queries that a registrar holds at providers: its loads in flight, and the release of a resource's parts.
 
-Parts are released newest first, one after another, and only then what waits for it. The rows are made OWED in the
-decision that ends the resource, so a crash in between forgets nothing: what is owed is sent again to each provider when
-the link to it is up. A provider that is down is not waited for.
+Parts are released newest first, one after another; the effects that wait for that come last. The rows become OWED in
+the decision that ends the resource, so a crash in between forgets nothing: an owed release is sent again when the link
+to its provider is up. Releases do not wait for a provider that is down.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _replace = msgspec.structs.replace
 
 
 def request(decision: Decision, registrar: str, message: Message) -> None:
-    """Send to a provider if the link is up; else have it made: reconciling sends everything open anyway."""
+    """Send a message to a provider if its link is up; else have the link made, which sends all open messages again."""
     if registrar in decision.catalog.up:
         decision.cause(Request(registrar, message))
     else:
@@ -29,15 +29,16 @@ def request(decision: Decision, registrar: str, message: Message) -> None:
 
 
 def look_there(decision: Decision, provider: str) -> None:
-    """Have this provider looked for at the next start."""
+    """Write that this provider has to be found at the next start."""
     if provider not in decision.catalog.peers:
         decision.put(Peer(provider))
 
 
 def add_in_flight(decision: Decision, query_id: str) -> None:
-    """Make the row of a load in flight, if it is one: something is about to be decided about it.
+    """Add the row of a load in flight, if the query is one, because a decision is about to concern it.
 
-    Its caller's own thread has sent it, and waits for the answer: until somebody asks, nobody else need know of it.
+    The caller's own thread has sent this load and waits for the answer. Until a decision concerns the query, nothing
+    else needs its row.
     """
     held = decision.forget(decision.catalog.in_flight, query_id)
     if held is not None:
@@ -48,20 +49,20 @@ def add_in_flight(decision: Decision, query_id: str) -> None:
 
 
 def add_all_in_flight(decision: Decision, provider: str = "", parent: str = "") -> None:
-    """As add_in_flight(), of every load in flight; to this provider, and for this resource, if they are given."""
+    """Add the rows of all loads in flight; with `provider` or `parent`, only of those."""
     for held in list(decision.catalog.in_flight.values()):
         if provider in ("", held.registrar) and parent in ("", held.parent):
             add_in_flight(decision, held.id)
 
 
 def parts_of(decision: Decision, resource_id: str) -> list[str]:
-    """What the resource holds elsewhere, or is about to, newest first."""
+    """Return the queries that the resource holds or has asked for, newest first."""
     add_all_in_flight(decision, parent=resource_id)
     return decision.catalog.parts_of(resource_id)
 
 
 def owe(decision: Decision, held: Held, why: str) -> None:
-    """Make the release of `held` owed, on disk. A caller that still waits for its load hears why that ends."""
+    """Make the query owed, on disk. A caller that still waits for its load hears why the load ends."""
     if held.hold is Hold.PENDING:
         decision.forget(decision.catalog.direct, held.id)
         decision.cause(LoadResolved(held, failures.withdrawn(held, why)))
@@ -69,7 +70,7 @@ def owe(decision: Decision, held: Held, why: str) -> None:
 
 
 def withdraw(decision: Decision, held: Held, failure: Failure) -> None:
-    """End a load that is not waited for any longer; if it still succeeds, it is released again."""
+    """End a load that nobody waits for any longer. If it succeeds later, the provider releases it."""
     decision.forget(decision.catalog.direct, held.id)
     decision.cause(LoadResolved(held, failure))
     decision.put(_replace(held, hold=Hold.OWED, resource_id=""))
@@ -79,7 +80,7 @@ def withdraw(decision: Decision, held: Held, failure: Failure) -> None:
 def release_parts(
     decision: Decision, resource_id: str, after: Sequence[Effect], keep_attempt: int | None = None
 ) -> None:
-    """Release what the resource holds (with `keep_attempt`: except what that attempt loaded), then cause `after`."""
+    """Release the parts of the resource, then cause `after`; with `keep_attempt`, keep the parts of that attempt."""
     catalog = decision.catalog
     ids = [id for id in parts_of(decision, resource_id) if catalog.held[id].attempt != keep_attempt]
     for id in ids:
@@ -95,7 +96,7 @@ def release_parts(
 
 
 def released(decision: Decision, held_id: str) -> None:
-    """The release of this part was answered, or cannot be: go on with the next."""
+    """Go on with the next part, because the release of this one was answered, or cannot be."""
     catalog = decision.catalog
     number = decision.forget(catalog.closing_of, held_id)
     if number is not None:
@@ -105,7 +106,7 @@ def released(decision: Decision, held_id: str) -> None:
 
 
 def provider_lost(decision: Decision, registrar: str) -> None:
-    """Nothing is answered by this provider now: do not wait for it."""
+    """Go on with all releases that wait for this provider, because it does not answer now."""
     catalog = decision.catalog
     waiting = [id for id in catalog.closing_of if id in catalog.held and catalog.held[id].registrar == registrar]
     for id in waiting:

@@ -1,12 +1,12 @@
-"""What a registrar decides as a provider about how its resources are: statuses and late responses, to every holder.
+"""The decisions of a provider about statuses of its resources and about new responses, for every holder.
 
-What the owner says of a resource goes to the status callback of its server first. The row of the resource has it at
-once. A notice of its own (rows.is_own) says that the callback has to run; the commit that drops it makes the notices
-for the holders, unless the callback has dealt with the status. What a status callback itself says of its resource goes
-to the holders directly.
+A status that the owner sets goes to the status callback of the resource's server first. The resource's row has it at
+once. A notice of the server's own (rows.is_own) says that the callback has to run. The commit that drops this notice
+adds the notices for the holders, unless the callback has handled the status. A status that a status callback sets on
+its own resource goes to the holders directly.
 
-A status callback does not run while the load callback, or the recover callback, of its resource does: only when that
-has returned there is a response that it may replace. Until then the status is deferred.
+A status callback does not run while the load or recover callback of its resource runs: before these return, there is no
+response that it may replace. Until then the status is deferred.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def spread(
     *,
     repeated: bool = False,
 ) -> None:
-    """Note a status on the resource and tell every holder, once each."""
+    """Note a status on the resource, and send it once to every holder."""
     resource = _note(decision, resource, state, message, response)
     said = Notice(event, "", "", resource.id, event, state, message, source, False, response)
     _tell_holders(decision, resource, said, repeated=repeated)
@@ -71,14 +71,14 @@ def _tell_holders(decision: Decision, resource: Resource, said: Notice, *, repea
 def _end_if_unwanted(decision: Decision, resource: Resource) -> None:
     loaded = resource.phase is Phase.LOADED and resource.id not in decision.catalog.recovering
     if resource.state is State.FATAL and loaded and resource.id not in decision.catalog.holders:
-        begin_unload(decision, resource)  # it lingered; nobody will be given it again
+        begin_unload(decision, resource)  # it lingered; no new request will join it
 
 
 # -- to the server of the resource ---------------------------------------------------------------------------------
 
 
 def start_status(decision: Decision, start: StartStatus) -> None:
-    """Have the status callback of the resource run; when its load or recover callback has returned, if that runs."""
+    """Run the status callback of the resource; defer it while the load or recover callback runs."""
     resource = decision.catalog.resources[start.resource.id]
     if is_busy(decision.catalog, resource):
         deferred = decision.catalog.deferred
@@ -88,14 +88,15 @@ def start_status(decision: Decision, start: StartStatus) -> None:
 
 
 def is_busy(catalog: Catalog, resource: Resource) -> bool:
-    """Return whether its load callback, or its recover callback, has not returned yet."""
+    """Return whether the load or recover callback of the resource has not returned yet."""
     return resource.phase in (Phase.QUEUED, Phase.LOADING) or resource.id in catalog.recovering
 
 
 def start_own(decision: Decision, server: str) -> None:
-    """A server is there: have its status callback hear what it has not dealt with before a crash.
+    """Run the server's status callback again for the notices of its own that it had not dealt with before a crash.
 
-    Not what was said since: its callback has run for that, or does still, though it was unregistered meanwhile.
+    Newer notices are left out: the callback has run for them, or still runs, even if the server was unregistered
+    meanwhile.
     """
     catalog = decision.catalog
     for resource_id in list(catalog.own_notices):
@@ -107,9 +108,9 @@ def start_own(decision: Decision, server: str) -> None:
 
 
 def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
-    """The status callback has run for what was said of its own resource: tell the holders, unless it is handled.
+    """Note that the status callback has run for a status of its own resource: send it to the holders, unless handled.
 
-    A new response they need whatever the callback says; and the newest, as it may have replaced it once more.
+    A new response is sent to the holders even then; and the newest one, as the callback may have replaced it once more.
     """
     resource = decision.catalog.resources.get(notice.resource_id)
     if resource is None or notice.id not in decision.catalog.notices:
@@ -122,11 +123,11 @@ def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
         _tell_holders(decision, resource, _replace(notice, response=newest))
 
 
-# -- what the owner says -------------------------------------------------------------------------------------------
+# -- calls of the owner --------------------------------------------------------------------------------------------
 
 
 def set_status(decision: Decision, command: SetStatus) -> None:
-    """The owner's word on a resource, to its server and to all who hold it."""
+    """Set a status of a resource: its server hears it first, then all holders."""
     resource = decision.catalog.find(command.target)
     if resource is None:
         decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
@@ -136,11 +137,11 @@ def set_status(decision: Decision, command: SetStatus) -> None:
 
 
 def set_response(decision: Decision, command: SetResponse) -> None:
-    """A late response: the stored one is replaced, every holder hears UPDATE with it."""
+    """Replace the response of a resource, and send it to every holder with an UPDATE."""
     resource = decision.catalog.find(command.target)
     if resource is None:
         decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
-    elif resource.response is None:  # an interrupted load that is given up and cleaned up has none either
+    elif resource.response is None:  # it is loading, or it is an interrupted load that is being cleaned up
         decision.cause(Answer(command.ticket, failures.no_response_yet(resource)))
     else:
         _say(decision, resource, command, State.UPDATE, command.response)
@@ -148,7 +149,7 @@ def set_response(decision: Decision, command: SetResponse) -> None:
 
 
 def swap(decision: Decision, command: Swap) -> None:
-    """A spare takes the place of a part: one commit has the spare held, the part owed, and the new response."""
+    """Put a spare in the place of a part: one commit has the spare held, the part owed, and the new response."""
     catalog = decision.catalog
     resource = catalog.resources.get(command.resource_id)
     spare = catalog.held.get(command.spare)
@@ -158,7 +159,7 @@ def swap(decision: Decision, command: Swap) -> None:
         failure = failures.not_swapped(catalog, command.resource_id, command.part)
         decision.cause(Answer(command.ticket, failure))
         return
-    decision.put(spare)  # it may not be on disk yet
+    decision.put(spare)  # the disk may not have it yet
     _release(decision, resource.id, (command.part, *command.others))
     if command.response is not None:
         said = SetResponse(resource.id, command.event, command.response, command.message, None, resource.id)
@@ -172,7 +173,7 @@ def _are_parts(catalog: Catalog, command: Swap) -> bool:
 
 
 def _release(decision: Decision, resource_id: str, ids: Iterable[str]) -> None:
-    """Release parts that are not wanted again, though their unload callback raises: as though they were withdrawn."""
+    """Release parts so that they are not held again, even if their unload callback raises."""
     for id in ids:
         held = decision.catalog.held.get(id)
         if held is not None and held.hold is Hold.HELD and held.parent == resource_id:

@@ -1,9 +1,9 @@
-"""What a registrar decides as a consumer about statuses: who hears of one, and when the provider may forget it.
+"""The decisions of a consumer about statuses: which receivers hear one, and when the provider may forget it.
 
-A notice has up to two receivers: those who listen to the query, and then, unless they have dealt with it, the resource
-that depends on it. The listeners hear it at once, the resource not before its load has returned. Each hears an event
-once, however many ways it took. The notice is acknowledged when both have dealt with it, so that a crash before that
-has the provider tell it again, marked as repeated.
+A notice has up to two receivers: the listeners of the query, and the resource that depends on the query. The listeners
+hear it at once. The resource hears it after them, if none has handled it, and not before its load has returned. Each
+receiver hears an event once, by however many ways it comes. The notice is acknowledged when both have dealt with it. If
+a crash comes before that, the provider sends it again, marked as repeated.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 
 
 def noticed(decision: Decision, provider: str, message: Noticed) -> None:
-    """A status for one of our queries."""
+    """Decide about a status of one of this registrar's queries: pass it on, pass it over, or end the query."""
     notice = message.notice
     add_in_flight(decision, notice.query_id)
     held = decision.catalog.held.get(notice.query_id)
@@ -37,21 +37,21 @@ def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     elif held.resource_id and held.resource_id != notice.resource_id:
         _acknowledge(
             decision, provider, notice.id
-        )  # of what its Load got before; it was held back until on_start returned
+        )  # about an earlier resource of the query; the notice was held back until on_start returned
     elif held.hold is Hold.OWED:
         if notice.released:
             if held.resource_id:
                 end_release(decision, held)
-            else:  # withdrawn: its Load may have been sent again since, and only its provider's answer says it is gone
+            else:  # withdrawn: its Load may have been sent again since, so only the provider's answer can end it
                 request(decision, held.registrar, Unload(held.id, decision.catalog.name))
             _acknowledge(decision, provider, notice.id)
-        # else it goes with the query; if that cannot be unloaded, and is held again, it is sent again
+        # else the provider drops the notice with the query, or sends it again if the unload fails
     elif held.hold is Hold.PENDING and notice.released and held.id not in decision.catalog.direct:
-        # its Load was sent again since, and is answered for itself; what was said before is not about that
+        # its Load was sent again since, and gets an answer of its own; this notice is about the time before
         decision.put_here(_replace(held, state=State.OK, response=None))
         _acknowledge(decision, provider, notice.id)
     elif notice.id in decision.catalog.hearing:
-        pass  # sent again, and acknowledged when it has been dealt with
+        pass  # a second sending; the notice is acknowledged when its receivers have dealt with it
     elif held.id in decision.catalog.ending:
         _acknowledge(decision, provider, notice.id)  # its holders know that they have lost it
     else:
@@ -62,7 +62,7 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
     receivers = 0
     heard_all = held.hold is Hold.HELD and held.id not in decision.catalog.kept
     if repeated and notice.response is not None and heard_all:
-        notice = _replace(notice, response=held.response)  # when the link came, it was the newest
+        notice = _replace(notice, response=held.response)  # reconciling has brought the newest
     place = ("query", held.id, notice.event)
     listened = False
     if place not in decision.catalog.heard:
@@ -96,15 +96,15 @@ def _note(decision: Decision, held: Held, notice: Notice) -> None:
 
 
 def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool:
-    """Tell the resource that depends on the query, once an event; whether the notice has to wait for it.
+    """Have the resource hear the status once for each event; return whether the notice has to wait for it.
 
     Args:
-        listened: whether somebody listens to the query, and is being told: the resource hears after that.
+        listened: whether listeners of the query are hearing the status now; the resource hears it after them.
     """
     catalog, resource, notice = decision.catalog, start.resource, start.notice
     place = ("resource", resource.id, notice.event)
     waiting = catalog.heard.get(place)
-    if waiting is not None:  # it came by another way of the diamond, or is sent again
+    if waiting is not None:  # the event has come by another part before, or the notice is sent again
         if waiting and notice.id not in waiting:
             decision.note(catalog.heard, place, (*waiting, notice.id))
         return bool(waiting)
@@ -122,12 +122,12 @@ def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool
 
 
 def is_listened(catalog: Catalog, held: Held) -> bool:
-    """Whether somebody listens to the query, or to all at its server: a status waits until they have heard it."""
+    """Return whether anybody listens to the query or to its server: the resource hears a status only after them."""
     return held.id in catalog.listened or f"{held.registrar}/{held.server}" in catalog.listened
 
 
 def heard(decision: Decision, command: Heard) -> None:
-    """Those who listen to the query have been told: the resource that depends on it is next, unless it is handled."""
+    """Note that the listeners of a query have heard an event; the resource is next, unless one has handled it."""
     catalog = decision.catalog
     place = ("query", command.query_id, command.event)
     for notice_id in catalog.heard.get(place, ()):
@@ -140,7 +140,7 @@ def heard(decision: Decision, command: Heard) -> None:
 
 
 def start_deferred(decision: Decision, resource_id: str) -> None:
-    """The load callback, or the recover callback, has returned: let the resource hear what has come meanwhile."""
+    """Have the resource hear the deferred statuses, as its load or recover callback has returned."""
     catalog = decision.catalog
     for start in decision.forget(catalog.deferred, resource_id) or ():
         resource = catalog.resources.get(resource_id)
@@ -152,7 +152,7 @@ def start_deferred(decision: Decision, resource_id: str) -> None:
 
 
 def status_done(decision: Decision, done: StatusDone) -> None:
-    """The resource's callbacks for it have run: pass the status on, unless it was dealt with."""
+    """Note that the resource has heard a status; send it to the holders, unless it was handled."""
     catalog = decision.catalog
     notice = done.notice
     if is_own(notice):
@@ -183,13 +183,13 @@ def _dealt_with(decision: Decision, place: Place) -> None:
 
 
 def _end(decision: Decision, held_id: str) -> None:
-    """A query that was taken away goes when its holders know; on disk before the provider may forget to say so."""
+    """Remove a query that was taken away, when its holders know; on disk before the notice is acknowledged."""
     decision.forget(decision.catalog.ending, held_id)
     held = decision.catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
         if (
             held.hold is Hold.PENDING and held_id not in decision.catalog.direct
-        ):  # its line broke: it waits for the link
+        ):  # its thread's line broke, and the load waits for the link
             decision.cause(
                 LoadResolved(held, failures.withdrawn(held, "taken away before the answer to its load came"))
             )
@@ -211,7 +211,7 @@ def _remember(decision: Decision, place: Place) -> None:
 
 
 def _is_there(decision: Decision, place: Place) -> bool:
-    """Whether the query or resource still is: what is said about one that is gone is not asked for here."""
+    """Return whether the query or resource of the place still exists."""
     kind, id, _ = place
     return id in (decision.catalog.held if kind == "query" else decision.catalog.resources)
 

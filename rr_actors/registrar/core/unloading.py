@@ -1,4 +1,4 @@
-"""What a registrar decides as a provider about unloads: queries released, and resources whose last query is gone."""
+"""The decisions of a provider about unloads: queries that are released, and resources whose last query is gone."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ _replace = msgspec.structs.replace
 
 
 def unload(decision: Decision, message: Unload) -> None:
-    """Let one query go, and the resource with the last of them."""
+    """Release one query, and unload the resource with its last query."""
     catalog = decision.catalog
     query = catalog.queries.get(message.query_id)
     if query is None:
         drop_parked(decision, lambda parked: parked.query_id == message.query_id)
-        remember(decision, message.query_id, failures.LET_GO)  # its Load may be slower, by another way
-        drop_notices(decision, message.origin, message.query_id)  # that it was taken away: of no interest any more
+        remember(decision, message.query_id, failures.LET_GO)  # its Load may still come, by another way
+        drop_notices(decision, message.origin, message.query_id)  # they say that it was taken away: no longer needed
         decision.cause(Reply(message.origin, Unloaded(message.query_id)))
     elif query.origin != message.origin:
         refusal = UnloadRefused(message.query_id, failures.not_holder(query.id, query.origin, message.origin))
@@ -63,7 +63,7 @@ def _release(decision: Decision, query: Query) -> None:
     remember(decision, query.id, failures.LET_GO)
     again = last and resource.phase is UNLOADING
     if again or (last and resource.phase in (LOADED, UNLOAD_FAILED) and not _lingers(decision, resource)):
-        decision.note(catalog.unanswered, query.id, True)  # the query goes with the resource, and is answered then
+        decision.note(catalog.unanswered, query.id, True)  # answered when the resource is gone, and the query with it
         if not again:
             start_unload(decision, resource)
         return
@@ -74,7 +74,7 @@ def _release(decision: Decision, query: Query) -> None:
 
 
 def unheld(decision: Decision, resource: Resource) -> None:
-    """Nobody holds the resource any more."""
+    """Decide about a resource that nobody holds any more: drop, keep warm or unload it, by its phase."""
     if resource.phase is QUEUED:
         for answer in answers_to_owners(decision, resource, None):
             decision.cause(answer)
@@ -85,7 +85,7 @@ def unheld(decision: Decision, resource: Resource) -> None:
     elif resource.tries == NOT_BEGUN and resource.server in decision.catalog.servers:
         begin_unload(
             decision, _replace(resource, tries=0)
-        )  # not run again: what the interrupted run left is cleaned up
+        )  # the load does not run again; the unload callback cleans up after the interrupted run
 
 
 def _lingers(decision: Decision, resource: Resource) -> bool:
@@ -95,12 +95,12 @@ def _lingers(decision: Decision, resource: Resource) -> bool:
 
 
 def condemned(decision: Decision, resource: Resource) -> bool:
-    """Its owner wants it gone, by itself or with its server."""
+    """Return whether the owner has unloaded the resource by force, or unregistered its server."""
     return resource.id in decision.catalog.owners or resource.server in decision.catalog.leaving
 
 
 def retire(decision: Decision, resource: Resource) -> None:
-    """Keep an unheld resource warm, if its server says so, or unload it."""
+    """Keep an unheld resource warm if its server says so; otherwise unload it."""
     if _lingers(decision, resource):
         linger_s = decision.catalog.servers[resource.server].linger_s
         decision.cause(SetTimer("linger:" + resource.id, linger_s, LingerOver(resource.id)))
@@ -109,20 +109,20 @@ def retire(decision: Decision, resource: Resource) -> None:
 
 
 def linger_over(decision: Decision, over: LingerOver) -> None:
-    """Unload what nobody came back for."""
+    """Unload a resource that nobody has loaded again while it was kept warm."""
     resource = decision.catalog.resources.get(over.resource_id)
     if resource is not None and resource.phase is LOADED and resource.id not in decision.catalog.holders:
         begin_unload(decision, resource)
 
 
 def begin_unload(decision: Decision, resource: Resource) -> None:
-    """Have the unload callback run."""
+    """Cancel the linger timer, and run the unload callback."""
     decision.cause(SetTimer("linger:" + resource.id, None, None))
     start_unload(decision, resource)
 
 
 def unload_done(decision: Decision, done: UnloadDone) -> None:
-    """The resource is gone: release what it held, answer who waits, let a queued load of the same request begin."""
+    """Remove the resource, release its parts, answer all that wait, and start a queued load of the same request."""
     resource = running(decision.catalog, done.resource_id, UNLOADING, done.tries)
     if resource is None:
         return
@@ -139,16 +139,16 @@ def unload_done(decision: Decision, done: UnloadDone) -> None:
 
 
 def unload_erred(decision: Decision, erred: UnloadErred) -> None:
-    """Keep the resource, as it may still be running, and tell the caller who unloaded it."""
+    """Keep the resource as unload_failed, as it may still be running, and refuse the Unloads that wait."""
     resource = running(decision.catalog, erred.resource_id, UNLOADING, erred.tries)
     if resource is None:
         return
     decision.put(_replace(resource, phase=UNLOAD_FAILED, message=erred.failure.message))
     decision.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
     for query in decision.catalog.queries_of(resource.id):
-        if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, and tries again
+        if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try
             decision.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
-        send_notices(decision, query)  # a holder that is releasing it does not listen
+        send_notices(decision, query)  # the holder passed them over while it was releasing the query
     for answer in answers_to_owners(decision, resource, erred.failure):
         decision.cause(answer)
     _next_in_queue(decision, resource)
@@ -163,12 +163,12 @@ def _next_in_queue(decision: Decision, gone: Resource) -> None:
 
 
 def answers_to_owners(decision: Decision, resource: Resource, failure: Failure | None) -> list[Answer]:
-    """Those who unloaded it by force are answered."""
+    """Return the answers to the owner's calls that unloaded the resource by force."""
     return [Answer(ticket, failure) for ticket in decision.forget(decision.catalog.owners, resource.id) or ()]
 
 
 def settle(decision: Decision, server: str, failure: Failure | None = None) -> None:
-    """A server that is leaving has left when nothing of it is in motion."""
+    """End the unregistration of a server when none of its resources is in motion any more."""
     catalog = decision.catalog
     if server not in catalog.leaving:
         return
@@ -181,11 +181,11 @@ def settle(decision: Decision, server: str, failure: Failure | None = None) -> N
         decision.cause(Answer(ticket, failure))
 
 
-# What a registrar decides as a provider when it takes queries from their holders.
+# The decisions of a provider that takes queries from their holders.
 
 
 def force_unload(decision: Decision, command: ForceUnload) -> None:
-    """Take the resource from everybody who holds it; the owner is answered when it is gone."""
+    """Take a resource from all its holders and unload it; answer the owner when it is gone."""
     resource = decision.catalog.find(command.target)
     if resource is None:
         decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
@@ -196,7 +196,7 @@ def force_unload(decision: Decision, command: ForceUnload) -> None:
 
 
 def unregister(decision: Decision, command: Unregister) -> None:
-    """Take no more loads and release every query; the owner is answered when all resources are gone."""
+    """Take no more loads for a server, and release all its queries; answer the owner when its resources are gone."""
     catalog = decision.catalog
     if command.name not in catalog.servers or command.name in catalog.leaving:
         decision.cause(Answer(command.ticket, failures.unknown_server(catalog, command.name)))
@@ -218,7 +218,7 @@ def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None
                 decision.drop(query)
                 remember(decision, query.id, failure)
                 notify(decision, query, event, State.FATAL, why, source, released=True)
-            if resource.id not in decision.catalog.recovering:  # else when it is known whether it lives
+            if resource.id not in decision.catalog.recovering:  # else the end of its recovery unloads it
                 begin_unload(decision, resource)
         case Phase.UNLOADING:
             for query in decision.catalog.queries_of(resource.id):
@@ -227,14 +227,14 @@ def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None
 
 
 def _refuse_holders(decision: Decision, resource: Resource, why: str) -> None:
-    """Those who wait hear it. A load in flight goes on, and what it brings is unloaded then."""
+    """Refuse all that wait for a resource. A running load goes on; the resource is unloaded when it returns."""
     for reply in refuse_all(decision, resource, failures.evicted(decision.catalog, resource, why)):
         decision.cause(reply)
     unheld(decision, resource)
 
 
 def gone(decision: Decision, message: Gone) -> None:
-    """Release everything a registrar held that will not come back."""
+    """Release every query of a registrar that does not come back."""
     catalog = decision.catalog
     drop_parked(decision, lambda parked: parked.origin == message.origin)
     for query_id in list(catalog.by_origin.get(message.origin, ())):

@@ -1,1 +1,1 @@
-"""What carries decisions out: decide, commit, act; and the servers whose callbacks run."""
+"""How decisions are carried out: decide, commit, act; and the servers whose callbacks run."""

@@ -11,19 +11,19 @@ from rr_actors.base.errors import RrError
 from rr_actors.registrar.model.rows import Hold
 
 AT_A_TIME = 4096
-"""At each provider: as many as its workers may have callbacks to run. What were sent beyond that would wait there,
-half done on both sides; rows that are kept for a moment only would get into tables, and all of them out of the caches.
+"""Releases in progress at each provider: as many as callbacks may wait for its workers. More would wait there, half
+done on both sides. Rows that exist for a moment only would be written, and all rows would leave the processor's caches.
 """
 
 
 class Releases:
-    """Lets queries go, in their order at each provider; one that is down or slow holds up no other. On the loop.
+    """Releases queries in their order at each provider; one that is down or slow delays no other. On the loop.
 
     Args:
         registrar: the actor that holds them.
-        query_ids: held, or asked for.
-        ended: called as ended(query_id, error) with how each of them ended; one that somebody else releases before
-            its turn has come has ended well.
+        query_ids: queries that are held, or asked for.
+        ended: called as ended(query_id, error) when a query has ended. If another caller releases a query before its
+            turn, `error` is None.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Releases:
             self._begin(queue, AT_A_TIME)
 
     def hurry(self) -> None:
-        """Begin with all of them: the time is up, and what is owed must be on disk, or be known to be late."""
+        """Begin all remaining releases: the time is up, and each must be owed on disk, or be known to be late."""
         for queue in self._waiting.values():
             self._begin(queue, len(queue))
 
@@ -65,5 +65,5 @@ class Releases:
         if not self._registrar.closed:
             self._begin(queue, 1)
             return
-        while queue:  # the first that hears so tells those who wait
+        while queue:  # the first release that hears of the closing ends all that wait
             self._ended(queue.popleft(), error)

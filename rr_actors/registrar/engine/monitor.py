@@ -1,22 +1,22 @@
-"""A registrar is a monitor: decide, apply to memory, commit, give the lock back, act.
+"""A registrar is a monitor: decide, apply to memory, commit, release the lock, act.
 
-The thread that brings a message decides it, under the registrar's lock. Its changes are on disk before anything of them
-leaves. If the commit fails, nothing has happened. The four parts of this file:
+The thread that brings a message decides it under the registrar's lock. The changes are on disk before any effect of
+them leaves the process. If the commit fails, nothing has happened. This file has four parts:
 
 - RegistrarState: the catalog in memory, its lock, and the fast paths for one row.
-- Monitor: what comes in, and in which order it is decided.
-- CommitLog: what of the catalog is on disk, and what is still to be written.
-- EffectRunner: what the decisions want done, once it is on disk.
+- Monitor: takes messages and commands, and decides them in their order.
+- CommitLog: knows which changes are on disk and which are still to be written.
+- EffectRunner: carries out the effects of a decision once it is on disk.
 
-No code of a user's, no pickling and no sending of messages happens under the lock. A thread that has it never waits,
-and never takes another registrar's.
+Under the lock no user code runs, nothing is pickled and no message is sent. A thread that has the lock never waits, and
+never takes the lock of another registrar.
 
     with state.enter():
         catalog = state.whole()
         ...
 
-A thread may be interrupted (Ctrl-C) between any two instructions. The next thread that has the lock rolls an
-interrupted decision back, before it reads anything: so all begin with whole().
+An interrupt (Ctrl-C) may stop a thread between any two instructions. The next thread that takes the lock rolls the
+unfinished decision back before it reads anything. Therefore every use of the catalog begins with whole().
 """
 
 from __future__ import annotations
@@ -62,7 +62,10 @@ UnloadWaiter = Callable[[RrError | None], None]
 
 
 class _OpenLocks:
-    """Those of this process's registrars: whether the calling thread has each. Replaced as a whole, on the loop."""
+    """The locks of this process's registrars: for each, a function that says whether the calling thread has it.
+
+    The tuple is replaced as a whole, on the loop.
+    """
 
     def __init__(self) -> None:
         self.owned: tuple[Callable[[], bool], ...] = ()
@@ -72,8 +75,10 @@ _open_locks = _OpenLocks()
 
 
 def is_deciding() -> bool:
-    """Return whether the calling thread decides for any registrar of this process: a finalizer (__del__), which the
-    garbage collector runs anywhere, may find it so, and then must not wait."""
+    """Return whether the calling thread has the lock of any registrar of this process.
+
+    A finalizer (__del__) must not wait if so: the garbage collector runs it anywhere, also in the middle of a decision.
+    """
     for is_owned in _open_locks.owned:  # noqa: SIM110 - any() takes longer
         if is_owned():
             return True
@@ -81,23 +86,23 @@ def is_deciding() -> bool:
 
 
 def answered_by_line(_error: RrError | None) -> None:
-    """How an unload ended that a thread does by a line of its own: it hears there."""
+    """Do nothing: this waiter marks an unload whose thread reads the answer on its own direct line."""
 
 
 class RegistrarState:
     """The catalog of one registrar, in memory and on disk.
 
     Args:
-        store: its catalog's storage, open.
+        store: the open storage of the catalog.
 
     Attributes:
-        lock: of the thread that decides, or reads more than one entry. Taken by enter().
-        is_inside: whether the calling thread has the lock; see is_deciding().
-        closed: nothing is decided any more.
-        waiting: what has come in and is not decided yet (monitor.py). What a thread brings waits behind it.
-        row_by_row: whether what is decided by itself is written by itself.
-        sequence: the running numbers of what is asked: it is released newest first.
-        loads, unloads: who hears how a load, or a release, ended, by query.
+        lock: held by the thread that decides, or that reads more than one entry. enter() returns it.
+        is_inside: whether the calling thread has the lock; is_deciding() asks it.
+        closed: whether the registrar is closed; then nothing is decided any more.
+        waiting: the messages and commands that are not decided yet (Monitor). A new one of a thread waits behind them.
+        row_by_row: whether a message or row is committed by itself, and at once; otherwise many share a commit.
+        sequence: the running numbers of queries, in the order in which they are asked for. Releases go newest first.
+        loads, unloads: by query, the callback that hears how its load, or its release, ended.
     """
 
     def __init__(
@@ -119,7 +124,7 @@ class RegistrarState:
         self._why_down = "closed"
 
     def lock_in_use(self, *, in_use: bool) -> None:
-        """Have is_deciding() look at the lock from now on, or no more. On the loop."""
+        """Have is_deciding() ask this lock from now on, or no longer. On the loop."""
         others = tuple(owned for owned in _open_locks.owned if owned != self.is_inside)
         _open_locks.owned = (*others, self.is_inside) if in_use else others
 
@@ -127,24 +132,25 @@ class RegistrarState:
         """Return the lock, for a `with` statement.
 
         Raises:
-            RegistrarDown: closed, or this process is a fork of the registrar's: there, nobody might give the lock back.
+            RegistrarDown: the registrar is closed, or this process is a fork of the registrar's process: there the
+                thread that had the lock does not exist, so nobody would release it.
         """
         if self.closed:
             raise self.down()
         return self.lock
 
     def whole(self) -> Catalog:
-        """Return the catalog; first roll back a decision that an interrupt left unfinished. With the lock."""
+        """Return the catalog, and roll back a decision that an interrupt left unfinished. With the lock."""
         catalog = self.catalog
         if catalog.unfinished is not None:
             self._roll_back(catalog)
         return catalog
 
     def commit(self, items: Iterable[Item]) -> Decision:
-        """Decide these, and write what that has changed, or note it to be written a moment later.
+        """Decide the items in their order, and write the changes now, or note them to be written a moment later.
 
         Raises:
-            CatalogError: not written; nothing has happened, and nobody has seen any of it.
+            CatalogError: the changes were not written. Nothing has happened, and no other thread has seen any of it.
         """
         with self.lock:
             try:
@@ -163,9 +169,9 @@ class RegistrarState:
             return decision
 
     def join(self, load: Load) -> Loaded | None:
-        """Decide a Load by the fast path, and write it; None: it is to be decided as any message.
+        """Decide a Load by the fast path, and write its row. Return None if it has to be decided like any message.
 
-        The same for the loop and for a thread of this process that loads.
+        The loop calls it, and a thread of this process that loads.
         """
         with self.lock:
             catalog = self.catalog
@@ -181,7 +187,7 @@ class RegistrarState:
                     return None
                 catalog.set("queries", query.id, query)
                 catalog.unfinished = None
-            except Exception:  # as the decision will find, and say: a full disk, or a defect
+            except Exception:  # a full disk, or a defect: decide() will meet it again, and report it
                 catalog.unfinished = None
                 return None
             except BaseException:
@@ -190,10 +196,12 @@ class RegistrarState:
             resource = catalog.resources[query.resource_id]
             return Loaded(query.id, resource.id, resource.response or b"")
 
-    # -- fast paths of the thread that loads and releases by a line of its own ---------------------------------------
+    # -- fast paths of a thread that loads and releases by its own direct line ---------------------------------------
 
     def begin_directly(self, query: Any, request: bytes, ended: LoadWaiter) -> Load | None:
-        """Note that the calling thread is about to ask for a query. None: the loop has to, as the parent is gone, say.
+        """Note a load that the calling thread is about to send; return None if the loop has to send it.
+
+        The loop has to, for example, if the parent is gone.
 
         Args:
             query: what it asks for.
@@ -218,7 +226,7 @@ class RegistrarState:
         return Load(id, server, request, self.name, parent, attempt, seq)
 
     def hold(self, answer: Loaded | c.Got) -> bool:
-        """Take up what a thread has loaded; False: it is to be decided, as Got."""
+        """Add the row of a query that a thread has loaded. Return False if the answer has to be decided, as Got."""
         if self.closed or interpreter.possible():
             return False
         with self.lock:
@@ -239,7 +247,7 @@ class RegistrarState:
             return held
 
     def forget_refused(self, query_id: str) -> bool:
-        """Forget what a thread has asked for, and was refused; False: the loop is to end it, which may know of it."""
+        """Forget a load that was refused to its thread. Return False if the loop may know of it, and has to end it."""
         if interpreter.possible():
             return False
         with self.lock:
@@ -251,10 +259,11 @@ class RegistrarState:
             return True
 
     def owe(self, query_id: str) -> bool:
-        """Have a query owed that a thread releases by a line of its own; False: it is to be decided as any command.
+        """Mark as owed a query that a thread releases by its own line; return False if Release has to be decided.
 
-        On disk, unless nothing of it is: after a crash its provider says what became of it. After True the thread must
-        tell the provider, and then give the answer to forget_released(), or leave it to the registrar's actor.
+        The row is written, unless the disk has nothing of the query: then, after a crash, the provider says whether it
+        is still held. After True the thread must tell the provider. It then passes the answer to forget_released(), or
+        leaves the release to the registrar's actor.
         """
         if self.closed or interpreter.possible():
             return False
@@ -270,7 +279,7 @@ class RegistrarState:
             try:
                 if not holding.owe(catalog, self._commits.unsaved, row, self._commits.commit_row):
                     return False
-            except CatalogError:  # as the decision will find, and say
+            except CatalogError:  # decide() will meet it again, and report it
                 return False
             except BaseException:
                 self.whole()
@@ -279,7 +288,7 @@ class RegistrarState:
             return True
 
     def forget_released(self, query_id: str) -> bool:
-        """After owe(): forget a query that its provider has released; False: that is to be decided as any message."""
+        """Forget a query that its provider has released after owe(); return False if Unloaded has to be decided."""
         if self.closed:
             return False
         with self.lock:
@@ -304,31 +313,31 @@ class RegistrarState:
         catalog.unfinished = None
 
     def down(self) -> RegistrarDown:
-        """The error for callers when it is closed."""
+        """Return the error that callers of a closed registrar get."""
         return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
 
 
-# -- what comes in -----------------------------------------------------------------------------------------------------
+# -- messages and commands ---------------------------------------------------------------------------------------------
 #
-# The loop decides what it reads as it reads it, all messages of one read as one decision. The thread that ran a
-# callback decides what follows from its end, unless it has another to run. What the decisions cause is done on the
-# loop, in the order of the decisions; only the answer to one direct line is given by the thread that has decided it.
+# The loop decides messages as it reads them, all messages of one read as one decision. The thread that ran a callback
+# decides its end, unless it has another callback to run. The loop carries out the effects, in the order of the
+# decisions. One effect is an exception: the answer to a direct line is sent by the thread that decided it.
 #
-# Messages wait only while something else has to be first: the rest of the same read; what is done now (then they follow
-# it); a commit that failed, and is tried again a moment later; and where many share a commit (durability "power", or
-# `save_on_modify=False`) until the loop's next turn.
+# A message waits only for these: the rest of its read; the effects that the loop is carrying out; a commit that failed
+# and is tried again a moment later; the loop's next turn, if many messages share a commit (durability "power", or
+# `save_on_modify=False`).
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_AT_ONCE = 128  # with more, those who wait for the first answers do not wait for the last ones
+_AT_ONCE = 128  # messages in one decision at most: callers get the first answers before the last ones are decided
 _RETRY_S = 0.25
 
 
 class Monitor:
-    """That of one registrar. On the loop, but for decide_here.
+    """Decides the messages and commands of one registrar in their order. On the loop, except decide_here().
 
     Args:
-        registrar: its actor, whose servers, links and callers EffectRunner deals with.
+        registrar: the registrar's actor; EffectRunner uses its servers, links and callers.
     """
 
     def __init__(self, registrar: Any) -> None:
@@ -336,20 +345,20 @@ class Monitor:
         self._state: RegistrarState = registrar
         self._dispatcher = registrar.node.dispatcher
         self._runner = EffectRunner(registrar)
-        self._effects: deque[list[Effect]] = deque()  # of each decision, to be done on the loop
+        self._effects: deque[list[Effect]] = deque()  # those of each decision, to be carried out on the loop
         self._waiting = self._state.waiting
         self._gathers = not self._state.row_by_row
-        self._busy = False  # deciding, or acting: what comes in meanwhile follows
-        self._scheduled = False  # there will be a turn
-        self._held_up = False  # what could not be committed is tried again later, and nothing before it
-        self._failure = ""  # why, as it has been logged
+        self._busy = False  # the loop is deciding or acting: a new message waits until it has finished
+        self._scheduled = False  # a turn of the loop is scheduled
+        self._held_up = False  # a commit failed and is tried again later; nothing is decided before that
+        self._failure = ""  # the reason, as it was logged
         self._changed = asyncio.Event()
         self._held_back: list[tuple[Message, str]] = []
 
-    # -- what comes in -----------------------------------------------------------------------------------------------
+    # -- messages and commands ---------------------------------------------------------------------------------------
 
     def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
-        """A message of another registrar has arrived; on the loop. `more`: others follow, to be decided together."""
+        """Decide a message of another registrar. On the loop. `more`: others follow, to be decided together with it."""
         if self._state.closed:
             return
         if not self._registrar.serving and type(message) is Noticed:
@@ -362,7 +371,7 @@ class Monitor:
         self.put(message, sender, more=more)
 
     def _is_read_first(self, load: Load, sender: str) -> bool:
-        """Whether a worker reads a request, and its Load is decided then: since to read it runs a user's code."""
+        """Have a worker read the request first if that runs user code, and return whether it does."""
         servers = self._registrar.servers
         server = servers.get(load.server)
         if server is None or not server.request.runs_code(load.request):
@@ -374,9 +383,9 @@ class Monitor:
         link = link_of(sender)
 
         def done(read: Load | c.RefuseLoad, error: BaseException | None) -> None:
-            if self._state.closed or link_of(sender) is not link:  # it is sent again over the next
+            if self._state.closed or link_of(sender) is not link:  # the consumer sends it again over the next link
                 return
-            if servers.get(load.server) is not server:  # it is another's, or nobody's
+            if servers.get(load.server) is not server:  # unregistered meanwhile, and perhaps registered anew
                 self.receive(load, sender)
                 return
             if error is not None:
@@ -393,21 +402,21 @@ class Monitor:
         return True
 
     def _is_read(self, load: Load) -> bool:
-        """Whether what a Load is decided by is known without reading its request; with the lock."""
+        """Return whether the Load can be decided without reading its request. With the lock."""
         catalog = self._state.whole()
         known = catalog.queries.get(load.query_id)
         if known is not None:
-            return known.resource_id not in catalog.recovering  # there it may have to be loaded anew
+            return known.resource_id not in catalog.recovering  # such a resource may have to be loaded anew
         return load.query_id in catalog.refused or catalog.joinable(load.server, load.request) is not None
 
     def hear_held_back(self) -> None:
-        """Decide the statuses that came before the registrar was ready."""
+        """Decide the statuses that arrived before the registrar was ready."""
         held_back, self._held_back = self._held_back, []
         for message, sender in held_back:
             self.receive(message, sender)
 
     def put(self, what: Any, sender: str | None = None, *, more: bool = False) -> None:
-        """Decide a message, behind what waits, and act; with `more` in the loop's next turn, or with what follows."""
+        """Decide a message or command behind those that wait, and act; with `more`, in the loop's next turn."""
         if not (self._waiting or self._busy or self._held_up or more or self._gathers or self._state.is_inside()):
             self._busy = True
             try:
@@ -429,19 +438,20 @@ class Monitor:
             self._decide_waiting()
 
     def decide_here(self, command: c.Command) -> bool:
-        """Decide a command in the thread that brings it, and answer by that if a direct line waits; False: not so.
+        """Decide a command in the calling thread. Return False if the loop has to decide it.
 
-        What else follows is done on the loop, in its order.
+        If exactly one direct line waits, the calling thread sends the answer. The loop carries out all other effects,
+        in order.
         """
         state = self._state
-        if state.closed or self._gathers or interpreter.possible():  # in a fork nobody gives the lock back
+        if state.closed or self._gathers or interpreter.possible():  # in a fork nobody releases the lock
             return False
         with state.lock:
             if state.closed or self._waiting:
                 return False
             try:
                 decision = state.commit(((command, None),))
-            except Exception:  # as the loop will find, and say: a full disk, or a defect
+            except Exception:  # a full disk, or a defect: the loop will meet it again, and report it
                 return False
             answer = self._runner.by_thread(decision.effects)
             if answer is None:
@@ -453,10 +463,10 @@ class Monitor:
         return True
 
     def run(self, command: c.Command) -> None:
-        """Decide a command now, whatever waits, commit that, and act.
+        """Decide a command now, before all that waits, commit it, and act.
 
         Raises:
-            CatalogError: not committed; nothing has happened.
+            CatalogError: the command was not committed; nothing has happened.
         """
         with self._state.lock:
             self._effects.append(self._state.commit(((command, None),)).effects)
@@ -466,7 +476,7 @@ class Monitor:
             self.act()
 
     async def next_change(self, timeout_s: float) -> None:
-        """Return when something has been decided, or after `timeout_s` seconds."""
+        """Wait until something has been decided, or for `timeout_s` seconds."""
         self._changed.clear()
         try:
             await asyncio.wait_for(self._changed.wait(), timeout_s)
@@ -474,12 +484,12 @@ class Monitor:
             return
 
     def close(self) -> None:
-        """Decide nothing more, and act on nothing later."""
+        """Drop all that waits to be decided, and all effects that wait to be carried out."""
         self._waiting.clear()
         self._effects.clear()
         self._runner.close()
 
-    # -- taking up ---------------------------------------------------------------------------------------------------
+    # -- deciding ----------------------------------------------------------------------------------------------------
 
     def _turn(self) -> None:
         self._scheduled = False
@@ -491,7 +501,7 @@ class Monitor:
         self._busy = True
         try:
             while self._waiting and not self._held_up:
-                with self._state.lock:  # no thread decides anything between what waits and what it comes to
+                with self._state.lock:  # no thread may decide anything between taking the messages and deciding them
                     count = min(len(self._waiting), _AT_ONCE)
                     self._decide([self._waiting.popleft() for _ in range(count)])
                 self._do_effects()
@@ -505,7 +515,7 @@ class Monitor:
     def _decide(self, items: Sequence[Item]) -> None:
         failed: CatalogError | None = None
         try:
-            with self._state.lock:  # until what could not be committed waits again: no thread overtakes it
+            with self._state.lock:  # held until items that were not committed wait again: no thread overtakes them
                 try:
                     decision = self._state.commit(
                         [item if type(item[0]) is not Load else self._readable(*item) for item in items]
@@ -523,7 +533,7 @@ class Monitor:
             self._registrar.fail(error)
 
     def _readable(self, load: Load, sender: str | None) -> Item:
-        """As ServerActor.readable(), which a worker has done already where it runs a user's code."""
+        """Return the Load in canonical form, or its refusal; a worker has read it already if that runs user code."""
         server = self._registrar.servers.get(load.server)
         if server is None or self._is_read(load) or server.request.runs_code(load.request):
             return load, sender
@@ -531,9 +541,9 @@ class Monitor:
         return read, sender if type(read) is Load else None
 
     def _not_committed(self, items: Sequence[Item], error: CatalogError) -> None:
-        """Nothing of these has happened: refuse what can be refused, and do the rest again a little later."""
+        """Refuse the items that can be refused, and put the others back, to be decided again a little later."""
         refusals, again = refuse_uncommitted(self._state.whole(), items, failure_of(error))
-        refusals.close()  # it changes nothing
+        refusals.close()  # this decision has effects only
         self._effects.append(refusals.effects)
         if again:
             self._waiting.extendleft(reversed(again))
@@ -547,8 +557,8 @@ class Monitor:
     # -- acting ------------------------------------------------------------------------------------------------------
 
     def act(self) -> None:
-        """Do what has been decided, in the order of the decisions; and decide what comes in meanwhile behind it."""
-        if self._busy:  # it follows what is done now
+        """Carry out the effects of all decisions in their order, then decide the messages that arrived meanwhile."""
+        if self._busy:  # the loop carries them out after the present ones
             return
         self._busy = True
         try:
@@ -566,7 +576,7 @@ class Monitor:
         self._changed.set()
 
 
-# -- what is on disk ---------------------------------------------------------------------------------------------------
+# -- the disk ----------------------------------------------------------------------------------------------------------
 
 _SAVE_SOON_S = 0.05
 _TIDY_SOON_S = 0.1  # after the last commit
@@ -575,17 +585,17 @@ _TIDY_AGAIN_S = 1.0
 
 
 class CommitLog:
-    """Commits decisions to the store: at once what must be there, a moment later what could be rebuilt.
+    """Commits decisions to the store: changes that must survive a crash now, others a moment later.
 
-    With save_on_modify off everything is written each save interval, and at closing. Commits are made by any thread,
+    With save_on_modify off, all changes are written once each save interval, and at closing. Any thread may commit,
     with the lock.
 
     Attributes:
-        unsaved: what waits to be written; saving: whether it will be a moment later.
-        row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
-        lock: the registrar's. It is held around a decision, from its beginning to commit().
-        watched: the system's: while somebody records, commits are timed.
-        count: how many commits there were; `timed`: of these, and `timed_s` how many seconds they took.
+        unsaved: the changes that wait to be written; saving: whether a timer to write them is set.
+        row_by_row: whether a row is committed by itself: now, and without waiting for the disk.
+        lock: the registrar's lock. A thread holds it from the beginning of a decision to the end of commit().
+        watched: who watches the system: during a recording, commits are timed.
+        count: the number of commits; `timed`: how many of them were timed, and `timed_s` the seconds that those took.
     """
 
     def __init__(
@@ -606,9 +616,9 @@ class CommitLog:
         self.row_by_row = config.save_on_modify and config.durability != "power"
         self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
         self.unsaved = Unsaved()
-        self.saving = False  # from when it is to be done until it is
+        self.saving = False  # from when a save is asked for until it begins
         self._save_timer: TimerHandle | None = None
-        self._tidying = False  # the same
+        self._tidying = False  # from when tidying is asked for until it has ended
         self._tidy_timer: TimerHandle | None = None
         self.count = 0
         self.timed = 0
@@ -617,10 +627,10 @@ class CommitLog:
         self._closed = False
 
     def content(self) -> Content:
-        """Return what is on disk. Save what is unsaved first; with save_on_modify off, forget it instead.
+        """Return the rows on disk. Write unsaved changes first; with save_on_modify off, forget them instead.
 
         Raises:
-            CatalogError: what may be written a moment later was not; nothing is forgotten.
+            CatalogError: the unsaved changes could not be written, and are kept; or the rows could not be read.
         """
         if self._at_once:
             self._save()
@@ -628,7 +638,7 @@ class CommitLog:
         return self._store.load()
 
     def commit(self, decision: Decision) -> None:
-        """Write a decision's changes, or note them for later; older ones that wait are written before.
+        """Write the changes of a decision behind older unsaved ones, or note them to be written later.
 
         Raises:
             CatalogError: nothing was written.
@@ -641,7 +651,7 @@ class CommitLog:
                 unsaved.written(later)
             else:
                 self._write(decision.changes)
-            if unsaved.new:  # some were released before they were written; what these changes are of is on disk now
+            if unsaved.new:  # some were released before they were written; the rows of these changes are on disk now
                 unsaved.written(decision.changes)
         elif decision.changes or decision.later:
             self.unsaved.add(decision.changes)
@@ -649,10 +659,10 @@ class CommitLog:
             self.save_soon()
 
     def commit_row(self, row: Row) -> bool:
-        """Write one row now; False: it is one of many that are written together. From any thread, with the lock.
+        """Write one row now; return False if rows are not written singly. From any thread, with the lock.
 
         Raises:
-            CatalogError: it was not written.
+            CatalogError: the row was not written.
         """
         if self.row_by_row:
             self._write([Put(row)])
@@ -662,22 +672,23 @@ class CommitLog:
     def restore(self, catalog: Catalog) -> None:
         """Roll back a decision that was interrupted. From any thread, with the lock.
 
-        It may have been written, or not: the rows that it began to change are written as they were, a moment later.
+        The interrupt came before the write or after it. Therefore the rows that the decision began to change are
+        written as they were before, a moment later.
         """
         for table, id in catalog.roll_back():
             row = catalog.tables[table].get(id)
             if row is None and table == "held" and id in self.unsaved.new:
                 self.unsaved.drop(id)
                 continue
-            pending = type(row) is Held and row.hold is PENDING  # never on disk
+            pending = type(row) is Held and row.hold is PENDING  # a pending row is never on disk
             self.unsaved.add([Drop(table, id) if row is None or pending else Put(row)])
         self.save_soon()
 
     def save(self) -> None:
-        """Write what has not been written yet, so that other tools, too, read it.
+        """Write the unsaved changes, and tidy the store, so that other tools can read all of it.
 
         Raises:
-            CatalogError: it was not, and stays noted.
+            CatalogError: the changes were not written, and stay unsaved.
         """
         self._save()
         self._store.tidy()
@@ -702,27 +713,27 @@ class CommitLog:
             self._on_loop(self._tidy_when_quiet)
 
     def save_soon(self) -> None:
-        """Have what is unsaved written a moment later. From any thread, with the lock."""
+        """Have the unsaved changes written a moment later. From any thread, with the lock."""
         if not self.saving:
             self.saving = True
             self._on_loop(self._save_after, self._delay_s)
 
     def _on_loop(self, fn: Callable[..., object], *args: Any) -> None:
-        """Commits are made in other threads, too."""
-        with contextlib.suppress(RuntimeError):  # it has ended: closing writes what there is to be written
+        """Schedule a call on the loop, from any thread."""
+        with contextlib.suppress(RuntimeError):  # the loop has ended: close() writes the unsaved changes
             self._loop.call_soon_threadsafe(fn, *args)
 
     # -- on the loop -------------------------------------------------------------------------------------------------
 
     def _tidy_when_quiet(self) -> None:
-        """What comes and goes meanwhile needs no tidying, and the threads that wait for a commit have the processor."""
+        """Tidy the store after a pause in the commits, when no thread that waits for one needs the processor."""
         self._look(self._loop.time() + _TIDY_AT_LAST_S)
 
     def _look(self, at_last: float, commits: int = -1) -> None:
         if self._closed:
             return
         if commits == self.count or self._loop.time() >= at_last:
-            with contextlib.suppress(Unavailable):  # the process is closing, and this soon after it
+            with contextlib.suppress(Unavailable):  # the process is stopping, and soon closes this registrar
                 self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
         else:
             self._tidy_timer = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self.count)
@@ -739,14 +750,14 @@ class CommitLog:
                 self._tidy_timer = self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
 
     def close(self, *, erase: bool) -> None:
-        """Write what is unsaved and give the store back; with `erase`, remove it. What cannot be done is logged."""
+        """Write unsaved changes and close the store; with `erase`, remove it. Log every failure."""
         self._closed = True
         for timer in (self._save_timer, self._tidy_timer):
             if timer is not None:
                 timer.cancel()
         try:
             self._save()
-        except Exception:  # a defect, too: it has ended the registrar, and the store is given back all the same
+        except Exception:  # a CatalogError, or a defect that has ended the registrar: close the store all the same
             logger.exception("%s: could not save at closing", self._name)
         finally:
             self._close_store(erase=erase)
@@ -763,7 +774,7 @@ class CommitLog:
             self._save_timer = self._loop.call_later(delay_s, self._save_now)
 
     def _save_now(self) -> None:
-        self.saving = False  # first: what is to be written from now on is written later
+        self.saving = False  # first: a change from now on needs another save
         try:
             self._save()
         except CatalogError as error:
@@ -772,7 +783,7 @@ class CommitLog:
             self._save_after(_RETRY_S)
 
 
-# -- what the decisions want done --------------------------------------------------------------------------------------
+# -- effects -----------------------------------------------------------------------------------------------------------
 #
 # One method for each kind of effect.
 
@@ -780,7 +791,7 @@ _CALLBACKS = frozenset((e.StartLoad, e.StartUnload, e.StartRecover, e.StartStatu
 
 
 class EffectRunner:
-    """The hands of a registrar's actor. On the loop."""
+    """Carries out the effects that decisions cause, for a registrar's actor. On the loop."""
 
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
@@ -806,11 +817,11 @@ class EffectRunner:
         }
 
     def do(self, effects: Sequence[Effect]) -> None:
-        """Do them in their order. What links carry leaves at the end, each link's messages in one go.
+        """Carry out the effects in their order, and flush each link once, at the end.
 
-        Decisions have events before answers, some of which leave at once, by lines: a process that is killed when it
-        has answered has sent the event. And threads are woken for all callbacks together, as the first might be done
-        and asleep again before the second comes.
+        A decision has its events before its answers, some of which leave at once, by direct lines. A process that is
+        killed after an answer has therefore sent the event. Worker threads are woken once for all callbacks: otherwise
+        the first callback might end, and its thread sleep again, before the second is submitted.
         """
         methods = self._methods
         if len(effects) > 1 and not _CALLBACKS.isdisjoint(map(type, effects)):
@@ -830,10 +841,10 @@ class EffectRunner:
                 link.flush()
 
     def by_thread(self, effects: Sequence[Effect]) -> Callable[[], None] | None:
-        """What does them in any thread; None: they need the loop. From any thread, with the lock.
+        """Return a function that any thread may call to carry out the effects; None if the loop has to. With the lock.
 
-        That is the answer to one direct line, which has no order with anything else. What watchers hear comes
-        before the answer, so it is the loop that answers while there are any.
+        A thread may send only the answer to one direct line, which has no order with other messages. Watchers hear of
+        an event before the answer, so while anybody watches, the loop sends both.
         """
         answer: e.Reply | None = None
         for effect in effects:
@@ -844,7 +855,7 @@ class EffectRunner:
         return _nothing if answer is None else self._registrar.consumers.by_line(answer.message)
 
     def close(self) -> None:
-        """Let nothing fire any more."""
+        """Cancel all timers."""
         for timer in self._timers.values():
             timer.cancel()
 
@@ -860,7 +871,7 @@ class EffectRunner:
             client.want()
             return
         if self._registrar.catalog.up.get(effect.registrar) != client.opened:
-            return  # decided for a link before this one: when this is reconciled, what is open is sent again
+            return  # decided for an earlier link: reconciling this one sends all open messages again
         try:
             if type(effect.message) is Load:
                 client.describe(effect.message.server)
@@ -926,7 +937,7 @@ class EffectRunner:
         self._timers.pop(key, None)
         self._registrar.post(command)
 
-    # -- who waits and who listens -------------------------------------------------------------------------------
+    # -- waiting callers and listeners ---------------------------------------------------------------------------
 
     def _load_resolved(self, effect: e.LoadResolved) -> None:
         held = effect.held
@@ -938,7 +949,7 @@ class EffectRunner:
 
     def _unload_resolved(self, effect: e.UnloadResolved) -> None:
         held = self._registrar.catalog.held.get(effect.query_id)
-        if effect.failure is None or (held is not None and held.hold is OWED):  # else it is held, or will be again
+        if effect.failure is None or (held is not None and held.hold is OWED):  # else the query is held, or will be
             self._forget(effect.query_id)
         waiter = self._registrar.unloads.pop(effect.query_id, None)
         if waiter is not None:
@@ -971,4 +982,4 @@ class EffectRunner:
 
 
 def _nothing() -> None:
-    """What is done where nothing is to be done."""
+    """Do nothing: the decision has no answer to send."""

@@ -1,7 +1,7 @@
-"""Progress: how far a load has come. Its callback reports it, and those who wait for the load hear it.
+"""Progress: how far a load has come. Its callback reports it, and the consumers that wait for the load hear it.
 
-Best effort. Nothing of it is in the catalog, nothing is sent again, and no callback waits for it: a report is kept, and
-the event loop sends the newest one ten times a second at most. The last report of a load leaves before the answer.
+Best effort: reports are not in the catalog and are not sent again, and no callback waits for them. A report is kept,
+and the event loop sends the newest one, ten times a second at most. The last report of a load leaves before the answer.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from rr_actors.registrar.model.messages import Load, Progressed, readable
 from rr_actors.registrar.model.rows import Phase
 
 INTERVAL_S = 0.1
-"""How long after one report of a load the next is sent."""
+"""The time between two reports of one load, at least."""
 TEXT_LIMIT = 500
-"""How many characters the text of a report may have."""
+"""The number of characters that the text of a report may have."""
 
 
 class Progress(msgspec.Struct, frozen=True):
@@ -46,15 +46,15 @@ class Progress(msgspec.Struct, frozen=True):
 
 
 def shown_progress(fraction: float, text: str) -> str:
-    """Return a report for people: "50% opening"."""
+    """Return a report as text for people: "50% opening"."""
     return f"{fraction:.0%} {text}".rstrip()
 
 
 def checked(fraction: object, text: object) -> tuple[float, str]:
-    """Return what a callback reports as it can be sent.
+    """Return the fraction and text of a report in a form that can be sent.
 
     Raises:
-        UsageError: it is no such number, or no such text.
+        UsageError: the fraction is no number from 0 to 1, or the text is no str or too long.
     """
     number = math.nan
     if is_a(fraction, (int, float)) and not is_a(fraction, bool):
@@ -71,12 +71,13 @@ def checked(fraction: object, text: object) -> tuple[float, str]:
 
 
 class _Reports:
-    """Those of one load.
+    """The reports of one load.
 
     Attributes:
-        newest: the last one, for those who look.
-        unsent: the last one, until it is sent.
-        turn: has an entry while no turn of the loop is planned for it. The thread that takes the entry plans one.
+        newest: the last report, for readers at any time.
+        unsent: the last report, until it is sent.
+        turn: has an entry while no turn of the loop is planned for these reports. The thread that takes the entry plans
+            one.
     """
 
     __slots__ = ("newest", "turn", "unsent")
@@ -88,48 +89,48 @@ class _Reports:
 
 
 class ProgressReports:
-    """What the loads of one registrar report. On the loop, but for report() and newest()."""
+    """The reports of all loads of one registrar. On the loop, except report(), newest(), has_unsent() and forget()."""
 
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
         self._loads: dict[str, _Reports] = {}
 
     def report(self, resource_id: str, fraction: float, text: str) -> None:
-        """Keep a report, to be sent soon. From any thread; waits for nothing."""
+        """Keep a report, and have it sent soon. From any thread; does not wait."""
         reports = self._loads.get(resource_id) or self._loads.setdefault(resource_id, _Reports())
         reports.newest = (fraction, text)
         reports.unsent.append(reports.newest)
         self._want_turn(resource_id, reports)
 
     def newest(self, resource_id: str) -> tuple[float, str] | None:
-        """Return the last report of a load that runs; None: it has made none. From any thread."""
+        """Return the last report of a load that runs; None if it has made none. From any thread."""
         reports = self._loads.get(resource_id)
         return None if reports is None else reports.newest
 
     def greet(self, origin: str, query_id: str) -> None:
-        """Send the newest report to a consumer that waits for a load from now on."""
+        """Send the newest report to a consumer that has just begun to wait for a load."""
         if self._loads:
             self._registrar.node.dispatcher.call(self._greet, origin, query_id)
 
     def end(self, resource_id: str) -> None:
-        """The callback has returned: send its last report now, and take no more."""
+        """Send the last report of a callback that has returned, and take no more of it."""
         reports = self._loads.pop(resource_id, None)
         if reports is not None and reports.unsent and not self._registrar.closed:
             self._send(resource_id, reports)
 
     def has_unsent(self, resource_id: str) -> bool:
-        """Return whether a report is to be sent before the load's answer. From any thread."""
+        """Return whether a report has to be sent before the load's answer. From any thread."""
         reports = self._loads.get(resource_id)
         return reports is not None and bool(reports.unsent)
 
     def forget(self, resource_id: str) -> None:
-        """The callback has returned, and there is nothing unsent. From any thread."""
+        """Drop the reports of a callback that has returned, as none is unsent. From any thread."""
         self._loads.pop(resource_id, None)
 
     def _want_turn(self, resource_id: str, reports: _Reports) -> None:
         try:
             reports.turn.pop()
-        except IndexError:  # one is planned, and will find it
+        except IndexError:  # a turn is planned, and will find the report
             return
         with contextlib.suppress(Unavailable):  # the process is ending
             self._registrar.node.dispatcher.call(self._turn, resource_id, reports)
@@ -140,11 +141,11 @@ class ProgressReports:
         if reports.unsent:
             if self._send(resource_id, reports):
                 self._registrar.node.dispatcher.loop.call_later(INTERVAL_S, self._turn, resource_id, reports)
-            else:  # the report of a thread that the callback has left behind
+            else:  # a thread that outlived the callback has reported
                 self._loads.pop(resource_id, None)
             return
         reports.turn.append(None)
-        if reports.unsent:  # since it was looked
+        if reports.unsent:  # a report came after the check above
             self._want_turn(resource_id, reports)
 
     def _greet(self, origin: str, query_id: str) -> None:
@@ -156,14 +157,15 @@ class ProgressReports:
             resource_id = catalog.waiting.get(query_id) or parked_on(catalog, query_id) or ""
             resource = catalog.resources.get(resource_id)
         reports = self._loads.get(resource_id)
-        if resource is not None and reports is not None and not reports.unsent:  # that goes to all
+        if resource is not None and reports is not None and not reports.unsent:  # an unsent one will go to all
             registrar.consumers.hint(origin, Progressed([query_id], resource_id, resource.server, *reports.newest))
             registrar.consumers.flush()
 
     def _send(self, resource_id: str, reports: _Reports) -> bool:
-        """Send the unsent report to all who wait; return whether the load still runs.
+        """Send the unsent report to all that wait, and return whether the load still runs.
 
-        The report is taken under the lock: the callback's thread that finds nothing unsent ends the load behind it.
+        The report is taken under the lock: the callback's thread finds nothing unsent only after that, and then ends
+        the load.
         """
         registrar = self._registrar
         with registrar.lock:
@@ -183,7 +185,7 @@ class ProgressReports:
 
 
 def _waiting(catalog: Catalog, resource_id: str) -> dict[str, list[str]]:
-    """The queries whose loads wait for a resource, by the registrar that waits."""
+    """Return the queries whose loads wait for a resource, by the registrar that holds them."""
     waiting: dict[str, list[str]] = {}
     for query_id in catalog.holders.get(resource_id, ()):
         if query_id in catalog.waiting:
@@ -195,9 +197,10 @@ def _waiting(catalog: Catalog, resource_id: str) -> dict[str, list[str]]:
 
 
 class ProgressListeners:
-    """Who hears, at a consumer, of the loads that it waits for. add() and forget() from any thread.
+    """The listeners of a consumer to the loads that it waits for. add() and forget() from any thread.
 
-    A consumer that begins to wait may get a report twice, as the newest one and as one to all. It hears that once.
+    A consumer that begins to wait may get a report twice: as the newest one, and as one that is sent to all. The
+    listener hears it once.
     """
 
     def __init__(self) -> None:
@@ -209,12 +212,12 @@ class ProgressListeners:
         self._by_query[query_id] = listener
 
     def forget(self, query_id: str) -> None:
-        """The load has ended."""
+        """Drop the listener of a load that has ended."""
         self._by_query.pop(query_id, None)
         self._heard.pop(query_id, None)
 
     def hear(self, provider: str, message: Progressed) -> None:
-        """A report has arrived. On the loop."""
+        """Call the listeners for a report that has arrived. On the loop."""
         if not self._by_query:
             return
         progress = Progress(message.fraction, message.text, f"{provider}/{message.server}", message.resource_id)

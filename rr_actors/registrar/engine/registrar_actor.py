@@ -1,6 +1,6 @@
-"""RegistrarActor: owns one catalog, and all that belongs to one registrar. Its Monitor decides what comes in.
+"""RegistrarActor: has one catalog, and all other parts of one registrar. Its Monitor decides messages and commands.
 
-It lives on the process's loop, and its servers and clients with it. Nothing here blocks but the commit.
+It lives on the process's loop, with its servers and clients. Nothing here blocks except a commit.
 """
 
 from __future__ import annotations
@@ -40,20 +40,22 @@ logger = logging.getLogger("rr_actors.registrar")
 
 
 class Audience(Protocol):
-    """Who hears of what this registrar holds."""
+    """The listeners to the queries that this registrar holds."""
 
     @property
     def holder(self) -> Any:
-        """The Registrar that people use."""
+        """The Registrar that users call."""
         ...
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
-        """A status for one of its queries; `heard` is called on the loop when its callbacks are through, with whether
-        one of them has dealt with it."""
+        """Run the callbacks that listen to a query, for a status of it.
+
+        Then call `heard` on the loop, with whether one of them has dealt with the status.
+        """
         ...
 
     def forget(self, query_id: str) -> None:
-        """A query is held no more."""
+        """Drop the listeners of a query that is not held any more."""
         ...
 
 
@@ -62,8 +64,8 @@ class RegistrarActor(RegistrarState):
 
     Args:
         node: the process's runtime: dispatcher, transports, directory.
-        name: the registrar's.
-        store: its catalog's storage, open.
+        name: the registrar's name.
+        store: the open storage of its catalog.
     """
 
     def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
@@ -83,19 +85,19 @@ class RegistrarActor(RegistrarState):
         self.types = ServerTypes(self)
         self.monitor = Monitor(self)
 
-    # -- life ----------------------------------------------------------------------------------------------------
+    # -- start and stop ------------------------------------------------------------------------------------------
 
     def settle(self) -> None:
-        """Have a row of all that threads are loading: somebody is about to look at all that there is.
+        """Add the rows of all loads in flight, as somebody is about to read all rows.
 
         Raises:
-            CatalogError: it has to be written where, and that is not possible.
+            CatalogError: with the rows, something has to be written, and that failed.
         """
         if self.catalog.in_flight and not self.closed:
             self.commit(((c.AddInFlight(), None),))
 
     def begin(self) -> None:
-        """Take up what the catalog says was going on, and look for the providers of what it holds."""
+        """Go on with the work that the catalog says was in progress, and look for the providers of its queries."""
         self.lock_in_use(in_use=True)
         self.monitor.run(c.BeginAgain())
         with self.lock:
@@ -104,19 +106,19 @@ class RegistrarActor(RegistrarState):
             self.client(provider).want()
 
     async def next_change(self, timeout_s: float) -> None:
-        """Return when something has been decided, or after `timeout_s` seconds."""
+        """Wait until something has been decided, or for `timeout_s` seconds."""
         await self.monitor.next_change(timeout_s)
 
     def serve(self) -> None:
-        """From now on others are let in, and statuses that were waiting are heard."""
+        """Let in consumers from now on, and decide the statuses that waited."""
         self.serving = True
         self.monitor.hear_held_back()
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
-        """Let a consumer in.
+        """Let in the link of a consumer.
 
         Raises:
-            RegistrarDown: not serving yet (its own loads excepted), or no longer.
+            RegistrarDown: the registrar is closed, or not serving yet; its own loads are let in before it serves.
         """
         if self.closed or not (self.serving or hello.origin == self.name):
             status = "stopped" if self.closed else "starting"
@@ -124,31 +126,33 @@ class RegistrarActor(RegistrarState):
         return Welcome(self.epoch), self.consumers.attach(hello.origin)
 
     def accept_direct(self, hello: Hello) -> tuple[Welcome, Attach]:
-        """Let in a thread of a consumer that has a link already.
+        """Let in the direct line of a thread of a consumer that has a link already.
 
         Raises:
-            RegistrarDown: not serving.
+            RegistrarDown: the registrar is closed, or not serving yet.
         """
         welcome, _ = self.accept(hello)
         return welcome, self.consumers.attach_direct(hello.origin)
 
     def leave_to_parent(self) -> None:
-        """In a forked child: take nothing, and give nothing back."""
+        """Stop using this registrar in a forked child: its links and its catalog belong to the parent process."""
         self.closed = True
         self.lock_in_use(in_use=False)
         self._why_down = FORKED
 
     def down(self) -> RegistrarDown:
-        """See RegistrarState: where all registrars of this process are being closed, it says why."""
+        """Return the error that callers of a closed registrar get, with the reason if the process is stopping."""
         if self.node.stopping:
             self._why_down = f"closed, as {self.node.stopping}"
         return super().down()
 
     def close(self, *, erase: bool = False) -> None:
-        """Write what is unsaved and let everything go; nothing is released. Each step is tried. On the loop.
+        """Write unsaved changes, and close the links and the catalog; no query is released. On the loop.
+
+        Each step is tried, also after one that failed.
 
         Raises:
-            Exception, ExceptionGroup: what went wrong.
+            Exception, ExceptionGroup: the errors of the steps that failed.
         """
         if self.closed:
             return
@@ -168,7 +172,7 @@ class RegistrarActor(RegistrarState):
         steps.end(f"registrar {self.name!r}: not closed altogether")
 
     def fail(self, error: Exception) -> None:
-        """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
+        """Close the registrar after a defect. Its supervisor starts it again from its catalog."""
         logger.critical("registrar %s: failed", self.name, exc_info=error)
         self._why_down = "closed after a defect, which the log has; open it again: its catalog is as it was"
         self.close()
@@ -177,15 +181,15 @@ class RegistrarActor(RegistrarState):
         else:
             self.node.registrar_failed(self.name)
 
-    # -- what comes in -------------------------------------------------------------------------------------------
+    # -- messages and commands -----------------------------------------------------------------------------------
 
     def post(self, command: c.Command, *, more: bool = False) -> None:
-        """Give the registrar a command; on the loop. `more`: others follow, to be decided together."""
+        """Have the Monitor decide a command. On the loop. `more`: others follow, to be decided together with it."""
         if not self.closed:
             self.monitor.put(command, more=more or self.node.dispatcher.more)
 
     def join_here(self, load: Load, epoch: int) -> Loaded | None:
-        """Join what is loaded and held here, for a thread of a consumer in this process; None: it has to ask.
+        """Decide by the fast path a Load of a thread of a consumer in this process; return None if it has to be sent.
 
         Args:
             epoch: the consumer's incarnation.
@@ -195,14 +199,14 @@ class RegistrarActor(RegistrarState):
         return self.join(load)
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
-        """What a consumer hears instead of an answer that is too long for a frame; on the loop."""
+        """Return the refusal that replaces an answer that is too long for a frame. On the loop."""
         resource = self.catalog.resources.get(loaded.resource_id)
         server = None if resource is None else self.servers.get(resource.server)
         failure = failure_of(error) if server is None else server.load_failure(error)
         return LoadRefused(loaded.query_id, failure)
 
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
-        """Load: `waiter` hears how it ended."""
+        """Load; `waiter` hears how the load ended."""
         if self.closed:
             waiter(None, self.down())
             return
@@ -215,11 +219,11 @@ class RegistrarActor(RegistrarState):
         self.post(ask)
 
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
-        """Unload a query of one's own; `waiter` hears how it ended."""
+        """Release a query of this registrar; `waiter` hears how the release ended."""
         if self.closed:
             waiter(self.down())
             return
-        with self.lock:  # a thread that has looked, and is letting it go, is first
+        with self.lock:  # a thread may be releasing the query in owe(): it notes that under this lock
             known = query_id in self.unloads
             if not known:
                 self.unloads[query_id] = waiter
@@ -228,7 +232,7 @@ class RegistrarActor(RegistrarState):
         else:
             self.post(c.Release(query_id))
 
-    # -- what threads leave to the loop: the line broke, or the thread gave up ------------------------------------
+    # -- loads and unloads that a thread leaves to the loop: its line broke, or it gave up ------------------------
 
     def go_on_loading(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
         """Go on with a load that a thread has begun by itself; `waiter` hears how it ends.
@@ -239,7 +243,7 @@ class RegistrarActor(RegistrarState):
         if self.closed:
             waiter(None, self.down())
             return
-        given_up = isinstance(command, c.GiveUp)  # it hears when what becomes of it is on disk
+        given_up = isinstance(command, c.GiveUp)  # its caller hears when the end of the load is on disk
         self.loads[query_id] = self._unless_loaded(query_id, waiter) if given_up else waiter
         self.post(command)
         held = self.catalog.held.get(query_id)
@@ -249,7 +253,7 @@ class RegistrarActor(RegistrarState):
             waiter(held, RegistrarDown(f"registrar {name!r}: the load has ended", registrar=name, status=""))
 
     def _unless_loaded(self, query_id: str, waiter: LoadWaiter) -> LoadWaiter:
-        """Pass on how a load failed; that it is held is not heard by one who has given it up, and will be told so."""
+        """Return a waiter that passes on a failure only: a caller that has given up does not hear of success."""
 
         def ended(held: Held | None, error: RrError | None) -> None:
             if error is None:
@@ -260,15 +264,15 @@ class RegistrarActor(RegistrarState):
         return ended
 
     def go_on_unloading(self, query_id: str, waiter: UnloadWaiter, refusal: Failure | None = None) -> None:
-        """Go on with an unload that a thread has begun by a line of its own; `waiter` hears how it ended.
+        """Go on with an unload that a thread has begun by its own line; `waiter` hears how it ends.
 
         Args:
-            refusal: what the thread's line has answered; without, the line is no more. The client hears of it as well.
+            refusal: the answer on the thread's line, which the link brings, too; None: the line broke.
         """
         if self.closed:
             waiter(self.down())
             return
-        with self.lock:  # no thread is just letting it go
+        with self.lock:  # so that no thread is in owe() or forget_released() now
             other = self.unloads.get(query_id, answered_by_line)
             held = self.whole().held.get(query_id)
             is_owed = held is not None and held.hold is Hold.OWED
@@ -277,17 +281,17 @@ class RegistrarActor(RegistrarState):
                 self.unloads[query_id] = waiter
             elif other is answered_by_line:
                 self.unloads.pop(query_id, None)
-        if other is not answered_by_line:  # refused, and somebody is trying again
+        if other is not answered_by_line:  # the unload was refused, and another caller is trying again
             self._wait_with(query_id, waiter, other, refusal)
         elif not goes_on:
             waiter(error_of(refusal) if held is not None and refusal is not None else None)
-        elif not is_owed:  # refused, by another way
+        elif not is_owed:  # held again: the link has brought the refusal
             self.post(c.Release(query_id))
         elif refusal is None:
             self.post(c.SendAgain(query_id))
 
     def _wait_with(self, query_id: str, waiter: UnloadWaiter, other: UnloadWaiter, refusal: Failure | None) -> None:
-        """Let `waiter` hear that it was refused, or else what `other` hears, who waits already."""
+        """Give `waiter` the refusal of its own unload, or else the result for which `other` waits already."""
         if refusal is not None:
             waiter(error_of(refusal))
             return
@@ -301,51 +305,51 @@ class RegistrarActor(RegistrarState):
     # -- clients, rows -------------------------------------------------------------------------------------------
 
     def client(self, provider: str) -> Client:
-        """The client of a provider, made if there is none."""
+        """Return the client of a provider; make it if there is none."""
         client = self.clients.get(provider)
         if client is None:
             client = self.clients[provider] = Client(self, provider)
         return client
 
     def held_at(self, provider: str) -> list[Held] | None:
-        """What is held there; None while anything is not decided, as it could change that."""
+        """Return the rows held at a provider; None while messages wait that could change them."""
         with self.lock:
             return None if self.waiting else digests.held_at(self.whole(), provider)
 
     def commit_rows(self, changes: list[Change]) -> None:
-        """Write rows that no decision is about: stored servers. On the loop.
+        """Write rows that need no decision, such as stored servers. On the loop.
 
         Raises:
-            CatalogError: not written.
+            CatalogError: the rows were not written.
         """
         self.monitor.run(c.SetRows(changes))
 
     def consumer_lost(self, origin: str) -> None:
-        """A consumer's link is down, or another has taken its place."""
+        """Note that a consumer's link is down, or that another has taken its place."""
         if not self.closed:
             self.post(c.ConsumerLost(origin))
 
     def commit_counts(self) -> dict[str, int]:
-        """How many commits there were, and of those during recordings how many, and microseconds."""
+        """Return the number of commits, the number of timed commits, and the microseconds that these took."""
         log = self._commits
         return {"commits": log.count, "timed_commits": log.timed, "commit_us": int(log.timed_s * 1e6)}
 
     def save(self) -> None:
-        """Write what has not been written yet.
+        """Write the unsaved changes.
 
         Raises:
-            CatalogError: it was not.
+            CatalogError: the changes were not written.
         """
         self._commits.save()
 
     def reload_catalog(self) -> None:
-        """Take the catalog as it is on disk, and agree anew with providers and consumers. On the loop.
+        """Read the catalog from the disk again, and reconcile with all providers and consumers. On the loop.
 
         Raises:
             UsageError: a load or unload is in flight.
-            CatalogError: it cannot be read, or what had to be written before could not be.
+            CatalogError: the catalog cannot be read, or unsaved changes could not be written before.
         """
-        with self.lock:  # meanwhile no thread lets anything go
+        with self.lock:  # so that no thread releases a query meanwhile
             if self.busy():
                 raise UsageError(f"{self.name}: load_catalog() while a load or unload is in flight; wait for it")
             old = self.whole()
@@ -354,7 +358,7 @@ class RegistrarActor(RegistrarState):
             catalog.listened, catalog.in_flight = old.listened, old.in_flight
             catalog.seq = catalog.since = max(catalog.seq, old.seq)
             self.catalog = catalog
-            self.consumers.close()  # they connect again, and hear what is not here any more
+            self.consumers.close()  # they connect again, and reconcile
             for client in list(self.clients.values()):
                 client.link_again()
             self.begin()
@@ -365,22 +369,22 @@ class RegistrarActor(RegistrarState):
         self.post(c.ForceUnload(target, new_id(), waiter))
 
     def force_at_stop(self, resource_id: str, waiter: UnloadWaiter, why: str) -> None:
-        """As force(), because this registrar is being closed."""
+        """Unload a resource as force() does, because this registrar is being closed."""
         self.post(c.ForceUnload(resource_id, new_id(), waiter, f"unloaded, as {why}"))
 
     def newest_first(self) -> list[str]:
-        """The queries this registrar holds for itself, newest first."""
+        """Return the queries that this registrar holds, newest first."""
         with self.lock:
             catalog = self.whole()
             return catalog.newest_first(id for id, row in catalog.held.items() if row.hold is not Hold.OWED)
 
     def forget_peers(self) -> None:
-        """Nothing is held anywhere: there is nobody to look for when this catalog is opened again."""
+        """Remove all Peer rows: nothing is held anywhere, so the next start has no provider to look for."""
         with self.lock:
             self.commit_rows([Drop("peers", name) for name in self.whole().peers])
 
     def busy(self) -> bool:
-        """Whether a load or unload is in flight on either side."""
+        """Return whether a load or unload is in flight on either side."""
         with self.lock:
             catalog = self.whole()
         waits = self.waiting or self.loads or self.unloads or catalog.in_flight

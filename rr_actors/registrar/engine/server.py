@@ -1,8 +1,8 @@
 """Server: one kind of resource of one registrar. It runs its callbacks in workers and reports how they ended.
 
-The context of a running callback says for which resource and which attempt it runs. What it loads is attributed by it.
-It is a contextvar, so it follows into tasks and into asyncio.to_thread, not into threads that a callback starts by
-hand: those pass ``parent=rr.current()`` on.
+The context of a running callback says for which resource and which attempt it runs. A load inside the callback belongs
+to that resource. The context is a contextvar: tasks and asyncio.to_thread inherit it. Threads that a callback starts by
+hand do not; they pass ``parent=rr.current()``.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ from rr_actors.runtime.workers import is_async
 
 
 class Current(msgspec.Struct, frozen=True):
-    """What a callback may know about its own call.
+    """The call of a callback, as the callback may know it.
 
     Attributes:
-        resource_id: the resource it loads, unloads, or hears about.
-        attempt: 1 at first, more when a crash interrupted it before.
-        origin: the registrar that holds the resource, by name: the one that asked first, of those that are left.
+        resource_id: the resource that the callback loads, unloads, or hears about.
+        attempt: 1 at first; more if a crash interrupted an earlier attempt.
+        origin: the name of the registrar that holds the resource: of its present holders, the one that asked first.
         server: the server's name, as it was registered.
-        interrupted: in an unload callback, whether the load callback never returned: the response is None then. The
-            load was withdrawn, or given up, after a crash; perhaps nothing was loaded, perhaps a part, perhaps all.
+        interrupted: in an unload callback, whether the load callback never returned; the response is None then. The
+            load was withdrawn or given up after a crash. Nothing, a part or all of the resource may have been loaded.
     """
 
-    # The serving registrar's actor: what the callback loads belongs to its resource. And what the resource is in until
-    # the callback returns: LOADING, UNLOADING, or LOADED, while it is asked after. None in a status callback: nothing
-    # waits for that one.
+    # `_registrar` is the actor of the serving registrar. `_phase` is the resource's phase until the callback returns:
+    # LOADING, UNLOADING, or LOADED while it is being recovered. It is None in a status callback, for which nothing
+    # waits.
 
     resource_id: str
     attempt: int
@@ -72,12 +72,12 @@ class Current(msgspec.Struct, frozen=True):
     def progress(self, fraction: float, text: str = "") -> None:
         """Report how far the load has come, in its load or recover callback, from any thread.
 
-        Those who wait for the load hear it (`progress=` of Registrar.load). At most ten reports a second are sent, the
-        newest ones, and the last one always. A report waits for nobody, may be lost, and is not kept.
+        All consumers that wait for the load hear it (`progress=` of Registrar.load). At most ten reports a second are
+        sent: the newest ones, and always the last. A report does not wait, may be lost, and is not kept.
 
         Args:
             fraction: from 0.0 to 1.0.
-            text: what is done now, for people; at most 500 characters.
+            text: what the callback does now, for people; at most 500 characters.
 
         Raises:
             UsageError: `fraction` or `text` is something else, or this is an unload or status callback.
@@ -106,11 +106,11 @@ def current() -> Current:
 
 
 current_or_none: Callable[[], Current | None] = _current.get
-"""As current(), or None outside of callbacks."""
+"""Return the context of the callback that this code runs in; None outside of callbacks."""
 
 
 def serving(current: Current) -> Any:
-    """The actor of the registrar whose callback it is."""
+    """Return the actor of the registrar that runs the callback."""
     return current._registrar  # pyright: ignore[reportPrivateUsage]  # same file
 
 
@@ -119,7 +119,7 @@ def _phase_of(current: Current) -> Phase | None:
 
 
 def begin(current: Current) -> None:
-    """From now on current() returns `current` in this context, which is the callback's own."""
+    """Make current() return `current` in this context, which belongs to the callback."""
     _current.set(current)
     if serving(current).node.watched.recording:
         _record("began", current)
@@ -143,14 +143,16 @@ _DOES = {LOADING: "loads", UNLOADING: "unloads", LOADED: "recovers"}
 
 
 def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str) -> None:
-    """Raise if `what` would wait for the callback that this code runs in. A task that a callback left behind may wait.
+    """Raise if `what` would wait for the callback that this code runs in.
+
+    A task that runs on after its callback has returned may wait.
 
     Args:
-        waits_for: whether it waits for such a callback as long as that runs. Called with the lock of its registrar.
-        instead: what to do.
+        waits_for: whether the call waits for such a callback while that runs. Called with the lock of its registrar.
+        instead: what to do instead, for the error's text.
 
     Raises:
-        UsageError: it would. `.registrar`, `.server`, `.resource_id`
+        UsageError: the call would wait for itself. `.registrar`, `.server`, `.resource_id`
     """
     me = _current.get()
     if me is None or (phase := _phase_of(me)) is None or serving(me).closed:
@@ -177,18 +179,18 @@ logger = logging.getLogger("rr_actors.server")
 
 Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
-_ROW_BYTES = 1024  # what goes with a request, a response, or types: names and ids
+_ROW_BYTES = 1024  # room for the names and ids that are sent with a request, a response, or types
 ARGUMENTS = {
     "load": ("request",),
     "unload": ("request", "response"),
     "status": ("request", "status"),
     "recover": ("request", "response"),
 }
-"""What the callbacks are called with."""
+"""The arguments of each callback."""
 
 
 class ServerSpec(msgspec.Struct, frozen=True):
-    """What a server is registered with; see Registrar.register_server."""
+    """The callbacks and settings that a server is registered with; Registrar.register_server describes them."""
 
     name: str
     load: Callback
@@ -205,8 +207,8 @@ class ServerSpec(msgspec.Struct, frozen=True):
 class ServerActor:
     """Runs one server's callbacks, each in a worker (``async def`` ones as tasks), each with its context.
 
-    The registrar tells it what to start; it posts LoadDone, LoadErred and so on back. Callbacks of different resources
-    run side by side; status callbacks of one resource one after another.
+    The registrar tells it which callback to start; it posts LoadDone, LoadErred and so on back. Callbacks of different
+    resources run at the same time; status callbacks of one resource run one after another.
 
     Raises:
         InvalidSpec: a callback has attributes that cannot be read.
@@ -215,7 +217,7 @@ class ServerActor:
 
     def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
         self.spec = spec
-        self.restored = False  # from the catalog: a second registration means this one
+        self.restored = False  # whether it came from the catalog; then a second registration replaces it
         self.types = types
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
@@ -247,12 +249,12 @@ class ServerActor:
         return described(wrapped, what, self._describe)
 
     def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
-        """What there is to say of an error of a callback, in the thread that ran it."""
+        """Return the failure and the trace that describe a callback's error. In the thread that ran the callback."""
         return self.load_failure(error), failure_of(error, self.origin).trace
 
     @property
     def facts(self) -> Server:
-        """What the decisions need to know."""
+        """The facts about this server that decisions need."""
         spec = self.spec
         has_recover = spec.recover is not None
         has_status = spec.status is not None
@@ -261,9 +263,9 @@ class ServerActor:
     # -- load ----------------------------------------------------------------------------------------------------
 
     def readable(self, load: Load) -> Load | c.RefuseLoad:
-        """Return a consumer's Load with its request in the one form that identical ones have, or the refusal of it.
+        """Return a consumer's Load with its request in canonical form, or the refusal of a request that cannot be read.
 
-        By a worker, where it runs a user's code.
+        A worker calls it if reading the request runs user code.
         """
         try:
             canonical = self.request.canonical(load.request, self.origin)
@@ -278,7 +280,7 @@ class ServerActor:
         self._submit(self._load, resource, resource.attempt, done, at_once=at_once)
 
     def _loaded(self, resource: Resource, response: bytes) -> bool:
-        """In the thread that ran the callback."""
+        """Decide LoadDone in the thread that ran the callback; return False if the loop has to."""
         progress = self.registrar.progress
         if self.too_long(resource, response) is not None or progress.has_unsent(resource.id):
             return False
@@ -294,7 +296,7 @@ class ServerActor:
             self.registrar.post(c.LoadErred(resource.id, resource.attempt, self.load_failure(error)))
 
     def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
-        """Why a response cannot be sent to its holders, if it cannot: it goes together with its request."""
+        """Return the error for a response that, with its request, is too long for a frame; None if it is not."""
         limit = self.registrar.node.config.frame_limit_bytes
         size = len(resource.request) + len(response or b"")
         if size + _ROW_BYTES <= limit:
@@ -305,7 +307,7 @@ class ServerActor:
         return NotSerializable(f"{text}: give the name of a file, say, or raise the limit", path="response")
 
     def load_failure(self, error: BaseException) -> Failure:
-        """How a load has failed, as those hear it who wait for it; of a group of one error, as that says."""
+        """Return the failure that consumers hear if a load callback raises; a group of one error is that error."""
         if type(error) is Raised:
             return error.details[0]
         error = _alone(error)
@@ -322,7 +324,7 @@ class ServerActor:
     # -- unload --------------------------------------------------------------------------------------------------
 
     def start_unload(self, resource: Resource) -> None:
-        """Run the unload callback; without one the resource is unloaded by forgetting it."""
+        """Run the unload callback; without one, the resource counts as unloaded at once."""
         if self.spec.unload is None:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
@@ -331,7 +333,7 @@ class ServerActor:
         self._submit(self._unload, resource, resource.tries, done, patient=True, at_once=at_once)
 
     def _unloaded(self, resource: Resource, _result: None) -> bool:
-        """In the thread that ran the callback."""
+        """Decide UnloadDone in the thread that ran the callback; return False if the loop has to."""
         return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
@@ -347,7 +349,7 @@ class ServerActor:
     # -- recover -------------------------------------------------------------------------------------------------
 
     def start_recover(self, resource: Resource, reload: bool) -> None:
-        """Ask the recover callback whether the resource lives, or load it again."""
+        """Ask the recover callback whether the resource lives, or load the resource again."""
         run = self._load if reload or self.spec.recover is None else self._recover
         self._submit(run, resource, resource.attempt, functools.partial(self._recover_ended, resource), patient=True)
 
@@ -365,7 +367,7 @@ class ServerActor:
     # -- status --------------------------------------------------------------------------------------------------
 
     def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
-        """Run the status callback for what the owner says of the resource, or one of its parts says."""
+        """Run the status callback for a status of the resource, or of one of its parts."""
         status = status_of(notice, repeated=repeated)
 
         def done(_result: None, error: BaseException | None) -> None:
@@ -420,7 +422,7 @@ class ServerActor:
 def _recorded(
     current: Current, done: Done, at_once: Callable[[Any], bool] | None
 ) -> tuple[Done, Callable[[Any], bool] | None]:
-    """What hears of a callback's end, and has it recorded first: at once, or when that did not suffice."""
+    """Return `done` and `at_once` changed to record the callback's end first, and only once."""
     ended: list[bool] = []
 
     def recorded(result: Any, error: BaseException | None) -> None:
@@ -439,7 +441,7 @@ def _recorded(
 def _wrap(
     callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
 ) -> Callback:
-    """A function that calls the callback for a resource, decoding before and encoding after, off the loop."""
+    """Return a function that decodes the arguments, calls the callback, and encodes its result. Off the loop."""
     if is_async(callback):
 
         async def run_async(current: Current, resource: Resource, *more: Any) -> Any:
@@ -451,7 +453,7 @@ def _wrap(
     def run(current: Current, resource: Resource, *more: Any) -> Any:
         begin(current)
         answer = callback(*arguments(resource), *more)
-        if is_coroutine(answer):  # a wrapper or a lambda round an async function
+        if is_coroutine(answer):  # the callback is a wrapper or a lambda around an async function
             return _then(answer, result)
         return result(answer)
 
@@ -471,7 +473,7 @@ def _text_of(error: BaseException) -> str:
 
 
 def _alone(error: BaseException) -> BaseException:
-    """What a group of errors is about, if that is one error."""
+    """Return the only error of a group of errors, however deep; else return the error as it is."""
     if not isinstance(error, BaseExceptionGroup):
         return error
     group = cast("BaseExceptionGroup[BaseException]", error)
@@ -495,10 +497,10 @@ def make_spec(
     load_timeout_s: float | None = None,
     recovery: str = "keep",
 ) -> ServerSpec:
-    """Check what a server is registered with, and read its types from the annotations of `load`.
+    """Check the arguments of a server's registration, and read its types from the annotations of `load`.
 
     Raises:
-        InvalidName, InvalidSpec: saying which argument is wrong.
+        InvalidName, InvalidSpec: an argument is wrong; the error says which.
     """
     name = check_name(name, "server name")
     with examined(f"server {name!r}"):
@@ -521,7 +523,7 @@ def make_spec(
 
 
 def _annotated(load: Callback) -> tuple[Any, Any]:
-    """Request and response type in the annotations of a load callback; None where there is none to be read."""
+    """Return the request and response type in the annotations of a load callback, or None for each one not found."""
     try:
         hints = _hints(load)
         parameters = list(inspect.signature(load).parameters.values())
@@ -533,9 +535,9 @@ def _annotated(load: Callback) -> tuple[Any, Any]:
 
 
 def log_unread_types(spec: ServerSpec, server: str) -> None:
-    """Log it if an annotation names what cannot be found, so that plain values come where a type was meant."""
+    """Log a warning if an annotation names a type that cannot be found: the values are plain then, and not checked."""
     if spec.request_type is not None or spec.response_type is not None:
-        return  # they were read, or given
+        return  # the types were read, or given
     try:
         _hints(spec.load)
     except NameError as error:
@@ -545,12 +547,12 @@ def log_unread_types(spec: ServerSpec, server: str) -> None:
             server,
             error,
         )
-    except Exception:  # nothing that was meant as a type: a builtin, say
+    except Exception:  # no annotation was meant as a type: `load` is a builtin, say
         return
 
 
 def _hints(load: Callback) -> dict[str, Any]:
-    """Annotations as types; those written as text are looked up where the function is defined or registered."""
+    """Return annotations as types; look up names in text where the function is defined, and in the calling frames."""
     function = load.func if isinstance(load, functools.partial) else load
     if not inspect.isroutine(function):
         function = type(function).__call__  # a callable object's annotations are its method's

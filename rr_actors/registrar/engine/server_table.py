@@ -1,4 +1,4 @@
-"""Servers: those registered at one registrar, and how one of them comes and goes."""
+"""Servers: the servers registered at one registrar, and how they are added and removed."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Servers:
         self.get: Callable[[str], ServerActor | None] = self._by_name.get
 
     def names(self) -> list[str]:
-        """The names of all, in the order in which they were registered."""
+        """Return the names of all servers, in the order in which they were registered."""
         return list(self._by_name)
 
     def register(self, server: ServerActor) -> None:
-        """Add a server, and take its resources up again.
+        """Add a server, and go on with its resources.
 
         Raises:
-            NameTaken: there is one of that name.
+            NameTaken: there is a server of that name.
         """
         registrar, name = self._registrar, server.spec.name
         old = self._by_name.get(name)
@@ -50,12 +50,12 @@ class Servers:
         registrar.post(c.Register(server.facts, new_id()))
 
     def register_again(self) -> None:
-        """Take the resources of all of them up again, from a catalog that was read anew."""
+        """Register all servers again, in a catalog that was read anew."""
         for server in self._by_name.values():
             self._registrar.post(c.Register(server.facts, new_id()))
 
     def unregister(self, name: str, done: Callable[[RrError | None], None]) -> None:
-        """Remove a server when all on it is released; `done` hears of it."""
+        """Remove a server when all its resources are released; `done` hears how that ended."""
         registrar = self._registrar
 
         def ended(error: RrError | None) -> None:
@@ -68,18 +68,18 @@ class Servers:
         registrar.post(c.Unregister(name, new_id(), ended))
 
 
-# ServerTypes: what providers have told of their servers' types, and who waits to know them.
+# ServerTypes: the types of providers' servers, and the callers that wait for them.
 
 
 class ServerTypes:
-    """Those of one registrar's providers; its catalog keeps them. On the loop."""
+    """The types of the servers of one registrar's providers; its catalog keeps them. On the loop."""
 
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
         self._wanting: dict[str, list[Callable[[], None]]] = {}
 
     def tell(self, server: ServerId, told: Callable[[], None]) -> None:
-        """Have `told` called when the types of a provider's server are known."""
+        """Call `told` when the types of a provider's server are known."""
         if str(server) in self._registrar.catalog.server_types:
             told()
             return
@@ -87,10 +87,10 @@ class ServerTypes:
         self._registrar.client(server.registrar).describe(server.server, at_once=True)
 
     def described(self, server: str, blob: bytes) -> None:
-        """A provider has told them."""
+        """Keep the types that a provider has sent, and call the callers that wait for them."""
         known = self._registrar.catalog.server_types.get(server)
         if known is None or known.blob != blob:
-            row = ServerType(server, blob)  # at once: a respawned on_start reads its queries before any link is up
+            row = ServerType(server, blob)  # written now: after a respawn, on_start reads queries before a link is up
             self._registrar.commit_rows([Put(row)])
         for told in self._wanting.pop(server, ()):
             told()

@@ -1,4 +1,4 @@
-"""Status: what an owner says of a resource, and what its holders hear."""
+"""Status: a message of an owner about a resource, as its holders hear it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def state_of(state: object, what: str) -> State:
     """Return the State that is given as such, or by its name in upper or lower case.
 
     Raises:
-        UsageError: it is none; `what` is the call that it was given to.
+        UsageError: `state` is no State; `what`, the name of the call, begins the text.
     """
     if is_a(state, State):
         return cast("State", state)
@@ -25,18 +25,18 @@ def state_of(state: object, what: str) -> State:
 
 
 class Status:
-    """A word on how a resource is (thesis: status message).
+    """A message about the state of a resource (thesis: status message).
 
-    To send one, make it with a state and a message. One that is heard also says whose it is.
+    To send one, make it with a state and a message. One that is received also says which resource it is about.
 
     Attributes:
-        state: OK, UPDATE, WARNING, ERROR or FATAL. To make one, its name will do, in any case: Status("fatal").
-        message: for people.
-        resource_id: the resource the receiver holds that the status reached it by; in a server's status callback its
-            own, if its owner has said it.
-        query_id: the receiver's query on it; "" if it is the receiver's own.
-        source: the server it began at, "registrar/server".
-        repeated: a crash made it uncertain whether it was heard before.
+        state: OK, UPDATE, WARNING, ERROR or FATAL. The name is accepted, too, in any case: Status("fatal").
+        message: text for people.
+        resource_id: the resource through which the status reached the receiver. The receiver holds it; in a server's
+            status callback it is the server's own if its owner has set the status.
+        query_id: the receiver's query on that resource; "" if the resource is the receiver's own.
+        source: the server where the status began, "registrar/server".
+        repeated: whether the status may have been heard before; a crash made that uncertain.
     """
 
     __slots__ = (
@@ -68,14 +68,14 @@ class Status:
         self.source = source
         self.repeated = repeated
         self._handled = False
-        self._event = ""  # the same for all its receivers, and after a crash
+        self._event = ""  # the same for all receivers of the status, and after a crash
         self._spares = itertools.count()
 
     def handled(self) -> None:
-        """Say that this status has been dealt with, in a callback: it goes no further up.
+        """Say in a callback that this status has been dealt with, so that it goes no further up.
 
-        In a server's status callback: than its resource; if it is about that resource, its holders do not hear it. In
-        `on_status` of a part: not even to the server's status callback.
+        From a server's status callback it does not go beyond the server's resource. If it is about that resource, the
+        holders do not hear it. From `on_status` of a part, it does not even go to the server's status callback.
         """
         self._handled = True
 
@@ -85,7 +85,7 @@ class Status:
         return self._handled
 
     def _next_spare(self) -> str:
-        """Return a name for the next spare part that is asked for because of it: the same when a crash repeats it."""
+        """Return a name for the next spare part that this status needs: the same if a crash repeats the status."""
         return f"{self._event} {next(self._spares)}"
 
     def __repr__(self) -> str:
@@ -116,15 +116,15 @@ def status_of(notice: Notice, *, repeated: bool = False) -> Status:
     return status
 
 
-# For the package's own modules; people who complete a name see nothing of it.
+# For the package's own modules. Editors do not offer it to users, as the method's name is private.
 next_spare = Status._next_spare  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def message_text(message: object) -> str:
-    """A message for people as text that can be sent.
+    """Return a message for people as text that can be sent.
 
     Raises:
-        UsageError: it is something whose text cannot be had: nested too deeply, say.
+        UsageError: str() of the message raises: it is nested too deeply, say.
     """
     try:
         return readable(str(message))

@@ -1,4 +1,4 @@
-"""Consumers: the links that others have opened to a registrar, and the connections of their threads (direct lines)."""
+"""Consumers: the links of consumers to a registrar, and the connections of their threads (direct lines)."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ from rr_actors.wire.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_OF_ITSELF = frozenset({Load, Unload, Fetch, Gone})  # what a consumer says of itself, and names itself in
-_A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # what else it may say
+_OF_ITSELF = frozenset({Load, Unload, Fetch, Gone})  # messages in which a consumer names itself
+_A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # the other messages that a consumer may send
 
 
 class Consumers:
     """One link for each consumer, and any number of direct lines. On the loop.
 
     Attributes:
-        routes: by which way each answer goes.
+        routes: for each answer, the line or link by which it goes.
 
     Args:
         provider: the registrar's actor.
@@ -56,7 +56,7 @@ class Consumers:
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
-        """How a consumer's link is received."""
+        """Return the function that receives the link of a consumer."""
 
         def attach(link: Link) -> _Inlet:
             self.opened(origin, link)
@@ -65,7 +65,7 @@ class Consumers:
         return attach
 
     def attach_direct(self, origin: str) -> Attach:
-        """How the direct line of one of its threads is received."""
+        """Return the function that receives a direct line of a consumer's thread."""
 
         def attach(line: Link) -> _Inlet:
             return _Inlet(functools.partial(self.received_directly, origin, line.hello.epoch), self.lost_directly)
@@ -73,7 +73,7 @@ class Consumers:
         return attach
 
     def send(self, origin: str, message: Message) -> None:
-        """Send to a consumer: by its link when flushed, or at once by the line that asked. Lost without a link."""
+        """Send to a consumer by its link, when flushed, or at once by the line that asked. Lost if there is neither."""
         line, by_link = self.routes.way_of(message)
         if line is not None:
             self._try(line.send_now, line, message)
@@ -82,7 +82,7 @@ class Consumers:
             self._send(link, message)
 
     def by_line(self, answer: Message) -> Callable[[], None] | None:
-        """What sends an answer by the direct line that alone waits for it; None: there is none. From any thread."""
+        """Return a function that sends an answer by the line that alone waits, or None. From any thread."""
         line = self.routes.line_of(answer)
         send = None if line is None else line.answering(answer)
         if line is not None and send is not None:
@@ -98,10 +98,10 @@ class Consumers:
         self.flush()
 
     def hint(self, origin: str, message: Message) -> None:
-        """Send what may be lost, when flushed: it is lost if the consumer has not read what was sent before."""
+        """Send, when flushed, a message that may be lost: it is dropped if the consumer is behind with its reading."""
         link = self._links.get(origin)
         if link is not None and not link.behind:
-            with contextlib.suppress(RrError):  # it is too long, as very many wait: no reason to close the link
+            with contextlib.suppress(RrError):  # very many queries wait, so it is too long: no reason to close the link
                 link.send(message)
                 self._dirty[id(link)] = link
 
@@ -113,7 +113,7 @@ class Consumers:
         self._provider.node.recorder.message(event, self._provider.name, origin, message, at)
 
     def _try(self, send: Callable[[Message], None], link: Any, message: Message) -> bool:
-        # Taken before: its receiver may read a message, and record that, before send() has returned here.
+        # The time before send(): the receiver may read and record the message before send() returns.
         at = time.time() if self._provider.node.watched.level[0] > 1 else None
         try:
             send(message)
@@ -121,7 +121,7 @@ class Consumers:
             others = self._instead(link, message, error)
             if others:
                 return all(self._try(send, link, other) for other in others)
-            logger.error("%s: %s; closing the link", self._provider.name, error)  # it does not read: it will ask again
+            logger.error("%s: %s; closing the link", self._provider.name, error)  # its consumer will ask again
             link.close()
             return False
         if at is not None:
@@ -129,11 +129,11 @@ class Consumers:
         return True
 
     def _instead(self, link: Any, message: Message, error: RrError) -> Sequence[Message]:
-        """What goes in place of a message that is over the limit of a frame, so that its link can stay.
+        """Return the messages that replace one that is over the limit of a frame, so that its link can stay open.
 
-        A message of the same meaning, as far as it goes. Who is refused holds nothing, and who holds something has its
-        request and response. But for a list, that is needed where the limit has been lowered since something was
-        loaded. What else there is to say was cut, or refused, where it was made.
+        They say the same, as far as they can. A consumer that is refused holds nothing, and one that holds a query has
+        its request and response. Except for lists, this is needed only if the limit was lowered after a load. All other
+        messages were cut, or refused, where they were made.
         """
         if not isinstance(error, NotSerializable) or "limit" not in error.details:
             return ()
@@ -158,18 +158,18 @@ class Consumers:
         return others
 
     def flush(self) -> None:
-        """Let everything go that was sent."""
+        """Flush every link that has unsent messages."""
         if self._dirty:
             dirty, self._dirty = self._dirty, {}
             for link in dirty.values():
                 link.flush()
 
     def link_of(self, origin: str) -> Link | None:
-        """A consumer's link, if it has one."""
+        """Return the link of a consumer, or None."""
         return self._links.get(origin)
 
     def opened(self, origin: str, link: Link) -> None:
-        """A consumer's link; a newer one replaces it."""
+        """Add the link of a consumer; it replaces an older one."""
         old = self._links.get(origin)
         self._links[origin] = link
         if old is not None:
@@ -177,7 +177,7 @@ class Consumers:
             self._lost(origin)
 
     def received(self, origin: str, link: Link, message: Any) -> None:
-        """Pass a message on, unless a newer link is open: what an old one still brings is sent again over that."""
+        """Pass on a message of a link. If a newer link is open, ignore it: the consumer sends it again over that."""
         _check(message, origin)
         if self._links.get(origin) is link:
             if self._provider.node.watched.level[0] > 1:
@@ -189,7 +189,7 @@ class Consumers:
                 self._provider.progress.greet(origin, message.query_id)
 
     def expel(self, origin: str) -> None:
-        """A consumer is gone for good: what its link still brings is ignored, and no thread of it waits."""
+        """Close the link and the lines of a consumer that does not come back, and ignore their messages."""
         for line in self.routes.lines_of(origin):
             line.close()
         link = self._links.pop(origin, None)
@@ -198,7 +198,7 @@ class Consumers:
             self._lost(origin)
 
     def lost(self, origin: str, link: Link, _reason: Exception | None) -> None:
-        """A consumer's link is down."""
+        """Note that the link of a consumer is down."""
         if self._links.get(origin) is link:
             del self._links[origin]
             self._lost(origin)
@@ -208,12 +208,12 @@ class Consumers:
         self._provider.consumer_lost(origin)
 
     def listens_to(self, origin: str, epoch: int) -> bool:
-        """Whether direct lines of the consumer's incarnation `epoch` are listened to: as long as it has a link."""
+        """Return whether direct lines of the consumer's incarnation `epoch` may ask: as long as that has a link."""
         link = self._links.get(origin)
-        return not self._provider.closed and link is not None and link.hello.epoch == epoch  # else perhaps a dead one's
+        return not self._provider.closed and link is not None and link.hello.epoch == epoch  # else it may have died
 
     def received_directly(self, origin: str, epoch: int, line: Any, message: Any) -> None:
-        """A message on a direct line of the consumer's incarnation `epoch`: it is answered there."""
+        """Decide a message of a direct line of the consumer's incarnation `epoch`; the answer goes by that line."""
         if not self.listens_to(origin, epoch):
             line.close()
             return
@@ -226,11 +226,11 @@ class Consumers:
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)
             line.open_outlet()
-        # A thread of this process may have posted to this loop before: with `more` this comes a turn later, behind it.
+        # A thread of this process may have posted a command before: with `more`, this message is decided after that.
         self._provider.monitor.receive(message, origin, more=isinstance(line, LocalLine))
 
     def lost_directly(self, line: Any, _reason: Exception | None) -> None:
-        """A direct line is gone: what it waits for is answered by the consumer's link."""
+        """Note that a direct line is down: the consumer's link carries the answers that it waits for."""
         self.routes.line_lost(line)
 
     def close(self) -> None:
@@ -243,10 +243,10 @@ class Consumers:
 
 
 def _check(message: Any, origin: str) -> None:
-    """See that a consumer says what a consumer may, and of itself.
+    """Check that a consumer may send this message, and that it names itself in it.
 
     Raises:
-        Unavailable: it does not; its link is closed, and nobody else's.
+        Unavailable: it may not, or names another; only this link is closed.
     """
     if type(message) in _OF_ITSELF:
         if message.origin != origin and not (type(message) is Gone and origin == retired(message.origin)):
@@ -262,23 +262,24 @@ class _Inlet(msgspec.Struct, frozen=True):
     lost: Callable[..., None]  # (link, reason)
 
 
-# Routes: by which way a provider answers: by the direct line that the question came by, the consumer's link, or both.
+# Routes: the way of each answer. It goes by the direct line that asked, by the consumer's link, or by both.
 #
-# Both is for what both have asked. A thread that leaves a line closes it and has the link ask, too; its end is read
-# with what is in it or some time after, so a question may be answered to a line that nobody reads any more.
+# If a question came by both, the answer goes by both. A thread that gives a line up closes it, and has the link ask,
+# too. The provider may read the question before it reads the end of the line. So an answer may go to a line that nobody
+# reads any more.
 
 
 class _Ways(msgspec.Struct):
-    """By which ways questions of one kind have come that are not answered: by query, the line; the link's consumer."""
+    """Questions of one kind that are not answered: by query, the direct line, and the consumer whose link asked."""
 
     lines: dict[str, Any] = {}
     links: dict[str, str] = {}
 
 
 class Routes:
-    """Those of one provider. On the loop, but for line_of and answered.
+    """The ways of all answers of one provider. On the loop, except line_of() and answered().
 
-    Loads and unloads apart: the answer to a Load that comes late, or twice, is not that to an Unload of the same query.
+    Loads and unloads are apart: an answer to a Load, late or sent twice, does not answer an Unload of the same query.
     """
 
     def __init__(self) -> None:
@@ -294,64 +295,64 @@ class Routes:
 
     @property
     def open_by_link(self) -> int:
-        """How many questions of links are not answered yet."""
+        """The number of questions of links that are not answered yet."""
         return len(self._loads.links) + len(self._unloads.links)
 
     def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
-        """A consumer's link has asked."""
+        """Note a question that came by a consumer's link."""
         self._ways[type(question)].links[question.query_id] = consumer
 
     def asked_by_line(self, line: Any, question: Load | Unload) -> None:
-        """A direct line has asked."""
+        """Note a question that came by a direct line."""
         self._ways[type(question)].lines[question.query_id] = line
 
     def way_of(self, message: Any) -> tuple[Any, bool]:
-        """Return, and forget, the line that a message goes by (or None), and whether it goes by the link."""
+        """Return the line of an answer (or None), and whether it goes by the link; forget the question."""
         ways = self._ways.get(message.__class__)
         if ways is None:
             return None, True
         asked = ways.links.pop(message.query_id, None) is not None
         line = self._forget_line(ways, message.query_id)
-        # A refusal has to come before the statuses that follow it.
+        # An UnloadRefused must come before the notices that follow it by the link.
         return line, asked or line is None or type(message) is UnloadRefused
 
     def line_of(self, message: Any) -> Any:
-        """The line that a message goes by, and by nothing else; None if there is none. From any thread."""
+        """Return the line of an answer that goes by nothing else; None if there is none. From any thread."""
         ways = self._ways.get(message.__class__)
         if ways is None or type(message) is UnloadRefused or message.query_id in ways.links:
             return None
         return ways.lines.get(message.query_id)
 
     def answered(self, answer: Any) -> None:
-        """It goes by that line, without way_of. From any thread."""
+        """Forget the question of an answer that goes by the line of line_of(). From any thread."""
         self._forget_line(self._ways[type(answer)], answer.query_id)
 
     def _forget_line(self, ways: _Ways, query_id: str) -> Any:
         if ways is self._unloads:
-            self._loads.links.pop(query_id, None)  # a Load that was withdrawn is not answered
+            self._loads.links.pop(query_id, None)  # a withdrawn Load gets no answer
         return ways.lines.pop(query_id, None)
 
     def line_lost(self, line: Any) -> None:
-        """A line is no more: what it waits for is answered by the link."""
+        """Forget the questions of a line that is down: their answers go by the link."""
         for ways in (self._loads, self._unloads):
             for query_id in [query_id for query_id, route in list(ways.lines.items()) if route is line]:
                 del ways.lines[query_id]
 
     def lines_of(self, consumer: str) -> list[Any]:
-        """The lines of a consumer's threads that wait for an answer."""
+        """Return the lines of a consumer's threads that wait for an answer."""
         return [line for line in self._lines() if line.hello.origin == consumer]
 
     def _lines(self) -> list[Any]:
         return [*self._loads.lines.values(), *self._unloads.lines.values()]
 
     def link_lost(self, consumer: str) -> None:
-        """A consumer's link is no more: what is still open is asked again over the next."""
+        """Forget the questions of a consumer's link that is down: the next link asks again."""
         for ways in (self._loads, self._unloads):
             for query_id in [query_id for query_id, origin in ways.links.items() if origin == consumer]:
                 del ways.links[query_id]
 
     def clear(self) -> list[Any]:
-        """Forget everything; returns the lines that wait for an answer."""
+        """Forget all questions; return the lines that wait for an answer."""
         lines = self._lines()
         self.__init__()
         return lines

@@ -1,4 +1,4 @@
-"""LocalLine: what a thread's own connection is to a registrar of the same process."""
+"""LocalLine: the connection of a thread to a registrar of the same process."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from rr_actors.wire.transport import Hello
 
 
 class LocalLine:
-    """An Exchange with a registrar of this process: it is a Link to it, too.
+    """An Exchange of a thread with a registrar of this process; for the registrar it is a Link.
 
-    The calling thread joins by itself what is loaded and held. The loop does the rest.
+    The calling thread itself joins a resource that is loaded and held. The loop decides all other messages.
     """
 
     def __init__(self, node: Any, registrar: Any, hello: Hello) -> None:
         self._node = node
         self._registrar = registrar
         self.hello = hello
-        self._unanswered = [None]  # who takes it out answers, and nobody else
+        self._unanswered = [None]  # only the thread that takes the entry out may answer
         self._answers: deque[Message | None] = deque()
         self._bell: Bell = LockBell()
         self.epoch: int = registrar.epoch
 
     def exchange(self, message: Message, timeout_s: float | None) -> Message:
-        """Send a message and return the one that comes back; see Exchange."""
+        """Send a message and return its answer; raise TimeoutError, or ConnectionResetError once it is closed."""
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
@@ -46,34 +46,34 @@ class LocalLine:
         return answer
 
     def send(self, message: Message) -> None:
-        """As a Link of the registrar: the answer."""
+        """Give the answer to the waiting thread."""
         self._tell(message)
 
     def _tell(self, answer: Message | None) -> None:
         try:
             self._unanswered.pop()
-        except IndexError:  # it has been rung, and nobody waits any more
+        except IndexError:  # there is an answer already, and no thread waits
             return
         self._answers.append(answer)
         self._bell.ring()
 
     def open_outlet(self) -> None:
-        """As a Link: any thread can answer as it is."""
+        """Do nothing: any thread can answer on this line already."""
 
     def answering(self, message: Message) -> Callable[[], None]:
-        """As a Link."""
+        """Return a function that gives the answer to the waiting thread."""
         return functools.partial(self._tell, message)
 
     send_now = send
 
     def flush(self) -> None:
-        """As a Link: nothing is held back."""
+        """Do nothing: send() holds nothing back."""
 
     def cut(self) -> None:
-        """Have the thread that waits hear that it is lost; see Exchange."""
+        """Have exchange() of the waiting thread fail."""
         self._tell(None)
 
     def close(self) -> None:
-        """As a Link: without an answer, the exchange has failed. As an Exchange: its question is answered otherwise."""
+        """Close the line: exchange() fails if it waits, and the link carries answers that are still to come."""
         self._tell(None)
         self._node.dispatcher.call(self._registrar.consumers.lost_directly, self, None)

@@ -1,10 +1,11 @@
-"""Client: a registrar's link to one provider. Finds it, connects, reconciles, and connects again when the link is lost.
+"""Client: a registrar's link to one provider. It finds the provider, connects, reconciles, and reconnects after a loss.
 
-While anything is asked, held or owed there, it keeps trying: a provider that is being respawned is back within
-milliseconds. Nothing is queued here: what is open is in the rows, and reconciling sends it again.
+While anything is asked, held or owed at the provider, it keeps trying: a provider that is being respawned is back
+within milliseconds. It has no queue: open messages can be made from the rows, and reconciling sends them again.
 
-A thread that loads or unloads and waits does so by a connection of its own, beside the link. Only the provider commits
-then; the thread decides what the answer changes. If the connection breaks, the link sends the same again.
+A thread that loads or unloads and waits uses a connection of its own, beside the link. Then only the provider commits,
+and the thread decides the changes that follow from the answer. If the connection breaks, the link sends the message
+again.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ THREADS = "direct"
 
 _FIRST_RETRY_S = 0.002
 _LAST_RETRY_S = 0.1
-_STARTING_RETRY_S = 0.01  # how long a provider is up, at most, before it is asked; a look at the directory takes 2 µs
+_STARTING_RETRY_S = 0.01  # the longest wait after a provider is up; to look into the directory takes 2 µs
 _STOPPED_RETRY_S = 0.25
 
 _ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused})
@@ -55,7 +56,7 @@ Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
 
 
 class Client:
-    """One provider, as one registrar sees it. Lives on the loop, but for what says otherwise."""
+    """The link of one registrar to one provider. On the loop, except where noted."""
 
     def __init__(self, registrar: Any, provider: str) -> None:
         self._registrar = registrar
@@ -68,9 +69,9 @@ class Client:
         self._chunks: list[FetchedQuery] = []
         self._fetching: list[Fetching] = []
         self._reconciled = False
-        self._known: digests.Known | None = None  # of what is held there, when it was last looked at
-        self._number = registrar.epoch << 32  # of the last Fetch
-        self._linked = False  # ever
+        self._known: digests.Known | None = None  # the rows held there, and their digests, when last looked at
+        self._number = registrar.epoch << 32  # the number of the last Fetch
+        self._linked = False  # whether there was ever a link
         self._described: set[str] = set()
         self._undescribed: set[str] = set()
         self._closed = False
@@ -80,15 +81,15 @@ class Client:
 
     @property
     def connections(self) -> ThreadConnections[Exchange] | None:
-        """Those of threads, beside the present link; None if the link is to be used. From any thread.
+        """The connections of threads, beside the present link; None if the link is to be used. From any thread.
 
-        There are none before the provider is reconciled over the present link: by then its row, by which it is looked
-        for after a crash, is on disk.
+        There are none before the provider is reconciled over the present link. By then its Peer row is on disk, by
+        which it is found after a crash.
         """
         catalog = self._registrar.catalog
         if catalog.up.get(self.provider) != self.opened or self.provider not in catalog.peers:
             return None
-        if self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
+        if self._closed or self._node.dispatcher.closed:  # in a forked child, all of this belongs to the parent
             return None
         return self._connections
 
@@ -111,13 +112,13 @@ class Client:
     # -- for the registrar ---------------------------------------------------------------------------------------
 
     def want(self) -> None:
-        """Something waits for this provider: see to it that there is a link, or that it hears why there is none."""
+        """Open a link if there is none; if that is impossible, post PeerGone with the reason."""
         self._asked = True
         if self.link is None and self._task is None and not self._closed:
             self._task = self._node.dispatcher.loop.create_task(self._connect())
 
     def link_again(self) -> None:
-        """Let the link go and open another: the provider says again what is held there."""
+        """Close the link and open another, over which the provider lists again what is held there."""
         link, self.link = self.link, None
         self._connections.close()
         if link is not None:
@@ -125,18 +126,18 @@ class Client:
         self.want()
 
     def describe(self, server: str, *, at_once: bool = False) -> None:
-        """Ask for a server's types, unless they have been told on this link; `at_once`: not with what follows."""
+        """Ask for a server's types, unless this link has brought them; `at_once`: do not wait for other messages."""
         if self.link is None:
             self._undescribed.add(server)
             self.want()
         elif server not in self._described:
-            self._undescribed.add(server)  # until it has been told: this link may break before
+            self._undescribed.add(server)  # until the answer is there: this link may break before
             self.link.send(Describe(server))
             if at_once:
                 self.link.flush()
 
     def fetch(self, done: Fetching) -> None:
-        """Ask for the queries this registrar holds there; `done` gets them, or the error."""
+        """Ask for the queries that this registrar holds at the provider; `done` gets them, or the error."""
         self._fetching.append(done)
         if self.link is not None and self._reconciled and len(self._fetching) == 1:
             self._send_fetch(resume=False)
@@ -145,7 +146,7 @@ class Client:
             self.want()
 
     def take_leave(self) -> None:
-        """Have the provider release whatever threads have loaded meanwhile: this registrar does not come back."""
+        """Have the provider release all queries, also those of threads, as this registrar does not come back."""
         if self.link is not None and self.provider != self._registrar.name:
             try:
                 self.link.send(Gone(self._registrar.name))
@@ -153,7 +154,7 @@ class Client:
                 logger.warning("%s: could not take leave of %s: %s", self._registrar.name, self.provider, error)
 
     def close(self) -> None:
-        """Let the link go, and do not connect again."""
+        """Close the link, and do not connect again."""
         self._closed = True
         self._connections.close()
         if self._task is not None:
@@ -178,7 +179,7 @@ class Client:
             self._task = None
 
     async def _try_once(self, delay: float) -> float | None:
-        """One attempt; how long to wait for the next, or None when there is a link (or nothing to wait for)."""
+        """Try once to connect; return the seconds to wait before the next try, or None if no other is needed."""
         entry = self._node.find(self.provider)
         if entry is None:
             self._unreachable(self._node.directory.no_registrar(self.provider), final=True)
@@ -195,12 +196,12 @@ class Client:
                 self._unreachable(down, final=False)
             return _STOPPED_RETRY_S
         if entry.status is Status.STARTING:
-            if self._known is None and entry.address:  # its process is there, and reads: there is time for it now
+            if self._known is None and entry.address:  # its process is reading its catalog, so there is time for this
                 self._known = await self._look_ahead()
             return min(delay, _STARTING_RETRY_S)
         try:
             await self._dial(entry.address)
-        except (Unavailable, UnknownRegistrar):  # it has just died, or is not serving yet: the directory will say
+        except (Unavailable, UnknownRegistrar):  # it has just died, or does not serve yet: the directory will say
             return delay
         except RrError as error:
             logger.error("%s: cannot connect to %s: %s", self._registrar.name, self.provider, error)
@@ -209,7 +210,10 @@ class Client:
         return None
 
     async def _look_ahead(self) -> digests.Known | None:
-        """What is held there, probably still when the link is there; the loop serves others in between."""
+        """Return the rows held at the provider with their digests, before the link is there.
+
+        They are probably still true then. The loop serves others in between.
+        """
         rows = self._registrar.held_at(self.provider)
         if rows is None:
             return None
@@ -223,7 +227,7 @@ class Client:
         transport = self._node.local if address == self._node.local.address else self._node.transport
         link = await transport.connect(address, self._hello("registrar"), self._attach)
         known: digests.Known | None = None
-        if not self._closed and not self._fetching:  # who fetches wants all of them
+        if not self._closed and not self._fetching:  # fetch() needs all queries listed
             rows = self._registrar.held_at(self.provider)
             known = None if rows is None else digests.known(rows, self._known)
         self._known = None
@@ -249,7 +253,7 @@ class Client:
         self.link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
 
     def _say_releases_wait(self, entry: Entry) -> None:
-        """Log that callers wait for unloads at a provider that somebody has to start again."""
+        """Log that callers wait for releases at a provider that has to be started again."""
         held = self._registrar.catalog.held
         rows = (held.get(query_id) for query_id in list(self._registrar.unloads))
         if any(row is not None and row.registrar == self.provider for row in rows):
@@ -268,13 +272,13 @@ class Client:
     def _attach(self, _link: Link) -> Client:
         return self
 
-    # -- what arrives --------------------------------------------------------------------------------------------
+    # -- messages of the provider --------------------------------------------------------------------------------
 
     def received(self, link: Link, message: Any) -> None:
-        """A message of the provider.
+        """Take a message of the provider.
 
         Raises:
-            Unavailable: it is none that a provider sends; the link is closed.
+            Unavailable: a provider does not send such a message; the link is closed.
         """
         kind = message.__class__
         if kind not in _A_PROVIDERS:
@@ -289,10 +293,10 @@ class Client:
             self._take_types(message)
         elif kind is Progressed:
             self._registrar.listeners.hear(self.provider, message)
-        # What is noticed before the list of queries is sent again behind it.
+        # A notice that comes before the list of queries is sent again behind it.
 
     def _take_types(self, message: Described) -> None:
-        """The types of a server that was asked about; or one has been registered, and its types may be new."""
+        """Keep the types of a server, if they were asked for or an older version of them is known."""
         server = f"{self.provider}/{message.server}"
         if message.server in self._undescribed or server in self._types:
             self._described.add(message.server)
@@ -301,7 +305,7 @@ class Client:
 
     def _fetched(self, link: Link, message: Fetched) -> None:
         if message.number != self._number:
-            return  # asked for by an incarnation before this one
+            return  # an earlier incarnation has asked for it
         self._chunks.extend(message.queries)
         if message.more:
             return
@@ -309,22 +313,22 @@ class Client:
         if not self._reconciled:
             self._reconciled = True
             servers = {query.server for query in queries}
-            if message.same and not self._linked:  # what an incarnation before this one had asked for
+            if message.same and not self._linked:  # and those of queries that agree, and so are not listed
                 with self._registrar.lock:
                     catalog = self._registrar.whole()
                     servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
             self._linked = True
             prefix = f"{self.provider}/"
-            with self._registrar.lock:  # told by an earlier incarnation
+            with self._registrar.lock:  # the types that an earlier incarnation was sent
                 known = {server for server in self._types if server.startswith(prefix)}
             self._undescribed |= servers | {server.removeprefix(prefix) for server in known}
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()
             reconcile = c.Reconcile(self.provider, queries, new_id(), message.same, message.number)
-            # with more: notices follow, which say why something is not in the list
+            # with `more`: notices follow, which say why a query is not in the list
             self._registrar.post(reconcile, more=link.more)
-            if message.same and self._fetching:  # asked for since: all of them
+            if message.same and self._fetching:  # fetch() was called since, and needs all queries listed
                 self._send_fetch(resume=False)
                 link.flush()
                 return
@@ -336,7 +340,7 @@ class Client:
             done(queries, error)
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """The link is down: connect again if anything is open there."""
+        """Note that the link is down, and connect again if anything is open at the provider."""
         if reason is not None and not self._closed:
             logger.info("%s: link to %s lost: %s", self._registrar.name, self.provider, reason)
         if self.link is not link and self.link is not None:
@@ -349,4 +353,4 @@ class Client:
         if self._registrar.catalog.needs(self.provider) or self._fetching:
             asked = self._asked
             self.want()
-            self._asked = asked  # as for nobody: if the provider is stopped, that is no error
+            self._asked = asked  # unchanged: if no caller asks, it is no error that the provider is stopped

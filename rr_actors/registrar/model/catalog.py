@@ -1,7 +1,7 @@
-"""Catalog: a registrar's rows in memory, with the indexes over them; Decision: changes of it that can be undone.
+"""Catalog: a registrar's rows in memory, with their indexes. Decision: changes of a catalog that can be undone.
 
-decide() and what it calls read the catalog, and write to it through a Decision. No I/O here, no clock, no
-randomness: the same messages in the same order give the same catalog and the same effects.
+decide() and the functions it calls read the catalog, and change it through a Decision. There is no I/O here, no clock
+and no randomness: the same messages in the same order give the same catalog and the same effects.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ _EPOCH_BITS = 32
 RequestKey = tuple[str, bytes]
 
 ABSENT: Any = object()
-"""In an Undo: there was nothing."""
+"""In an Undo, the old value of a key that was not there."""
 
 Undo = list[tuple["Table | dict[Any, Any]", Any, Any]]
-"""What was changed, in its order: the table, or the in-memory dict; the key; and what was there before."""
+"""Changes in their order: the table or in-memory dict, the key, and the value before the change."""
 
 
 class Server(msgspec.Struct, frozen=True):
-    """What the decisions need to know of a registered server; its callbacks are the server actor's."""
+    """The facts about a registered server that decisions need; its callbacks belong to the server actor."""
 
     name: str
     linger_s: float = 0.0
@@ -66,20 +66,20 @@ class Server(msgspec.Struct, frozen=True):
     recovery: str = "keep"
     has_status: bool = False
     has_recover: bool = False
-    types: bytes = b""  # of requests and responses, for consumers (rows.ServerType)
+    types: bytes = b""  # the types of requests and responses, for consumers (rows.ServerType)
 
 
 class Closing(msgspec.Struct, frozen=True):
-    """Releases that go out one after another, newest first; when the last is done, `after` happens."""
+    """Releases that are sent one after another, newest first; the effects `after` follow the last of them."""
 
     remaining: tuple[str, ...]
     after: tuple[Effect, ...]
 
 
 class Hearing(msgspec.Struct, frozen=True):
-    """A notice that is being dealt with: whose, by how many receivers still, and whether it was marked repeated.
+    """A notice that its receivers are dealing with: its provider, how many receivers are left, whether it is repeated.
 
-    `ends`: the query that ends with it ("" for none).
+    `ends`: the query that ends when they have finished ("" for none).
     """
 
     provider: str
@@ -89,39 +89,40 @@ class Hearing(msgspec.Struct, frozen=True):
 
 
 class Catalog:
-    """Everything one registrar knows.
+    """All that one registrar knows.
 
-    Rows, as on disk: `resources` and `queries` it serves, `held` queries of its own, `notices` to deliver, `peers` it
-    has asked, `stored_servers`, `server_types`.  Indexes follow the rows.  The rest lives in memory only and can be
-    lost in a crash, because those who wait ask again:
+    Rows, as on disk: `resources` and `queries` that it serves, `held` queries of its own, `notices` to deliver, `peers`
+    it has asked, `stored_servers`, `server_types`. Indexes follow the rows. All else is in memory only. A crash may
+    lose it, because each caller that waits asks again:
 
     - `deaths`: how the last processes of this registrar died, one after another, in words for people.
-    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled, with the
-      number of the Fetch that opened that link: what was decided for one link is not sent over another. On the next the
-      provider is to hear Fetch, and until its answer nothing else.
-      `consumers`: origins that have fetched their queries over a link that is still there.
-    - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
-      `unanswered`: queries whose Unload has come over the present link and has not been answered.
-    - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
-    - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a connection of their
-      caller's thread that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
-      provider's link was down: a list it sent over the next may be older. `in_flight`: the rows of what threads have
-      asked for by such connections, until something is decided about it; the threads add to it. `kept`: held queries
-      that were owed for a while, until their unload failed. A second try may still succeed. And the statuses of that
-      time were passed over, so a response that is sent again may be newer than the row's. Of other queries it is older.
+    - `servers`: the servers registered now. `leaving`: those of them that take no new loads.
+    - `up`: the providers whose link is reconciled, each with the number of the Fetch that opened the link. A message
+      decided for one link is not sent over another: the first message on a new link is Fetch, and nothing follows
+      before its answer. `consumers`: the origins that have fetched their queries over a link that is still open.
+    - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: queries whose Load was refused
+      lately. `unanswered`: queries whose Unload has come over the present link and has not been answered.
+    - `recovering`: resources whose recover callback runs, with the messages parked until it has returned.
+    - `closings`, `closing_of`: releases in progress.
+    - `direct`: queries whose Load a thread has sent by its own connection, which has not answered yet; False: the query
+      has ended by another way. `fresh`: queries that such a connection answered while the provider's link was down: the
+      list sent over the next link may be older. `in_flight`: the rows of loads sent by such connections, until a
+      decision concerns them; the threads add to it.
+    - `kept`: held queries that were owed for a while, until their unload failed. A second try may still succeed.
+      Statuses of that time were passed over, so for these a response that is sent again may be newer than the row's;
+      for other queries it is older.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
-    - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
-      query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
-      have dealt with it. `hearing`: those notices. `deferred`: by resource, the statuses that its server hears when
-      the load callback, or the recover callback, has returned. `next_to_hear`: by notice, the statuses of parts that
-      the resource hears when those who listen to the part have heard them. `ending`: queries taken away whose holders
-      are being told.
-      `acked`: providers that were sent acknowledgements, or are to be, and may not have got them when a link is lost.
+    - `told`: notices sent before; a second sending is marked repeated. `heard`: statuses received, by receiver (a
+      query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver.
+      `hearing`: these notices. `deferred`: by resource, the statuses that its server hears after its load or recover
+      callback has returned. `next_to_hear`: by notice, the statuses of a part that the resource hears after the
+      listeners of the part. `ending`: queries that were taken away and whose holders are still hearing of it.
+    - `acked`: providers with acknowledgements sent, or to be sent, which a lost link may lose.
 
     Args:
-        name: the registrar's.
-        content: what is on disk; it is the catalog's own from now on.
-        epoch: how often the catalog has been opened; running numbers and resource ids of different epochs differ.
+        name: the registrar's name.
+        content: the rows on disk. From now on the catalog owns this object.
+        epoch: how often the catalog has been opened. Running numbers and resource ids of different epochs differ.
     """
 
     def __init__(self, name: str, content: Content | None = None, epoch: int = 1) -> None:
@@ -136,7 +137,7 @@ class Catalog:
         self.stored_servers: dict[str, StoredServer] = self.tables["stored_servers"]
         self.server_types: dict[str, ServerType] = self.tables["server_types"]
         # indexes
-        self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> what it gets
+        self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> resource to join
         self.unloading: dict[RequestKey, Ids] = {}
         self.queued: dict[RequestKey, Ids] = {}
         self.moving: dict[str, bool] = {}  # resources that are loading, queued, or being unloaded
@@ -146,9 +147,9 @@ class Catalog:
         self.notices_to: dict[str, Ids] = {}  # origin -> notices
         self.notices_on: dict[str, Ids] = {}  # query -> notices
         self.own_notices: dict[str, Ids] = {}  # resource -> notices that its own server has to hear first
-        self.parts: dict[str, Ids] = {}  # resource -> held, those owed excepted
+        self.parts: dict[str, Ids] = {}  # resource -> held, without owed ones
         self.outbound: dict[str, Ids] = {}  # provider -> held
-        self.unsettled: dict[str, str] = {}  # held that are asked for or owed -> provider
+        self.unsettled: dict[str, str] = {}  # held that is pending or owed -> provider
         self._index: dict[Table, Callable[[Any, Any], None]] = {
             "resources": self._index_resource,
             "queries": self._index_query,
@@ -171,7 +172,7 @@ class Catalog:
         self.hearing: dict[str, Hearing] = {}
         self.deferred: dict[str, tuple[StartStatus, ...]] = {}
         self.next_to_hear: dict[str, StartStatus] = {}
-        self.listened: set[str] = set()  # queries and server ids that somebody listens to, who may deal with a status
+        self.listened: set[str] = set()  # queries and server ids with a listener, which may deal with a status
         self.ending: dict[str, bool] = {}
         self.acked: dict[str, bool] = {}
         self.direct: dict[str, bool] = {}
@@ -182,14 +183,14 @@ class Catalog:
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
         self.seq = 0
-        self.unfinished: Undo | None = None  # of the decision that is being applied; None between decisions
+        self.unfinished: Undo | None = None  # how to undo the decision that is being applied; None between decisions
         self._fill_indexes()
         self.told.update(dict.fromkeys(self.notices, True))
         self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
-        self.since = self.seq  # queries with a greater number were asked for by this Catalog: it knows all about them
+        self.since = self.seq  # this Catalog asked for all queries with a greater number, and knows all about them
 
     def _fill_indexes(self) -> None:
-        """As putting each row in its place with set(); an index at a time, as there may be a million."""
+        """Build the indexes that set() keeps for each row; one index at a time, as there may be a million rows."""
         self._fill_by_phase()
         self.by_server = built(map(_server, self.resources.values()), self.resources)
         self.holders = built(map(_resource_id, self.queries.values()), self.queries)
@@ -213,9 +214,9 @@ class Catalog:
                 by_request[row.server][row.request] = row.id
 
     def roll_back(self) -> list[tuple[Table, str]]:
-        """Undo the decision that was interrupted, wherever that was; returns the rows that it had begun to change.
+        """Undo the decision that was interrupted, and return the rows that it had begun to change.
 
-        May be interrupted itself, and then begins again.
+        An interrupt may stop this method, too. The next call then begins again.
         """
         rows: list[tuple[Table, str]] = []
         for where, key, old in reversed(self.unfinished or ()):
@@ -235,16 +236,17 @@ class Catalog:
         return rows
 
     def next_seq(self, given: int = 0) -> int:
-        """The running number of the next query this registrar asks for; one may have been given to it already."""
+        """Return the running number of the next query that this registrar asks for: `given`, if it has one already."""
         number = given or self.seq + 1
         self.seq = max(self.seq, number)
         return number
 
     def new_resource_id(self, query_id: str) -> str:
-        """The id of the resource that a query makes: its own, told apart from what it made before.
+        """Return a new id for the resource that a query makes: the query's own, or one made from that.
 
-        A query makes a second one when its refusal was lost and it is sent again. What the first had loaded elsewhere
-        must not be taken for the second's, also when a crash lies between: hence the epoch.
+        A query makes a second resource when its refusal was lost and its Load is sent again. The parts that the first
+        one had loaded must not be taken for the second's, not even after a crash in between. Therefore the id has the
+        epoch in it.
         """
         id = query_id if self.epoch <= 1 else f"{query_id}.{self.epoch}"
         number = 1
@@ -255,12 +257,12 @@ class Catalog:
         return free
 
     def joinable(self, server: str, request: bytes) -> str | None:
-        """The id of the resource that an identical request gets: at most one."""
+        """Return the id of the one resource that an identical request joins; None if there is none."""
         requests = self.by_request.get(server)
         return None if requests is None else requests.get(request)
 
     def find(self, target: str) -> Resource | None:
-        """The resource with this id, or the one the query with this id is on."""
+        """Return the resource with this id, or the resource of the query with this id."""
         resource = self.resources.get(target)
         if resource is None:
             query = self.queries.get(target)
@@ -268,21 +270,21 @@ class Catalog:
         return resource
 
     def queries_of(self, resource_id: str) -> list[Query]:
-        """The queries on a resource."""
+        """Return the queries on a resource."""
         return [self.queries[id] for id in self.holders.get(resource_id, ())]
 
     def holder_of(self, resource_id: str) -> str:
-        """The registrar whose query on a resource is the oldest; "" if nobody holds it."""
+        """Return the registrar whose query on a resource is the oldest; "" if nobody holds it."""
         for query_id in self.holders.get(resource_id, ()):
             return self.queries[query_id].origin
         return ""
 
     def needs(self, provider: str) -> bool:
-        """Whether a link to the provider is to be kept: something is asked, held, owed or to be acknowledged there."""
+        """Return whether a link is needed: the provider may have queries of ours, or is to get an acknowledgement."""
         return provider in self.outbound or provider in self.acked or (self.epoch > 1 and provider in self.peers)
 
     def set(self, table: Table, id: str, new: Any, undo: Undo | None = None) -> None:
-        """Put the row in memory, or take it out (None), when it is noted in `undo` what was there."""
+        """Put a row into memory, or remove it (None); note the old one in `undo` first."""
         rows = self.tables[table]
         old = rows.get(id)
         if undo is not None:
@@ -296,19 +298,19 @@ class Catalog:
             index(old, new)
 
     def unsettled_at(self, provider: str) -> list[Held]:
-        """What is asked for, or owed, at a provider."""
+        """Return the queries that are pending or owed at a provider."""
         return [self.held[id] for id, where in self.unsettled.items() if where == provider]
 
     def newest_first(self, held_ids: Iterable[str]) -> list[str]:
-        """The ids of held queries in the order they are released in."""
+        """Return the ids of held queries in the order in which they are released."""
         return sorted(held_ids, key=lambda id: self.held[id].seq, reverse=True)
 
     def parts_of(self, resource_id: str) -> list[str]:
-        """What the resource holds elsewhere, newest first."""
+        """Return the ids of the queries that a resource holds, newest first."""
         return self.newest_first(self.parts.get(resource_id, ()))
 
     def origin_of(self, resource: Resource) -> str:
-        """The resource's server id, "registrar/server"."""
+        """Return the id of the server of a resource, "registrar/server"."""
         return f"{self.name}/{resource.server}"
 
     # -- indexes ------------------------------------------------------------------------------------------------
@@ -324,7 +326,7 @@ class Catalog:
         if old is not None and old.phase in _MOVING:
             del self.moving[old.id]
             if new is not None and old.phase is LOADING and new.phase is LOADED and new.state is old.state:
-                return  # the common change: requests find it as before
+                return  # the common change: requests find the resource as before
         if old is not None:
             key = (old.server, old.request)
             if self.joinable(*key) == old.id:
@@ -383,7 +385,7 @@ class Catalog:
 
 
 def _stands_there(old: Held, new: Held) -> bool:
-    """Whether a new row is under the same keys as the old one: the common change, pending to held, and held to owed."""
+    """Return whether both rows have the same index keys, which is the common case."""
     if new.registrar != old.registrar or new.parent != old.parent:
         return False
     return not new.parent or (new.hold is OWED) is (old.hold is OWED)
@@ -391,8 +393,9 @@ def _stands_there(old: Held, new: Held) -> bool:
 
 # -- indexes -----------------------------------------------------------------------------------------------------------
 #
-# Ids by a key. Most keys have one id; a million of those must be no burden. One id is a tuple: 48 bytes where a dict
-# has 232, and nothing the garbage collector looks at twice. A key that has had more keeps its dict until it has none.
+# Ids by a key. Most keys have one id, and there may be a million of them. One id is kept as a tuple: 48 bytes instead
+# of a dict's 232, and the garbage collector does not look at it again. A key that has had several ids keeps its dict
+# until it has none.
 
 K = TypeVar("K")
 _SOME = 2000
@@ -413,7 +416,7 @@ def add(index: dict[K, Ids], key: K, id: str) -> None:
 
 
 def discard(index: dict[K, Ids], key: K, id: str) -> None:
-    """Take the id away, and the key with the last of them."""
+    """Remove the id from the key, and the key with its last id."""
     ids = index.get(key)
     if ids is None or id not in ids:
         return
@@ -424,11 +427,11 @@ def discard(index: dict[K, Ids], key: K, id: str) -> None:
 
 
 def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
-    """The index that adding all of them comes to; keys and ids go in pairs. Of ids in a dict no hash is made again."""
+    """Return the index that add() would make of these pairs. Ids in a dict are not hashed again."""
     keys = list(keys)
     if len(ids) > 1 and keys[0] == keys[-1] and keys.count(keys[0]) == len(keys):
         return {keys[0]: dict.fromkeys(ids)}
-    if len(set(keys[:_SOME])) == len(keys[:_SOME]):  # each has its own, perhaps
+    if len(set(keys[:_SOME])) == len(keys[:_SOME]):  # perhaps each id has a key of its own
         index: dict[K, Ids] = dict(zip(keys, zip(ids, strict=True), strict=True))
         if len(index) == len(ids):
             return index
@@ -440,19 +443,18 @@ def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
 
 # -- changes that can be undone ----------------------------------------------------------------------------------------
 #
-# A Decision applies each change to memory at once, because the next message that it is about must see it. It notes how
-# to undo a change before it makes it. The registrar commits the decision while it still has the lock, and undoes it if
-# that fails.
+# A Decision applies each change to memory at once, because its next message must see the change. Before each change it
+# notes how to undo it. The registrar commits the decision while it still has the lock, and undoes it if that fails.
 #
-# An interrupt (Ctrl-C) may come between any two instructions. What is noted then stays in `Catalog.unfinished`, and the
-# next thread that has the lock rolls it back (Catalog.roll_back).
+# An interrupt (Ctrl-C) may come between any two instructions. The notes then stay in `Catalog.unfinished`, and the next
+# thread that has the lock rolls the decision back (Catalog.roll_back).
 
 
 class Decision:
-    """What some messages and commands change and cause. After close() or undo() it is over.
+    """The changes and effects of some messages and commands. close() or undo() ends it.
 
-    `changes` must be on disk before any effect is acted upon. `later` are changes of rows that can be rebuilt from
-    elsewhere, by table and id: they may reach the disk a moment after, and are written behind `changes`.
+    `changes` must be on disk before any effect is carried out. `later` has, by table and id, changes of rows that can
+    be rebuilt from another registrar: they are written behind `changes`, or a moment later.
     """
 
     __slots__ = ("_counters", "_undo", "catalog", "changes", "effects", "later")
@@ -467,15 +469,15 @@ class Decision:
         catalog.unfinished = self._undo
 
     def put(self, row: Row) -> None:
-        """Insert or replace a row, durably."""
+        """Insert or replace a row; it is on disk before the effects."""
         table, id = TABLE_OF[type(row)], row.id
         self.catalog.set(table, id, row, self._undo)
         self.changes.append(Put(row))
         if self.later:
-            self.later.pop((table, id), None)  # older than this
+            self.later.pop((table, id), None)  # that change is older
 
     def drop(self, row: Row) -> None:
-        """Remove a row, durably."""
+        """Remove a row; that is on disk before the effects."""
         table = TABLE_OF[type(row)]
         self.catalog.set(table, row.id, None, self._undo)
         self.changes.append(Drop(table, row.id))
@@ -483,19 +485,19 @@ class Decision:
             self.later.pop((table, row.id), None)
 
     def put_later(self, row: Row) -> None:
-        """Insert or replace a row that could be rebuilt."""
+        """Insert or replace a row that could be rebuilt; it may be written a moment later."""
         table = TABLE_OF[type(row)]
         self.catalog.set(table, row.id, row, self._undo)
         self.later[table, row.id] = Put(row)
 
     def drop_later(self, row: Row) -> None:
-        """Remove a row that would be seen to be gone anyway."""
+        """Remove a row that the next incarnation would find to be gone; that may be written a moment later."""
         table = TABLE_OF[type(row)]
         self.catalog.set(table, row.id, None, self._undo)
         self.later[table, row.id] = Drop(table, row.id)
 
     def put_here(self, row: Row) -> None:
-        """Insert or replace a row in memory alone: it is on disk, or would mean nothing to the next incarnation."""
+        """Insert or replace a row in memory only: it is on disk already, or the next incarnation has no use for it."""
         self.catalog.set(TABLE_OF[type(row)], row.id, row, self._undo)
 
     def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
@@ -504,24 +506,24 @@ class Decision:
         memory[key] = value
 
     def forget(self, memory: dict[Any, Any], key: Any) -> Any:
-        """Take an entry out of one of the catalog's in-memory dicts; returns it, or None."""
+        """Remove an entry of one of the catalog's in-memory dicts, and return it, or None."""
         if key not in memory:
             return None
         self._undo.append((memory, key, memory[key]))
         return memory.pop(key)
 
     def cause(self, effect: Effect) -> None:
-        """Have this done once the changes are on disk."""
+        """Have the effect carried out once the changes are on disk."""
         self.effects.append(effect)
 
     def close(self) -> None:
-        """The changes are on disk, or wait to be written: they stay."""
+        """Keep the changes: they are on disk, or wait to be written."""
         self.catalog.unfinished = None
 
     def undo(self) -> None:
-        """Take back everything: the catalog is as it was before the decision.
+        """Undo every change, so that the catalog is as it was before the decision.
 
-        Only what was applied completely: after an interrupt it is Catalog.roll_back() that does it.
+        The decision must have been applied completely. Catalog.roll_back() undoes one that was interrupted.
         """
         for where, key, old in reversed(self._undo):
             if isinstance(where, str):
@@ -546,13 +548,13 @@ Key = tuple[Table, str]
 class Unsaved:
     """The last change of each row that waits to be written.
 
-    What was never written need not be owed on disk: after a crash nobody here knows of it, and its provider says
-    whether it is held. So a query that its holder releases within that time leaves nothing in the catalog. "Never
-    written" is more than "waits to be written": a row that waits may be newer than one on disk.
+    A held row that was never written need not be written as owed: after a crash this registrar does not know of the
+    query, and its provider says whether it is held. So a query that is released within that time leaves nothing on
+    disk. "Never written" says more than "waits to be written": a row that waits may replace an older one on disk.
 
     Attributes:
-        some: the changes that wait, by table and id; but for `new`.
-        new: by id the held queries of which no commit has written anything; None: it is released, and does not wait.
+        some: the changes that wait, by table and id, except those of `new`.
+        new: by id, the held queries that no commit has written; None: the query is released, and does not wait.
     """
 
     __slots__ = ("new", "some")
@@ -562,13 +564,13 @@ class Unsaved:
         self.new: dict[str, Held | None] = {}
 
     def changes(self) -> list[Change]:
-        """What waits."""
+        """Return the changes that wait to be written."""
         if not self.new:
             return list(self.some.values())
         return [*self.some.values(), *(Put(row) for row in self.new.values() if row is not None)]
 
     def add(self, changes: Iterable[Change]) -> None:
-        """These wait, in place of older ones of the same rows."""
+        """Have these changes wait, in place of older ones of the same rows."""
         for change in changes:
             table, id = key_of(change)
             if table != "held" or id not in self.new:
@@ -579,7 +581,7 @@ class Unsaved:
                 del self.new[id]
 
     def written(self, changes: Iterable[Change]) -> None:
-        """These have been written; what waits of the same rows is older."""
+        """Note that these changes are on disk, and forget older ones of the same rows."""
         for change in changes:
             table, id = key_of(change)
             self.some.pop((table, id), None)
@@ -587,25 +589,25 @@ class Unsaved:
                 self.new.pop(id, None)
 
     def row_written(self, row: Row) -> None:
-        """As written(), of one row."""
+        """Forget the changes of one row that has been written, as written() does for many."""
         if self.some:
             self.some.pop((TABLE_OF[type(row)], row.id), None)
         if self.new:
             self.new.pop(row.id, None)
 
     def all_written(self) -> None:
-        """Nothing waits any more."""
-        if self.new:  # first: what is on disk is not new, and may be written again
+        """Note that all waiting changes are on disk."""
+        if self.new:  # first: if an interrupt comes in between, `some` is only written once more
             self.new = {id: None for id, row in self.new.items() if row is None}
         self.some.clear()
 
     def forget(self) -> None:
-        """What waits is never written."""
+        """Forget all waiting changes; they are never written."""
         self.some.clear()
         self.new.clear()
 
     def drop(self, query_id: str) -> None:
-        """A held query is gone."""
+        """Note that a held query is gone, so that its row is removed from the disk, if it is there."""
         if query_id in self.new:
             del self.new[query_id]
         else:
@@ -613,7 +615,7 @@ class Unsaved:
 
 
 def key_of(change: Change) -> Key:
-    """The table and the id of the row that a change is of."""
+    """Return the table and the id of the row that a change concerns."""
     if isinstance(change, Put):
         return TABLE_OF[type(change.row)], change.row.id
     return change.table, change.id

@@ -1,6 +1,7 @@
-"""Commands: what the actors of a registrar's own process tell it, beside the messages of other registrars.
+"""Commands: what the parts of a registrar's own process tell it, while messages come from other registrars.
 
-From its API, its server actors, its timers and its links. `ticket` is whatever the caller wants back in the Answer.
+They come from its API, its server actors, its timers and its links. `ticket` is any value that the caller wants back in
+the Answer.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from rr_actors.registrar.model.rows import Change, Notice, State
 
 
 class Command(msgspec.Struct, frozen=True):
-    """Any of them: decide() has a table from each type to its function."""
+    """The base of all commands; decide() has a table from each type to its function."""
 
 
 class BeginAgain(Command, frozen=True):
-    """The registrar has opened its catalog. The first of all, before any server is registered."""
+    """The registrar has opened its catalog. This is the first command, before any server is registered."""
 
 
 class SetRows(Command, frozen=True):
-    """Write rows from which nothing follows, for example those of stored servers."""
+    """Write rows that need no other decision, for example those of stored servers."""
 
     changes: list[Change]
 
@@ -40,14 +41,14 @@ class RefuseLoad(Command, frozen=True):
 
 
 class Register(Command, frozen=True):
-    """A server is there; it serves its resources from before again."""
+    """A server is registered; it serves its earlier resources again."""
 
     server: Server
     event: str
 
 
 class Unregister(Command, frozen=True):
-    """A server goes: every query on it is released and its holder told."""
+    """A server is unregistered: each of its queries is released, and the holder gets a notice."""
 
     name: str
     event: str
@@ -94,7 +95,7 @@ class UnloadErred(Command, frozen=True):
 
 
 class RecoverDone(Command, frozen=True):
-    """The resource lives; `response` is None when it is as it was."""
+    """The resource lives; `response` is None if it has not changed."""
 
     resource_id: str
     attempt: int
@@ -112,15 +113,15 @@ class RecoverErred(Command, frozen=True):
 
 
 class LingerOver(Command, frozen=True):
-    """An unheld resource has been kept warm for long enough."""
+    """The time is over for which an unheld resource is kept warm."""
 
     resource_id: str
 
 
 class SetStatus(Command, frozen=True):
-    """The owner says how a resource is. `target`: its id, or that of a query on it.
+    """Set the status of a resource. `target`: its id, or that of a query on it.
 
-    `callback_of`: the resource whose status callback says it; "" if none does.
+    `callback_of`: the resource whose status callback sets it; "" if none does.
     """
 
     target: str
@@ -132,7 +133,7 @@ class SetStatus(Command, frozen=True):
 
 
 class SetResponse(Command, frozen=True):
-    """The owner replaces a resource's response. `callback_of`: as in SetStatus."""
+    """Replace the response of a resource. `callback_of`: as in SetStatus."""
 
     target: str
     event: str
@@ -143,10 +144,10 @@ class SetResponse(Command, frozen=True):
 
 
 class Swap(Command, frozen=True):
-    """A status callback puts a spare in the place of a part that its resource holds, and releases the part.
+    """Put a spare in the place of a part that a resource holds, from its status callback, and release the part.
 
-    `others` are spares of the same part that an interrupted run of the callback has loaded: they are released, too.
-    `response` is the new one of the resource; None leaves it as it is.
+    `others` are spares of the same part that an interrupted run of the callback has loaded; they are released, too.
+    `response` is the new response of the resource; None leaves it as it is.
     """
 
     resource_id: str
@@ -160,7 +161,7 @@ class Swap(Command, frozen=True):
 
 
 class ForceUnload(Command, frozen=True):
-    """The owner unloads a resource, and its holders hear `why`. `target`: its id, or that of a query on it."""
+    """Unload a resource that others may hold; its holders hear `why`. `target`: its id, or that of a query on it."""
 
     target: str
     event: str
@@ -172,9 +173,9 @@ class ForceUnload(Command, frozen=True):
 
 
 class Ask(Command, frozen=True, gc=False):
-    """Load: from whom, what, and for which resource of this registrar ("" for none).
+    """Load from a provider's server, for a resource of this registrar (`parent`, "" for none).
 
-    `seq`: its place in the order of what is asked; 0: the next.
+    `seq`: its running number in the order of loads; 0: the next number.
     """
 
     query_id: str
@@ -186,7 +187,7 @@ class Ask(Command, frozen=True, gc=False):
 
 
 class Got(Command, frozen=True, gc=False):
-    """A load in flight has got something: its provider has answered on the connection of the caller's thread."""
+    """A provider has answered a load in flight, on the connection of the caller's thread."""
 
     query_id: str
     resource_id: str
@@ -194,15 +195,15 @@ class Got(Command, frozen=True, gc=False):
 
 
 class SendAgain(Command, frozen=True):
-    """The connection of the caller's thread broke: the load, or the unload, goes on by the registrar's link."""
+    """The connection of the caller's thread broke: the registrar's link goes on with the load or unload."""
 
     query_id: str
 
 
 class GiveUp(Command, frozen=True):
-    """The caller does not wait for its load any longer: withdraw it. `unheard`: even if it is held by now.
+    """Withdraw a load for which its caller does not wait any longer. `unheard`: even if it is held by now.
 
-    That is for a thread that has left its own connection: it did not hear the answer, and hears the failure.
+    That is for a thread that has closed its own connection: it has not heard the answer, and hears the failure.
     """
 
     query_id: str
@@ -211,24 +212,24 @@ class GiveUp(Command, frozen=True):
 
 
 class Release(Command, frozen=True, gc=False):
-    """Unload a query of one's own."""
+    """Release a query of this registrar."""
 
     query_id: str
 
 
 class AddInFlight(Command, frozen=True):
-    """Have a row of every load in flight: somebody is about to look at all that there is."""
+    """Add the row of every load in flight, because somebody is about to read all rows."""
 
 
 class ReleaseOverdue(Command, frozen=True):
-    """The caller does not wait for its unload any longer: it stays owed."""
+    """End a caller's wait for its unload; the release stays owed."""
 
     query_id: str
     failure: Failure
 
 
 class Heard(Command, frozen=True, gc=False):
-    """All who listen to a query have been through with what Hear told them. `handled`: one has dealt with it."""
+    """All listeners of a query have heard what Hear told them. `handled`: one of them has dealt with it."""
 
     query_id: str
     event: str
@@ -236,7 +237,7 @@ class Heard(Command, frozen=True, gc=False):
 
 
 class StatusDone(Command, frozen=True):
-    """A server's status callback, or who listens to the query, has dealt with a notice; or it is passed on.
+    """A server's status callback has run for a notice, or did not have to. `handled`: it has dealt with the notice.
 
     The notice is about a part that `provider` serves, or about the resource itself (rows.is_own).
     """
@@ -248,9 +249,9 @@ class StatusDone(Command, frozen=True):
 
 
 class Reconcile(Command, frozen=True):
-    """A link to a provider is up, and this is what it has of ours; where it is the `same` as here it is not listed.
+    """A link to a provider is up, with the provider's list of our queries; those in `same` agree, and are not listed.
 
-    `link` is the number of the Fetch that opened it.
+    `link` is the number of the Fetch that opened the link.
     """
 
     registrar: str
@@ -261,19 +262,19 @@ class Reconcile(Command, frozen=True):
 
 
 class ConsumerLost(Command, frozen=True):
-    """The link from a consumer is down; it will be back or not."""
+    """The link of a consumer is down. It may come back."""
 
     origin: str
 
 
 class LinkLost(Command, frozen=True):
-    """The link to a provider is down; it will be tried again."""
+    """The link to a provider is down. The client will try to open another."""
 
     registrar: str
 
 
 class PeerGone(Command, frozen=True):
-    """A provider cannot be reached. `final`: it is gone for good, and with it all we held there."""
+    """A provider cannot be reached. `final`: it is gone for good, and with it every query that we held there."""
 
     registrar: str
     failure: Failure

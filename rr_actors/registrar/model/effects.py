@@ -1,6 +1,7 @@
-"""Effects: what a decision wants done once its changes are on disk. Data only; the registrar actor does them.
+"""Effects: the actions of a decision once its changes are on disk. Data only; the registrar's actor carries them out.
 
-Each can be derived again from the rows, so that a process killed before it was done does it when it comes back.
+Each effect can be derived from the rows again. So a process that is killed before it has carried one out does so when
+it comes back.
 """
 
 from __future__ import annotations
@@ -14,25 +15,25 @@ from rr_actors.registrar.model.rows import Held, Notice, Resource
 
 
 class Effect(msgspec.Struct, frozen=True):
-    """Any of them: EffectRunner has a table from each type to its method."""
+    """The base of all effects; EffectRunner has a table from each type to its method."""
 
 
 class Reply(Effect, frozen=True, gc=False):
-    """Send to the consumer `origin` over its link; lost if there is none (it will ask again)."""
+    """Send to the consumer `origin`; lost if it has no link (it will ask again)."""
 
     origin: str
     message: Message
 
 
 class Request(Effect, frozen=True, gc=False):
-    """Send to the provider over our link; lost if it is not up (everything open is sent again when it is)."""
+    """Send to a provider over our link; lost if that is down (the next link sends all open messages again)."""
 
     registrar: str
     message: Message
 
 
 class Connect(Effect, frozen=True):
-    """See to it that there is a link to the provider: something waits for it."""
+    """Open a link to the provider if there is none, because something waits for it."""
 
     registrar: str
 
@@ -50,16 +51,16 @@ class StartUnload(Effect, frozen=True):
 
 
 class StartRecover(Effect, frozen=True):
-    """Run the recover callback, or the load callback again when the policy says reload."""
+    """Run the recover callback, or the load callback again if the policy is reload."""
 
     resource: Resource
     reload: bool
 
 
 class StartStatus(Effect, frozen=True):
-    """Run the status callback of the resource for a notice about it, or about a part of it; then give StatusDone.
+    """Run the status callback of the resource for a notice about it, or about a part of it; then post StatusDone.
 
-    Without a status callback that is given at once.
+    Without a status callback, StatusDone is posted at once.
     """
 
     resource: Resource
@@ -69,7 +70,7 @@ class StartStatus(Effect, frozen=True):
 
 
 class SetTimer(Effect, frozen=True):
-    """Give `command` to the registrar after `delay_s`; one with the same key replaces it, None cancels it."""
+    """Post `command` after `delay_s`. It replaces the timer of the same key; with None it cancels that."""
 
     key: str
     delay_s: float | None
@@ -77,7 +78,7 @@ class SetTimer(Effect, frozen=True):
 
 
 class LoadResolved(Effect, frozen=True, gc=False):
-    """The load of this query has ended: `failure` is None when it is held."""
+    """The load of this query has ended; `failure` is None if it is held."""
 
     held: Held
     failure: Failure | None
@@ -91,14 +92,14 @@ class UnloadResolved(Effect, frozen=True, gc=False):
 
 
 class Receive(Effect, frozen=True):
-    """Handle this as though `sender` had sent it: in its turn, and not before statuses may be heard."""
+    """Decide this message as though `sender` had sent it: in its turn, and not before statuses are decided."""
 
     sender: str
     message: Message
 
 
 class Hear(Effect, frozen=True):
-    """Tell the listeners of this query of its own; then give the registrar Heard."""
+    """Tell the listeners of a query about a notice; then post Heard."""
 
     held: Held
     notice: Notice
@@ -116,7 +117,7 @@ Happening = Literal["loaded", "load_failed", "unloaded", "unload_failed", "statu
 
 
 class Happened(Effect, frozen=True):
-    """Something for those who watch: "loaded", "unloaded", "status" ..., and of which resource."""
+    """Tell the watchers of the system what has happened to a resource: "loaded", "unloaded", "status" ..."""
 
     what: Happening
     resource_id: str

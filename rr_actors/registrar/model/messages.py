@@ -1,13 +1,13 @@
-"""What registrars say to each other. Requests are imperative, facts are in the past tense.
+"""The messages between registrars. Requests are imperative, facts are in the past tense.
 
-Every message is a frozen msgspec Struct, encoded as a MessagePack array behind its tag: typed when it is decoded, so a
-peer's bytes can make nothing but these. Request and response bytes inside are canonical MessagePack
+Every message is a frozen msgspec Struct, encoded as a MessagePack array behind its tag. Decoding checks the types, so a
+peer's bytes can make no other objects. Request and response bytes inside are canonical MessagePack
 (base/values/canonical.py).
 
 Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded,
 LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed. The sender of a request sends it again,
-with the same id, until it is answered: every one of them may arrive twice (docs/consistency.md says what the second
-time does), and a Fetch with `resume` but once on a link, which it opens.
+with the same id, until it is answered. So every message may arrive twice (docs/consistency.md says what the second one
+does). A Fetch with `resume` opens a link, and comes once on each.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PROTOCOL = 2
 
 
 class Failure(msgspec.Struct, frozen=True, array_like=True):
-    """An error on its way: the class's name in errors.py, its text and attributes, and the frames it passed."""
+    """An error as it is sent: the name of its class in errors.py, its text and attributes, and the frames it passed."""
 
     kind: str
     message: str
@@ -35,7 +35,7 @@ class Failure(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
-    """Give `origin` a query with this id on the resource for this request; load it if nobody has yet."""
+    """Give `origin` a query with this id on the resource for this request; load that if it is not loaded."""
 
     query_id: str
     server: str
@@ -47,7 +47,7 @@ class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
 
 
 class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
-    """The query is held, and the provider's catalog has it on disk."""
+    """The query is held, and is on disk in the provider's catalog."""
 
     query_id: str
     resource_id: str
@@ -55,37 +55,38 @@ class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
 
 
 class LoadRefused(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """The query does not exist; nothing is left of it."""
+    """The query does not exist, and has left nothing."""
 
     query_id: str
     failure: Failure
 
 
 class Unload(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=4):
-    """Release the query. One that is not there counts as released."""
+    """Release the query. A query that does not exist counts as released."""
 
     query_id: str
     origin: str
 
 
 class Unloaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=5):
-    """The query is gone; if it was the last, the unload callback has run and what it depended on is released."""
+    """The query is gone. If it was the last, the unload callback has run and the resource's parts are released."""
 
     query_id: str
 
 
 class UnloadRefused(msgspec.Struct, frozen=True, array_like=True, tag=6):
-    """The unload callback raised: the query is still held, its resource unload_failed."""
+    """The unload callback raised: the query is still held, and its resource is unload_failed."""
 
     query_id: str
     failure: Failure
 
 
 class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """Tell `origin` all the queries it holds here; with `resume`, and then the notices it has not dealt with.
+    """List all queries that `origin` holds here; with `resume`, then send the notices it has not dealt with.
 
-    `number` comes back in the answer: one to what a dead incarnation asked can reach its successor. `spans`: what it
-    knows of them, in digests (registrar/core/digests.py); then the answer lists only those that differ.
+    `number` comes back in the answer, because the answer to a dead incarnation may reach the next one. `spans`: the
+    digests of the queries that `origin` knows (registrar/core/digests.py). Then the answer lists only the queries that
+    differ.
     """
 
     origin: str
@@ -95,7 +96,7 @@ class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
-    """One query in Fetched. `response` is None while it is loading, or being released."""
+    """One query in Fetched. `response` is None while its resource is loading, or being unloaded."""
 
     query_id: str
     server: str
@@ -109,9 +110,9 @@ class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """The queries `origin` holds at the registrar that says so, at that moment; `more` parts of the list follow.
+    """The queries that the receiver holds at the sender at that moment; with `more`, other parts of the list follow.
 
-    `same`: from above which running number up to which nothing differs from what Fetch said, and nothing is listed.
+    `same`: the ranges of running numbers in which nothing differs from Fetch, and which are not listed.
     """
 
     queries: list[FetchedQuery]
@@ -121,13 +122,13 @@ class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
 
 
 class Describe(msgspec.Struct, frozen=True, array_like=True, tag=9):
-    """Tell the types of this server's requests and responses."""
+    """Send the types of this server's requests and responses."""
 
     server: str
 
 
 class Described(msgspec.Struct, frozen=True, array_like=True, tag=10):
-    """The server's types by cloudpickle; opened only by code that has a peer of the same key in front of it."""
+    """The server's types by cloudpickle. A receiver unpickles them only if its peer has the same key."""
 
     server: str
     blob: bytes
@@ -141,16 +142,16 @@ class Noticed(msgspec.Struct, frozen=True, array_like=True, tag=11):
 
 
 class NoticesHandled(msgspec.Struct, frozen=True, array_like=True, tag=12):
-    """The notices with these ids have been dealt with, on disk where that matters."""
+    """The notices with these ids have been dealt with; where that matters, it is on disk."""
 
     ids: list[str]
 
 
 class Probe(msgspec.Struct, frozen=True, array_like=True, tag=13):
-    """Edge chasing (Chandy, Misra, Haas 1983): does what `query_id` waits for wait, in the end, for `waiter`?
+    """Edge chasing (Chandy, Misra, Haas 1983): does the resource of `query_id` wait, directly or not, for `waiter`?
 
-    `waiter` is a resource that is being loaded and `blocked` the query it waits on; `ring` holds the "registrar/server"
-    names passed so far. A probe that comes to the waiter has found a ring.
+    `waiter` is a resource that is being loaded, and `blocked` the query on which it waits. `ring` holds the
+    "registrar/server" names passed so far. A probe that comes to the waiter has found a ring.
     """
 
     query_id: str
@@ -160,13 +161,13 @@ class Probe(msgspec.Struct, frozen=True, array_like=True, tag=13):
 
 
 class Gone(msgspec.Struct, frozen=True, array_like=True, tag=14):
-    """The registrar `origin` is gone for good: release every query it holds here."""
+    """The registrar `origin` does not come back: release every query that it holds here."""
 
     origin: str
 
 
 class Progressed(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=15):
-    """How far the load has come that these queries of the receiver wait for. May be lost."""
+    """The progress of a load for which these queries of the receiver wait. May be lost."""
 
     query_ids: list[str]
     resource_id: str
@@ -176,7 +177,7 @@ class Progressed(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=15)
 
 
 def retired(name: str) -> str:
-    """Return who says that the registrar `name` is gone for good: not a registrar's name, as that has no colon."""
+    """Return the origin of a link on which the registrar `name` is said to be gone; no registrar's name has a colon."""
     return f"{name}:retired"
 
 
@@ -201,15 +202,15 @@ Message = (
 
 _LONGEST_TEXT = 10_000
 _LONGEST_TRACE = 30_000
-_NO_DETAILS = ("self", "details", "trace")  # nor what an error has by itself: it could not be pickled or sent on
+_NO_DETAILS = ("self", "details", "trace")  # an error with such details could not be pickled or sent on
 
 
 def failure_of(error: BaseException, origin: str | None = None) -> Failure:
     """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace.
 
-    What it was raised from, or while that was handled, has come the same way: its frames come first. One of a user's
-    class may be anything, have a `trace` or `details` of another kind, say: then its text has to do. Of a trace that
-    nobody reads to its end the first frames are kept: with all of them the message could be too long for a frame.
+    The frames of its cause or context come first, as these errors have come the same way. An error of a user's class
+    may be unusual: its `trace` or `details` may be of another kind, say. Then only its text is used. Of a very long
+    trace only the first frames are kept, as the message could be too long for a frame of the wire.
     """
     text = readable(errors.text_of(error))
     frames = [] if origin is None else [(origin, text)]
@@ -235,7 +236,7 @@ def _own_trace(error: BaseException) -> list[tuple[str, str]]:
 
 
 def _trace_of(error: BaseException) -> list[tuple[str, str]]:
-    """The frames of an error, or else of the nearest one behind it that has some, as Python itself would show them."""
+    """Return the frames of an error, or of the nearest one behind it, in the order in which Python shows them."""
     left: list[BaseException | None] = [error]
     seen: set[int] = set()
     while left:
@@ -247,15 +248,16 @@ def _trace_of(error: BaseException) -> list[tuple[str, str]]:
             return trace
         left.append(None if error_now.__suppress_context__ else error_now.__context__)
         left.append(error_now.__cause__)
-        if isinstance(error_now, BaseExceptionGroup):  # of an asyncio.TaskGroup, say
+        if isinstance(error_now, BaseExceptionGroup):  # from an asyncio.TaskGroup, say
             left.extend(reversed(cast("BaseExceptionGroup[BaseException]", error_now).exceptions))
     return []
 
 
 def readable(text: str) -> str:
-    """Return a text for people as it can be sent and stored: for half a character, as in some file names, its code.
+    """Return a text for people in a form that can be sent and stored; half a character becomes its code.
 
-    One that nobody reads to its end is cut: with all of it a frame could be too long, and would never get through.
+    File names may have such half characters. A very long text is cut: otherwise a frame could be too long, and would
+    never be sent.
     """
     text = errors.exact_text(text)
     if len(text) > _LONGEST_TEXT:
@@ -264,7 +266,7 @@ def readable(text: str) -> str:
 
 
 def error_of(failure: Failure) -> errors.RrError:
-    """Make the error a Failure describes; one of a class this version does not know becomes RrError."""
+    """Return the error that a Failure describes; one of a class that this version does not know becomes RrError."""
     cls = getattr(errors, failure.kind, errors.RrError)
     if not (isinstance(cls, type) and issubclass(cls, errors.RrError)):
         cls = errors.RrError

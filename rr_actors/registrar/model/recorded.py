@@ -1,7 +1,7 @@
-"""What a recording has: entries, each something that a process of the system sent, received, ran or heard of.
+"""The entries of a recording: each is something that a process of the system sent, received, ran or heard of.
 
-The ids in them join a load, its dependencies, its callbacks and their answers. A load has its query's id, a callback
-its resource's. A load that a callback makes has that resource as its `parent`.
+The ids in them join a load, its dependencies, its callbacks and their answers. The entry of a load has its query's id,
+and that of a callback its resource's id. If a callback loads, the load has that resource as its `parent`.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from rr_actors.registrar.model.messages import (
     readable,
 )
 
-_LONG = 1000  # bytes of a request that is shown
+_LONG = 1000  # the bytes of a request that is shown, at most
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     """One line of a recording.
 
     Attributes:
-        seq: its number in the recording; 0 until it has one. They count in the order of arrival, `at` of happening.
-        at: when, seconds since the epoch.
-        event: "sent" or "received": a message between registrars. "began" or "ended": a callback. Else an event of the
-            tree or of a resource, as System.subscribe() calls it.
-        process: the path of the process where it happened, "root/cameras"; `pid`: its number.
-        registrar: whose it is.
+        seq: its number in the recording; 0 until it has one. Entries are numbered as they arrive.
+        at: when it happened, in seconds since the epoch; not always in the order of `seq`.
+        event: "sent" or "received" for a message between registrars; "began" or "ended" for a callback. Otherwise an
+            event of the tree or of a resource, named as in System.subscribe().
+        process: the path of the process where it happened, "root/cameras"; `pid`: its process id.
+        registrar: the registrar where it happened.
         peer: of a message, the registrar at its other end.
-        name: of a message its class, "Load"; of a callback its role, "load", "unload", "recover" or "status".
-        query, resource: the ids that it is about; `parent`: the sender's resource that a load is for.
-        server: "registrar/server", where it is known.
-        detail: a request, an error, a status; for people.
-        facts: everything that an event of the tree says.
+        name: of a message, its class, "Load"; of a callback, its role: "load", "unload", "recover" or "status".
+        query, resource: the ids that it is about; `parent`: the sender's resource for which a load is made.
+        server: "registrar/server", if it is known.
+        detail: a request, an error or a status, for people.
+        facts: all the facts of an event of the tree.
     """
 
     at: float

@@ -1,7 +1,7 @@
 """The rows of a catalog, and the changes that are committed to it.
 
-Rows are frozen: a change is a new row put in the old one's place. What each table means is said on its class; which
-messages change them, in core/. A store writes rows without knowing their meaning (store.py).
+Rows are frozen: a change puts a new row in the place of the old one. Each class says what its table means; core/ says
+which messages change it. A store writes rows without knowing their meaning (store.py).
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Annotated, Any, Literal, final
 import msgspec
 
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
-"""A number that a catalog can hold. Checked where it is read, as bytes from elsewhere may say anything."""
+"""A number that a catalog can hold. It is checked when it is decoded, as a peer's bytes may have any number."""
 
 
 class State(enum.StrEnum):
-    """What a status says about a resource (thesis: status codes)."""
+    """The state that a status gives a resource (thesis: status codes)."""
 
     OK = "OK"
     UPDATE = "UPDATE"
@@ -27,7 +27,7 @@ class State(enum.StrEnum):
 
 
 class Phase(enum.StrEnum):
-    """Where a resource is in its life. QUEUED waits for an UNLOADING one of the same request to be gone."""
+    """The phase of a resource's life. A QUEUED one waits until an UNLOADING one of the same request is gone."""
 
     QUEUED = "queued"
     LOADING = "loading"
@@ -37,29 +37,30 @@ class Phase(enum.StrEnum):
 
 
 class Hold(enum.StrEnum):
-    """A consumer's view of its query: asked for, held, or a release owed to the provider."""
+    """A consumer's view of its query: asked for, held, or released and owed to the provider."""
 
     PENDING = "pending"
     HELD = "held"
     OWED = "owed"
 
 
-# To look up an enum's member takes 0.1 µs before Python 3.12. What is done for each load and unload uses these names.
+# To look up an enum's member takes 0.1 µs before Python 3.12. The code of each load and unload uses these names.
 OK = State.OK
 QUEUED, LOADING, LOADED, UNLOADING, UNLOAD_FAILED = Phase
 PENDING, HELD, OWED = Hold
 
 
 NOT_BEGUN = -1
-"""Resource.tries of a load that a crash has interrupted, until its server is there and it begins again."""
+"""Resource.tries of a load that a crash has interrupted, until its server is registered and it begins again."""
 
 
 class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One thing a server of this registrar loaded for one distinct request. `request` is its canonical bytes.
+    """One thing that a server of this registrar loaded for one distinct request. `request` is its canonical bytes.
 
-    Its id is that of the query that made it (and more, after a restart: Catalog.new_resource_id). `attempt` counts the
-    runs of its load callback (it tells parts that an earlier, interrupted run has loaded), `tries` those of its unload
-    callback; NOT_BEGUN while that attempt of its load has not begun. `state` and `message` are of its last status.
+    Its id is that of the query that made it; after a restart it is longer (Catalog.new_resource_id). `attempt` counts
+    the runs of its load callback: it tells which parts an earlier, interrupted run has loaded. `tries` counts the runs
+    of its unload callback; it is NOT_BEGUN while the present attempt of the load has not begun. `state` and `message`
+    are those of its last status.
     """
 
     id: str
@@ -76,8 +77,8 @@ class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
 class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One hold on a resource of this registrar, by `origin` (a registrar's name).
 
-    `parent` is the origin's resource that depends on it ("" for none), `attempt` that resource's attempt when it
-    asked, `seq` the origin's running number, by which it releases newest first.
+    `parent` is the origin's resource that depends on it ("" for none), and `attempt` that resource's attempt when it
+    asked. `seq` is the origin's running number; releases go newest first by it.
     """
 
     id: str
@@ -89,9 +90,9 @@ class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One query of this registrar at a provider ("registrar/server" is `registrar`, `server`), seen from here.
+    """One query of this registrar at a provider, as this side knows it; its server is "`registrar`/`server`".
 
-    Can be rebuilt from the provider's Query row, except while OWED: the release is only known here.
+    The provider's Query row can rebuild it, except while it is OWED: only this side knows of the release.
     """
 
     id: str
@@ -108,13 +109,14 @@ class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """A status on its way to `origin` about its query; dropped when the origin says it has dealt with it.
+    """A status on its way to `origin` about its query; dropped when the origin has dealt with it.
 
-    `event` is the same on all the ways a status takes through the graph, `source` the resource it began at.
-    `released`: the query was taken away by its provider (forced unload); `response`: a new response (late response).
+    `event` is the same on all ways of the status through the graph, and `source` is the server where it began.
+    `released`: the provider took the query away (forced unload). `response`: a new response of the resource (late
+    response).
 
-    One without `origin` and `query_id` is for the server of the resource itself: its status callback runs first. It is
-    dropped in the commit that makes the notices for the holders, or when the callback has dealt with the status.
+    A notice without `origin` and `query_id` is for the server of the resource itself: its status callback runs first.
+    It is dropped in the commit that adds the notices for the holders, or when the callback has dealt with the status.
     """
 
     id: str
@@ -130,25 +132,25 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 def is_own(notice: Notice) -> bool:
-    """Return whether it is for the server of the resource that it is about, and not for a holder."""
+    """Return whether the notice is for the server of the resource itself, and not for a holder."""
     return not notice.origin
 
 
 class Peer(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """A registrar this one has asked for something: where to look for its queries after a crash."""
+    """A registrar that this one has asked for something: after a crash its queries are looked for there."""
 
     id: str
 
 
 class StoredServer(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """A server registered through a handle of another process: its callbacks by value (cloudpickle)."""
+    """A server registered through a handle of another process, with its callbacks by value (cloudpickle)."""
 
     id: str
     blob: bytes
 
 
 class ServerType(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """Request and response type of a provider's server (id "registrar/server"), cloudpickled, to read its bytes."""
+    """Request and response type of a provider's server (id "registrar/server"), cloudpickled, to decode its values."""
 
     id: str
     blob: bytes
@@ -169,11 +171,11 @@ TABLES: dict[Table, type[Row]] = {
 TABLE_OF: dict[type[Row], Table] = {cls: table for table, cls in TABLES.items()}
 
 Content = dict[Table, dict[str, Any]]
-"""All rows of a catalog, by table and id; every table is there."""
+"""All rows of a catalog, by table and id. It has every table."""
 
 
 def content_of(rows: Iterable[Row]) -> Content:
-    """Return these rows, as a catalog has them."""
+    """Return the rows by table and id."""
     content: Content = {table: {} for table in TABLES}
     for row in rows:
         content[TABLE_OF[type(row)]][row.id] = row
@@ -181,7 +183,7 @@ def content_of(rows: Iterable[Row]) -> Content:
 
 
 def rows_of(content: Content) -> list[Row]:
-    """Return all of them, a table after another."""
+    """Return all rows of the content, one table after another."""
     return [row for rows in content.values() for row in rows.values()]
 
 
@@ -203,7 +205,7 @@ Change = Put | Drop
 
 
 def apply(content: Content, changes: Iterable[Change]) -> None:
-    """Make the changes in it."""
+    """Make the changes in the content."""
     for change in changes:
         if isinstance(change, Put):
             content[TABLE_OF[type(change.row)]][change.row.id] = change.row
