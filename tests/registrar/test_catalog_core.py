@@ -29,7 +29,7 @@ from rr_actors.registrar.model.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.registrar.model.rows import Drop, Held, Hold, Notice, Peer, Phase, Put, State, content_of
+from rr_actors.registrar.model.rows import Drop, Held, Hold, Notice, Peer, Phase, Put, State, StoredServer, content_of
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
@@ -239,6 +239,20 @@ def test_unregistering_ends_every_phase_and_answers_once(phase: str) -> None:
     assert answers == [e.Answer("ticket", None)]
     assert (registrar.catalog.resources, registrar.catalog.queries) == ({}, {})
     assert registrar.catalog.servers == {}
+
+
+def test_a_stored_server_goes_with_the_decision_that_answers_its_unregistration() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.SetRows([Put(StoredServer("cam", b"spec"))]))
+
+    registrar.obey(c.Unregister("cam", "event", "ticket"))
+    assert "cam" in registrar.catalog.stored_servers
+    (resource,) = registrar.catalog.resources.values()
+    registrar.obey(c.UnloadDone(resource.id, resource.tries))
+
+    assert [effect for effect in registrar.effects if isinstance(effect, e.Answer)] == [e.Answer("ticket", None)]
+    assert Drop("stored_servers", "cam") in registrar.changes
+    assert registrar.catalog.stored_servers == {}
 
 
 @pytest.mark.parametrize("phase", PHASES)

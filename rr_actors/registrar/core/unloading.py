@@ -176,6 +176,8 @@ def settle(decision: Decision, server: str, failure: Failure | None = None) -> N
     if all(resource.phase is UNLOAD_FAILED for resource in left):
         ticket = decision.forget(catalog.leaving, server)
         decision.forget(catalog.servers, server)
+        if (stored := catalog.stored_servers.get(server)) is not None:
+            decision.drop(stored)
         if left and failure is None:
             failure = failures.left_behind(catalog, left)
         decision.cause(Answer(ticket, failure))

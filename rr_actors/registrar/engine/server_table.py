@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
-from rr_actors.base.errors import NameTaken, RrError
+from rr_actors.base.errors import CatalogError, NameTaken, RrError
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.registrar.engine.server import ServerActor
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import Described
-from rr_actors.registrar.model.rows import Drop, Put, ServerType
+from rr_actors.registrar.model.rows import Put, ServerType
+
+_RETRY_S = 0.25
+
+logger = logging.getLogger("rr_actors.registrar")
 
 
 class Servers:
@@ -61,8 +66,6 @@ class Servers:
         def ended(error: RrError | None) -> None:
             if name not in registrar.catalog.servers:
                 self._by_name.pop(name, None)
-                if name in registrar.catalog.stored_servers:
-                    registrar.commit_rows([Drop("stored_servers", name)])
             done(error)
 
         registrar.post(c.Unregister(name, new_id(), ended))
@@ -88,9 +91,19 @@ class ServerTypes:
 
     def described(self, server: str, blob: bytes) -> None:
         """Keep the types that a provider has sent, and call the callers that wait for them."""
-        known = self._registrar.catalog.server_types.get(server)
+        registrar = self._registrar
+        known = registrar.catalog.server_types.get(server)
         if known is None or known.blob != blob:
             row = ServerType(server, blob)  # written now: after a respawn, on_start reads queries before a link is up
-            self._registrar.commit_rows([Put(row)])
+            try:
+                registrar.commit_rows([Put(row)])
+            except CatalogError as error:  # a full disk, for instance: the callers wait, within their time limits
+                logger.warning("%s: the types of %s are written later: %s", registrar.name, server, error)
+                registrar.node.dispatcher.loop.call_later(_RETRY_S, self._described_again, server, blob)
+                return
         for told in self._wanting.pop(server, ()):
             told()
+
+    def _described_again(self, server: str, blob: bytes) -> None:
+        if not self._registrar.closed:
+            self.described(server, blob)
