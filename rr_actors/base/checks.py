@@ -89,6 +89,15 @@ def check_id(value: object, who: str) -> None:
         raise invalid(who, "id", expected, value) from error
 
 
+def path_text(path: object) -> str:
+    """Return a path as text; "" if it is no path, is a path of bytes, or its own code raises."""
+    try:
+        text = os.fspath(cast("str | os.PathLike[str]", path))
+    except Exception:
+        return ""
+    return exact_text(text) if is_a(text, str) else ""
+
+
 def has_home(path: str) -> bool:
     """Return False for a path that begins with "~" and the name of an unknown user, else True."""
     return not path.startswith("~") or not os.path.expanduser(path).startswith("~")

@@ -22,7 +22,7 @@ from typing import Any, Literal, Self, TypeGuard, cast
 
 import msgspec
 
-from rr_actors.base.checks import has_home, is_number
+from rr_actors.base.checks import has_home, is_number, path_text
 from rr_actors.base.errors import InvalidName
 from rr_actors.base.names import check_name
 from rr_actors.base.toml import check_keys, file_name, read_toml, wrong
@@ -76,7 +76,8 @@ class RegistrarConfig:
 
     def catalog_path(self, state_dir: str | os.PathLike[str]) -> Path:
         """Return the catalog's file below the system's state directory."""
-        return Path(state_dir, os.path.expanduser(self.location or self.name), CATALOG_FILE)
+        location = self.name if self.location is None else self.location
+        return Path(state_dir, os.path.expanduser(location), CATALOG_FILE)
 
 
 def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
@@ -178,9 +179,7 @@ def _is_name(value: object) -> bool:
 def _is_location(value: object) -> bool:
     if value is None:
         return True
-    if not isinstance(value, (str, os.PathLike)):
-        return False
-    text = str(cast("object", value))
+    text = path_text(value)
     return text != "" and "\0" not in text and has_home(text)
 
 

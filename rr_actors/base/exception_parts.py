@@ -28,7 +28,7 @@ class Parts(NamedTuple):
         name: the name of its class.
         classes: its class and the bases, up to the first builtin class.
         args: the arguments for that builtin class; text in the place of an argument that could not be pickled.
-        own: the result of the class's own `__reduce__`, if it has one.
+        own: the result of the class's own `__reduce__`, if it has one that does not raise.
         attributes: its `__dict__`, and the fields of the builtin class.
         text: the result of str(); None if str() failed.
     """
@@ -71,6 +71,12 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
         except Exception:
             return b""
 
+    def own_part() -> bytes:
+        try:
+            return dumps(error.__reduce_ex__(4))
+        except Exception:
+            return b""
+
     made = type(error)
     origin: type[BaseException] = vars(made).get(_ORIGIN, made)
     above = _up_to_pythons_own(origin)
@@ -82,7 +88,7 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
         name=made.__qualname__,
         classes=tuple(blob for blob in classes if blob),
         args=tuple(part(arg) or shown(arg) for arg in args),
-        own=part(error.__reduce_ex__(4)) if _reduces_itself(origin) else b"",
+        own=own_part() if _reduces_itself(origin) else b"",
         attributes={name: blob for name, blob in attributes.items() if blob},
         cause=b"" if error.__cause__ is None else part(error.__cause__),
         suppress_context=error.__suppress_context__,
@@ -117,7 +123,9 @@ def _text(error: BaseException) -> str | None:
 
 def made_of(parts: Parts, loads: Loads) -> BaseException:
     """Return an exception that is made of these parts."""
-    error = _by_itself(parts, loads) or _by_parts(parts, loads)
+    error = _by_itself(parts, loads)
+    if error is None:  # `or` would call the __bool__ of its class
+        error = _by_parts(parts, loads)
     for name, blob in parts.attributes.items():
         if name not in vars(error):
             try:

@@ -79,7 +79,7 @@ class _Reader:
             raise wrong(self.file, key.rstrip("."), "either actor = 'module:class' or children", got, said=got)
         if "children" in fields:
             return self.supervisor_at(key, fields)
-        fields["actor_class_or_manager"] = self._class_at(f"{key}actor", fields.pop("actor"))
+        fields["actor"] = self._class_at(f"{key}actor", fields["actor"])
         if "backoff" in fields:
             backoff = fields["backoff"]
             if not isinstance(backoff, dict):
@@ -104,16 +104,21 @@ class _Reader:
     def check_keys(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> None:
         """Check that each key is a field of the class."""
         known = [_in_file(field.name) for field in dataclasses.fields(cls)]
-        check_keys([*map(_in_file, fields)], known, self.file, key)
+        check_keys(fields, known, self.file, key)
 
     def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
         self.check_keys(cls, key, fields)
         try:
-            return cls(**fields)
+            return cls(**{_in_python(name): value for name, value in fields.items()})
         except InvalidSpec as error:
             details = error.details
             field = _in_file(details["field"])
             raise wrong(self.file, f"{key}{field}", details["expected"], details["got"]) from error
+
+
+def _in_python(key: str) -> str:
+    """Return the name of the field that a key in a file stands for."""
+    return "actor_class_or_manager" if key == "actor" else key
 
 
 def _in_file(field: str) -> str:

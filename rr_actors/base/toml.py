@@ -7,13 +7,13 @@ msgspec imports the standard library's reader when the first file is read: most 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, cast
 
 import msgspec
 
+from rr_actors.base.checks import path_text
 from rr_actors.base.errors import ConfigError, did_you_mean, shortened, shown
 
 _INTEGERS = range(-(2**63), 2**63)  # the range that TOML requires of a reader
@@ -50,9 +50,10 @@ def file_name(path: object) -> str:
     Raises:
         ConfigError: `path` is no path.
     """
-    if not isinstance(path, (str, os.PathLike)) or path == "":
-        raise wrong(None, "path", "the path of a TOML file", cast("object", path))
-    return os.fspath(cast("str | os.PathLike[str]", path))
+    text = path_text(path)
+    if text == "":
+        raise wrong(None, "path", "the path of a TOML file", path)
+    return text
 
 
 def read_toml(file: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from rr_actors.base.checks import check_takes, examined, has_home
+from rr_actors.base.checks import check_takes, examined, has_home, path_text
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import ConfigError, UsageError, exact_number, exact_text, is_a, shown
 from rr_actors.base.names import ServerId, parse_server
@@ -94,11 +94,7 @@ def state_path(state_dir: object) -> Path:
     Raises:
         ConfigError: it is no path.
     """
-    try:
-        path = os.fspath(cast("str | os.PathLike[str]", state_dir))
-    except Exception:  # no path, or one that cannot say which
-        path = None
-    text = exact_text(path) if is_a(path, str) and path is not None else ""  # bytes, of some, are no text
+    text = path_text(state_dir)
     if text and "\0" not in text and has_home(text):
         return Path(os.path.expanduser(text))
     raise _wrong("state_dir", "a directory's path", state_dir)

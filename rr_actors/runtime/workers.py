@@ -112,7 +112,10 @@ class Workers:
         done: Done | None = None,
         context: Context | None = None,
     ) -> None:
-        """Run fn(*args) as submit() does, but the calls of one key (not None) one at a time, in their order."""
+        """Run fn(*args) as submit() does, but the calls of one key (not None) one at a time, in their order.
+
+        If no thread can be started for a call that waited for its turn, it gets that error by `done`.
+        """
         task = Task(fn, args, done, Context() if context is None else context, key=key)
         with self._lock:
             if key in self._queues:
@@ -128,10 +131,7 @@ class Workers:
             else:
                 self._threads.start(task)
         except Unavailable:
-            with self._lock:
-                waiting = self._queues.pop(key)
-            for other in waiting or ():  # submitted by other threads meanwhile
-                self.serial(key, other.fn, *other.args, done=other.done, context=other.context)
+            self._start_following(key)  # other threads may have submitted more calls meanwhile
             raise
 
     def gather(self) -> None:
@@ -266,10 +266,19 @@ class Workers:
 
     def _ended(self, task: Task, result: Any, error: BaseException | None) -> None:
         self._tell(task, result, error)
-        if task.key is not None and (following := self._following(task.key)) is not None:
-            self._threads.start(msgspec.structs.replace(following, when_full=GETS_A_THREAD))
+        if task.key is not None:
+            self._start_following(task.key)
 
     # -- queues ----------------------------------------------------------------------------------------------------
+
+    def _start_following(self, key: Hashable) -> None:
+        """Start the next task of a queue whose first has ended. If no thread can be started, end it with that error."""
+        while (following := self._following(key)) is not None:
+            try:
+                self._threads.start(msgspec.structs.replace(following, when_full=GETS_A_THREAD))
+                return
+            except Unavailable as unavailable:
+                self._tell(following, None, unavailable)
 
     def _following(self, key: Hashable) -> Task | None:
         """Return the next task of a queue whose first has ended; delete the queue if it is empty."""

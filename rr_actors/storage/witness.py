@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.base.folder import Folder
+from rr_actors.storage.checked_records import write_whole
 
 _PLACE = ".catalogs"  # no registrar is called that
 
@@ -61,7 +62,7 @@ class Witness:
                 fd = place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
                 try:
                     body = msgspec.json.encode(known)
-                    os.write(fd, b"%08x %b\n" % (zlib.crc32(body), body))
+                    write_whole(fd, b"%08x %b\n" % (zlib.crc32(body), body), 0)
                 finally:
                     os.close(fd)
                 place.rename(new, self.registrar)

@@ -28,6 +28,24 @@ def refused(made: Any) -> ConfigError:
     return caught.value
 
 
+@dataclasses.dataclass
+class PathOf(os.PathLike[Any]):
+    """A path that is spelled in this way."""
+
+    text: object
+
+    def __fspath__(self) -> Any:
+        if isinstance(self.text, Exception):
+            raise self.text
+        return self.text
+
+    def __bool__(self) -> bool:
+        raise RuntimeError("nobody may ask")
+
+
+NO_PATHS = [PathOf(""), PathOf(b"bytes"), PathOf(7), PathOf(RuntimeError("nowhere"))]
+
+
 # -- from code -----------------------------------------------------------------------------------------------------
 
 
@@ -55,6 +73,8 @@ REGISTRAR_MISTAKES = [
     ("name", 7, "1 to 64 ASCII letters"),
     ("location", 7, "a directory's path"),
     ("location", "", "a directory's path"),
+    *(("location", path, "a directory's path") for path in NO_PATHS),
+    ("location", PathOf("a\0b"), "a directory's path"),
     ("save_interval_s", "60", "a number of seconds greater than 0"),
     ("save_interval_s", 0, "a number of seconds greater than 0"),
     ("save_interval_s", True, "a number of seconds greater than 0"),
@@ -109,6 +129,7 @@ def test_a_configuration_cannot_be_changed_and_travels_to_other_processes() -> N
 def test_a_catalog_is_below_the_state_directory_unless_its_location_is_elsewhere() -> None:
     assert RegistrarConfig(name="cameras").catalog_path("/state") == Path("/state/cameras/catalog.sqlite3")
     assert RegistrarConfig(location="disk2").catalog_path("/state") == Path("/state/disk2/catalog.sqlite3")
+    assert RegistrarConfig(location=PathOf("disk2")).catalog_path("/state") == Path("/state/disk2/catalog.sqlite3")
     assert RegistrarConfig(location=Path("/ssd/c")).catalog_path(Path("/state")) == Path("/ssd/c/catalog.sqlite3")
 
 
@@ -260,7 +281,7 @@ def test_a_path_that_no_file_can_have_is_refused_where_it_is_given() -> None:
         rr.System(state_dir="a\0b")
 
 
-@pytest.mark.parametrize("path", [None, 3, b"app.toml", ["app.toml"], ""])
+@pytest.mark.parametrize("path", [None, 3, b"app.toml", ["app.toml"], "", *NO_PATHS])
 @pytest.mark.parametrize("read", [RegistrarConfig.from_toml, SystemConfig.from_toml, rr.Supervisor.from_toml])
 def test_what_is_no_path_is_refused_by_name(read: Callable[[Any], object], path: object) -> None:
     error = refused(lambda: read(path))

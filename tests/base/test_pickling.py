@@ -489,6 +489,26 @@ class ByItself(Exception):
         return functools.partial(ByItself, device=self.device), ()
 
 
+class CannotReduce(ByItself):
+    """One whose own code fails when it is to travel."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise RuntimeError("not me")
+
+    def __str__(self) -> str:
+        return f"{self.device} jams"
+
+
+class WithoutTruth(ByItself):
+    """One that is asked for its truth, and fails."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return functools.partial(WithoutTruth, device=self.device), ()
+
+    def __bool__(self) -> bool:
+        raise RuntimeError("neither")
+
+
 class Fragile(Exception):
     """Its text is made of what cannot travel."""
 
@@ -519,6 +539,20 @@ def test_an_exception_that_reduces_itself_is_made_as_it_says() -> None:
     error.add_note("look")
     made = loads(dumps(error))
     assert (type(made), made.device, made.made_by, made.__notes__) == (ByItself, "arm", "init", ["look"])
+
+
+def test_an_exception_whose_own_way_to_travel_fails_arrives_in_parts() -> None:
+    made: Any = CannotReduce(device="arm")
+    for _ in range(2):
+        made = loads(dumps([made]))[0]
+        assert type(made).__name__ == "CannotReduce"
+        assert isinstance(made, CannotReduce)
+        assert (str(made), made.device) == ("arm jams", "arm")
+
+
+def test_the_truth_of_an_exception_is_not_asked_for() -> None:
+    made = loads(dumps(WithoutTruth(device="arm")))
+    assert (type(made), made.device, made.made_by) == (WithoutTruth, "arm", "init")
 
 
 def test_a_group_of_exceptions_arrives_with_all_of_them() -> None:

@@ -683,6 +683,48 @@ def test_a_serial_call_over_the_limit_is_refused_and_its_key_is_free_again() -> 
         dispatcher.close()
 
 
+def test_calls_of_a_key_that_no_thread_can_run_end_with_an_error_and_the_key_is_free_again(
+    workers: Workers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, go_on = Outcomes(), threading.Event()
+
+    async def first() -> bool:
+        return go_on.wait(10)
+
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    workers.serial("key", first, done=done)
+    for _ in range(2):
+        workers.serial("key", int, done=done)
+    with monkeypatch.context() as late:
+        late.setattr(threading.Thread, "start", no_thread)
+        go_on.set()
+        outcomes = done.wait(3)
+    assert outcomes[0] == (True, None)
+    assert [type(error) for _, error in outcomes[1:]] == [MailboxFull, MailboxFull]
+    workers.serial("key", lambda: "now", done=done)
+    assert done.wait(4)[3] == ("now", None)
+
+
+def test_a_call_of_a_key_that_comes_while_the_first_is_refused_ends_too(
+    workers: Workers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, asked = Outcomes(), Calls()
+
+    def no_thread(thread: threading.Thread) -> None:
+        asked(thread)
+        if len(asked.items) == 1:
+            workers.serial("key", int, done=done)
+            workers.serial("key", int, done=done)
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    with pytest.raises(MailboxFull):
+        workers.serial("key", print)
+    assert [type(error) for _, error in done.wait(2)] == [MailboxFull, MailboxFull]
+
+
 def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: pytest.MonkeyPatch) -> None:
     workers = Workers(lambda done, result, error: done(result, error), name="slow")
     being_started, go_on = threading.Event(), threading.Event()

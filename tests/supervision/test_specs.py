@@ -295,6 +295,13 @@ def test_a_misspelt_key_of_a_tree_file_is_named_with_the_one_that_is_near(tmp_pa
             Supervisor.from_toml(written(tmp_path, text))
 
 
+def test_the_name_of_a_field_in_python_is_no_key_of_a_tree_file(tmp_path: Path) -> None:
+    for text, key in ((ACTOR, r"children\[0\]\.actor_class_or_manager"), ("children = []\n", "actor_class_or_manager")):
+        file = written(tmp_path, f"{text}actor_class_or_manager = 'a:B'")
+        with pytest.raises(ConfigError, match=rf"tree\.toml: {key}: expected one of .*, got an unknown key"):
+            Supervisor.from_toml(file)
+
+
 def test_a_tree_file_that_cannot_be_read_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nothing\.toml: cannot be read: No such file .*; expected a TOML file"):
         Supervisor.from_toml(tmp_path / "nothing.toml")
