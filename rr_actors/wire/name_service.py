@@ -167,7 +167,10 @@ class Directory:
 
     def touch(self) -> None:
         """Mark all files as used now, so that no cleaner of temporary files removes them as old."""
-        for path in (self.run_dir.parent, self.run_dir, self.run_dir / "names", *self.run_dir.iterdir()):
+        paths = [self.run_dir.parent, self.run_dir, self.run_dir / "names"]
+        with contextlib.suppress(OSError):  # it was removed; restore() makes it again
+            paths.extend(self.run_dir.iterdir())
+        for path in paths:
             with contextlib.suppress(OSError):
                 os.utime(path, follow_symlinks=False)
         for name in self.names():

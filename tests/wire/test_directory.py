@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -141,6 +142,13 @@ def test_publishing_in_a_directory_that_was_removed_is_a_config_error_naming_it(
         directory.publish("r.cameras", "x")
     assert directory.lookup("r.cameras") is None
     assert directory.names() == []
+
+
+def test_marking_files_as_used_when_the_directory_was_removed_does_nothing(tmp_path: Path) -> None:
+    directory = Directory(tmp_path / "run")
+    shutil.rmtree(directory.run_dir)
+    directory.touch()
+    assert not directory.run_dir.exists()
 
 
 def test_keys_of_registrars_and_actors_do_not_collide_and_are_checked() -> None:
