@@ -27,6 +27,7 @@ import logging
 import os
 import re
 import stat
+import threading
 import weakref
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -141,6 +142,7 @@ class Directory:
         self._draft = f".{os.urandom(4).hex()}."
         self._numbers = itertools.count()
         self._written: dict[str, str] = {}  # the entries that this object wrote
+        self._restoring = threading.Lock()
         self._names = self._open()
 
     def _open(self) -> Folder:
@@ -155,15 +157,16 @@ class Directory:
 
     def restore(self) -> bool:
         """Make the directory again if it was removed, with this object's entries; return whether it was removed."""
-        names = self._names
-        if names.fd < 0 or (names.is_there() and (self.run_dir / "names").exists()):
-            return False
-        self._names = self._open()  # the old folder stays open, until it is collected, for threads that use it
-        weakref.finalize(names, os.close, names.fd)
-        for name, content in list(self._written.items()):
-            if content.startswith(_UP) or self.lookup(name) is None:
-                self._write(name, content)
-        return True
+        with self._restoring:
+            names = self._names
+            if names.fd < 0 or (names.is_there() and (self.run_dir / "names").exists()):
+                return False
+            self._names = self._open()  # the old folder stays open, until it is collected, for threads that use it
+            weakref.finalize(names, os.close, names.fd)
+            for name, content in list(self._written.items()):
+                if content.startswith(_UP) or self.lookup(name) is None:
+                    self._write(name, content)
+            return True
 
     def touch(self) -> None:
         """Mark all files as used now, so that no cleaner of temporary files removes them as old."""
@@ -199,8 +202,9 @@ class Directory:
             try:
                 self._write(name, content)
             except FileNotFoundError:
-                if not (self._keeps and self.restore()):
+                if not self._keeps:
                     raise
+                self.restore()  # or another thread has restored it meanwhile
                 self._write(name, content)
 
     def _write(self, name: str, content: str) -> None:

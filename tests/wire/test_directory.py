@@ -11,6 +11,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +20,8 @@ import pytest
 from rr_actors.base.errors import CatalogLocked, ConfigError, InvalidName, UsageError
 from rr_actors.tools.inspection import read_state
 from rr_actors.wire.name_service import Directory, Entry, StateDir, Status, actor_key, open_state_dir, registrar_key
+from support import Calls
+from support_asks import Background
 
 
 @pytest.fixture
@@ -149,6 +152,27 @@ def test_marking_files_as_used_when_the_directory_was_removed_does_nothing(tmp_p
     shutil.rmtree(directory.run_dir)
     directory.touch()
     assert not directory.run_dir.exists()
+
+
+def test_two_threads_that_miss_the_directory_at_once_make_it_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = Directory(tmp_path / "run", keeps=True)
+    shutil.rmtree(directory.run_dir)
+    make, made = directory._open, Calls()  # pyright: ignore[reportPrivateUsage]
+
+    def make_slowly() -> object:
+        made()
+        time.sleep(0.2)
+        return make()
+
+    monkeypatch.setattr(directory, "_open", make_slowly)
+    other = Background(directory.restore)
+    made.wait()
+    directory.publish("r.cameras", "here")
+    other.result(timeout=10)
+    assert len(made) == 1
+    assert directory.lookup("r.cameras") == Entry(Status.UP, "here")
 
 
 def test_keys_of_registrars_and_actors_do_not_collide_and_are_checked() -> None:
