@@ -58,7 +58,7 @@ _KEY_BYTES = 32
 _INCARNATION_BYTES = 4
 _INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
 _SHOWN = 10  # names in an error at most
-_CONTENT_BYTES = 4000  # the content of a symbolic link is shorter than a page
+_CONTENT_BYTES = 1000  # XFS has links of at most 1023 bytes
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
 
 PATH_BYTES = 482
@@ -101,7 +101,7 @@ _UP = Status.UP.value + ":"
 _UP_ONCE = Status.UP.value + " once:"
 _OPENING = Status.STARTING.value + ":"
 _WHY = " because "
-_WHY_BYTES = 900  # some file systems have links of at most 1023
+_WHY_BYTES = 900  # with the status in front of it, and "…"
 
 
 def _fitting(why: str) -> str:

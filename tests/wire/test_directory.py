@@ -195,6 +195,17 @@ def test_a_deep_path_has_a_key_of_its_own_that_fits_a_file_name(directory: Direc
         assert directory.lookup(key) == Entry(Status.UP, "x")
 
 
+def test_no_entry_is_longer_than_any_file_system_allows(directory: Directory) -> None:
+    classes = [f"robots.cameras.Camera{number}" for number in range(200)]
+    directory.put_classes("cameras", classes)
+    directory.mark(registrar_key("cameras"), Status.STOPPED, "why " * 1000)
+    names = directory.run_dir / "names"
+    assert max(len(os.fsencode(os.readlink(path))) for path in names.iterdir()) <= 1023  # XFS
+    kept = directory.manager_classes()["cameras"]
+    assert kept == classes[: len(kept)]
+    assert len(kept) > 20
+
+
 def test_readers_see_the_old_entry_or_the_new_and_never_none(directory: Directory) -> None:
     directory.publish("r.cameras", "0")
     done = threading.Event()
