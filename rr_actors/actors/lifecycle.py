@@ -227,7 +227,7 @@ class BaseActor(pykka.Actor):
         except BaseException:
             self._life_driver.close()
             self._vanish()
-            self._mailbox.close()
+            refuse_all(self._mailbox.close(), self._target.name)
             death_watch.ended(self.actor_stopped, self._report)
             release()
             raise

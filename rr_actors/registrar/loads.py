@@ -447,9 +447,9 @@ class Loads:
                 return False
             self.views.add(query)
             if actor.node.watched.level[0] <= 1:
-                answer = line.exchange(load, timeout_s)
+                answer = line.exchange(load, left_of(timeout_s, began))
             else:
-                answer = _recorded(actor, line, query.registrar, load, timeout_s)
+                answer = _recorded(actor, line, query.registrar, load, left_of(timeout_s, began))
             connections.give_back(line)
         except TimeoutError:
             command = c.GiveUp(query.id, _too_late(actor, query, timeout_s), unheard=True)
@@ -646,9 +646,9 @@ class Unloads:
                 return False
             unload = Unload(query_id, actor.name)
             if actor.node.watched.level[0] <= 1:
-                answer = line.exchange(unload, timeout_s)
+                answer = line.exchange(unload, left_of(timeout_s, began))
             else:
-                answer = _recorded(actor, line, client.provider, unload, timeout_s)
+                answer = _recorded(actor, line, client.provider, unload, left_of(timeout_s, began))
             connections.give_back(line)
             if type(answer) is Unloaded and not actor.forget_released(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)

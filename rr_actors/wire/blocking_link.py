@@ -84,9 +84,10 @@ class BlockingLink:
         sent = self._send(frame)
         if sent < len(frame):  # seldom: the buffer of the socket is empty before
             timeout_s = self._send_rest(memoryview(frame)[sent:], timeout_s)
-        messages = self._reader.feed(self._receive_soon(timeout_s))
+        began = time.monotonic()
+        messages = self._reader.feed(self._receive_soon(timeout_s, began))
         if not messages:
-            messages = self._rest(timeout_s)
+            messages = self._rest(None if timeout_s is None else began + timeout_s)
         return messages[0]
 
     def _send(self, data: bytes | memoryview) -> int:
@@ -108,9 +109,8 @@ class BlockingLink:
             rest = rest[self._send(rest) :]
         return None if deadline is None else max(0.0, deadline - time.monotonic())
 
-    def _rest(self, timeout_s: float | None) -> list[Any]:
+    def _rest(self, deadline: float | None) -> list[Any]:
         """Read until a message is complete, and return all messages that are then complete."""
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             if self._reader.error is not None or self._reader.ended:
                 raise ConnectionResetError(f"the link has ended: {self._reader.error or 'closed'}")
@@ -118,12 +118,11 @@ class BlockingLink:
             if messages:
                 return messages
 
-    def _receive_soon(self, timeout_s: float | None) -> bytes:
+    def _receive_soon(self, timeout_s: float | None, began: float) -> bytes:
         """Wait for data as _receive() does, but spin first: a quick answer comes before a thread could wake up."""
         if timeout_s is not None and timeout_s < SPIN_LIMIT_S:
             return self._receive(timeout_s)
         spin = self._spin
-        began = time.monotonic()
         if not spin.worthwhile:
             data = self._receive(timeout_s)
             spin.parked(time.monotonic() - began)

@@ -27,6 +27,7 @@ import logging
 import os
 import re
 import stat
+import threading
 import weakref
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -57,7 +58,7 @@ _KEY_BYTES = 32
 _INCARNATION_BYTES = 4
 _INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
 _SHOWN = 10  # names in an error at most
-_CONTENT_BYTES = 4000  # the content of a symbolic link is shorter than a page
+_CONTENT_BYTES = 1000  # XFS has links of at most 1023 bytes
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
 
 PATH_BYTES = 482
@@ -100,7 +101,7 @@ _UP = Status.UP.value + ":"
 _UP_ONCE = Status.UP.value + " once:"
 _OPENING = Status.STARTING.value + ":"
 _WHY = " because "
-_WHY_BYTES = 900  # some file systems have links of at most 1023
+_WHY_BYTES = 900  # with the status in front of it, and "…"
 
 
 def _fitting(why: str) -> str:
@@ -141,6 +142,7 @@ class Directory:
         self._draft = f".{os.urandom(4).hex()}."
         self._numbers = itertools.count()
         self._written: dict[str, str] = {}  # the entries that this object wrote
+        self._restoring = threading.Lock()
         self._names = self._open()
 
     def _open(self) -> Folder:
@@ -155,19 +157,23 @@ class Directory:
 
     def restore(self) -> bool:
         """Make the directory again if it was removed, with this object's entries; return whether it was removed."""
-        names = self._names
-        if names.fd < 0 or (names.is_there() and (self.run_dir / "names").exists()):
-            return False
-        self._names = self._open()  # the old folder stays open, until it is collected, for threads that use it
-        weakref.finalize(names, os.close, names.fd)
-        for name, content in list(self._written.items()):
-            if content.startswith(_UP) or self.lookup(name) is None:
-                self._write(name, content)
-        return True
+        with self._restoring:
+            names = self._names
+            if names.fd < 0 or (names.is_there() and (self.run_dir / "names").exists()):
+                return False
+            self._names = self._open()  # the old folder stays open, until it is collected, for threads that use it
+            weakref.finalize(names, os.close, names.fd)
+            for name, content in list(self._written.items()):
+                if content.startswith(_UP) or self.lookup(name) is None:
+                    self._write(name, content)
+            return True
 
     def touch(self) -> None:
         """Mark all files as used now, so that no cleaner of temporary files removes them as old."""
-        for path in (self.run_dir.parent, self.run_dir, self.run_dir / "names", *self.run_dir.iterdir()):
+        paths = [self.run_dir.parent, self.run_dir, self.run_dir / "names"]
+        with contextlib.suppress(OSError):  # it was removed; restore() makes it again
+            paths.extend(self.run_dir.iterdir())
+        for path in paths:
             with contextlib.suppress(OSError):
                 os.utime(path, follow_symlinks=False)
         for name in self.names():
@@ -196,8 +202,9 @@ class Directory:
             try:
                 self._write(name, content)
             except FileNotFoundError:
-                if not (self._keeps and self.restore()):
+                if not self._keeps:
                     raise
+                self.restore()  # or another thread has restored it meanwhile
                 self._write(name, content)
 
     def _write(self, name: str, content: str) -> None:

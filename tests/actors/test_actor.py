@@ -15,6 +15,7 @@ import pykka
 import pytest
 
 from rr_actors.actors.actor import IGNORE, Actor, ExitReport, LoopActor
+from rr_actors.actors.drivers import Driver
 from rr_actors.actors.lifecycle import BATCH
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.errors import MailboxFull, StartFailed, UsageError
@@ -63,6 +64,22 @@ def test_idle_actors_hold_no_thread() -> None:
     assert [ref.ask(7) for ref in refs] == [7] * 300
     workers = current().workers  # type: ignore[union-attr]
     assert workers.threads < 10
+
+
+def test_an_actor_that_cannot_begin_answers_what_it_was_asked_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    replies: list[Any] = []
+
+    def refuse(_driver: Driver) -> None:
+        [ref] = pykka.ActorRegistry.get_by_class(Echo)
+        replies.append(ref.ask("early", block=False))
+        raise MailboxFull("no thread is free")
+
+    monkeypatch.setattr(Driver, "start", refuse)
+    with pytest.raises(MailboxFull):
+        Echo.start()
+    [reply] = replies
+    with pytest.raises(pykka.ActorDeadError, match="stopped before handling"):
+        reply.get(timeout=5)
 
 
 def test_with_the_last_actor_the_loop_and_its_threads_are_gone() -> None:

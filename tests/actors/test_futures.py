@@ -158,6 +158,46 @@ def test_what_map_and_join_return_can_be_waited_for_and_calls_back(ref: rr.Actor
     assert fresh.exception() is None
 
 
+@pytest.mark.parametrize(
+    "error",
+    [rr.UsageError("set"), TimeoutError("set"), pykka.Timeout("set"), concurrent.futures.CancelledError("set")],
+    ids=repr,
+)
+def test_an_exception_that_was_set_is_returned_through_map(error: Exception) -> None:
+    source: Reply[int] = Reply()
+    mapped: Any = source.map(lambda value: value + 1)
+    source.set_exception(error)
+    assert mapped.exception() is error
+
+
+def test_exception_of_what_map_returns_raises_what_hinders_the_wait() -> None:
+    mapped: Any = Reply[int]().map(lambda value: value + 1)
+    with pytest.raises(rr.UsageError, match="expected seconds"):
+        mapped.exception(timeout=-1)
+    with pytest.raises(TimeoutError, match="no reply after"):
+        mapped.exception(timeout=0.01)
+
+
+def test_ctrl_c_while_exception_waits_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    source: Reply[int] = Reply()
+    mapped: Any = source.map(str)
+
+    def interrupted(_timeout: float | None) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(source, "_wait", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        mapped.exception()
+
+
+def test_exception_of_what_map_returns_raises_a_ring_of_asks() -> None:
+    ref = Worker.start()
+    asked: Any = ref.ask(lambda me: me.actor_ref.ask(1, block=False).map(str).exception(), block=False)
+    with pytest.raises(rr.UsageError, match="asks itself"):
+        asked.get(timeout=LIMIT_S)
+    ref.stop()
+
+
 def test_a_cancelled_load_is_withdrawn(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
     served = serve(provider, "slow", load=gate)
     future: Any = app.load("provider/slow", "x", block=False)

@@ -6,6 +6,7 @@ import functools
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -451,6 +452,27 @@ def test_a_line_whose_registrar_answers_and_closes_is_lost_after_the_answer(
     line.close()
     assert line.exchange(Unload("q", "app"), 10) == Unloaded("q")
     line.send(Unloaded("late"))
+
+
+def test_opening_a_connection_and_the_exchange_have_one_time_limit(
+    buyer: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take, exchange, limits = ThreadConnections.take, BlockingLink.exchange, Calls()
+
+    def take_slowly(connections: Any, limit_s: float | None) -> Any:
+        time.sleep(0.2)
+        return take(connections, limit_s)
+
+    def note(line: BlockingLink, message: Any, limit_s: float | None) -> Any:
+        limits(limit_s)
+        return exchange(line, message, limit_s)
+
+    monkeypatch.setattr(ThreadConnections, "take", take_slowly)
+    monkeypatch.setattr(BlockingLink, "exchange", note)
+    query = buyer.load("shop/thing", Order("second"), timeout_s=10)
+    query.unload(timeout_s=10)
+    assert len(limits) == 2
+    assert max(limits) <= 9.8
 
 
 # -- what is in the catalog ------------------------------------------------------------------------------------------

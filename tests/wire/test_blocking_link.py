@@ -122,9 +122,9 @@ def test_writing_and_waiting_have_one_time_limit(
     limits: list[float | None] = []
     receive = line._receive_soon  # pyright: ignore[reportPrivateUsage]
 
-    def note(limit_s: float | None) -> bytes:
+    def note(limit_s: float | None, began: float) -> bytes:
         limits.append(limit_s)
-        return receive(limit_s)
+        return receive(limit_s, began)
 
     monkeypatch.setattr(line, "_receive_soon", note)
     began = time.monotonic()
@@ -135,6 +135,22 @@ def test_writing_and_waiting_have_one_time_limit(
     assert first is not None
     assert time.monotonic() - began - 20.0 <= first <= 19.9
     assert second is None
+
+
+def test_the_beginning_and_the_rest_of_an_answer_have_one_time_limit(peer: Peer, line: BlockingLink) -> None:
+    goes_on = threading.Event()
+
+    def answer_the_beginning(link: Link, _message: Note) -> None:
+        time.sleep(0.5)
+        peer.echo(link, LONG)  # as much as the kernel takes
+        goes_on.wait(20)
+
+    peer.answer = answer_the_beginning
+    began = time.monotonic()
+    with pytest.raises(TimeoutError):
+        line.exchange(SHORT, 0.8)
+    goes_on.set()
+    assert time.monotonic() - began < 1.2
 
 
 @pytest.mark.parametrize("message", [SHORT, LONG], ids=["waits", "writes"])

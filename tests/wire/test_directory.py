@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import stat
 import subprocess
 import sys
 import textwrap
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +20,8 @@ import pytest
 from rr_actors.base.errors import CatalogLocked, ConfigError, InvalidName, UsageError
 from rr_actors.tools.inspection import read_state
 from rr_actors.wire.name_service import Directory, Entry, StateDir, Status, actor_key, open_state_dir, registrar_key
+from support import Calls
+from support_asks import Background
 
 
 @pytest.fixture
@@ -143,6 +147,34 @@ def test_publishing_in_a_directory_that_was_removed_is_a_config_error_naming_it(
     assert directory.names() == []
 
 
+def test_marking_files_as_used_when_the_directory_was_removed_does_nothing(tmp_path: Path) -> None:
+    directory = Directory(tmp_path / "run")
+    shutil.rmtree(directory.run_dir)
+    directory.touch()
+    assert not directory.run_dir.exists()
+
+
+def test_two_threads_that_miss_the_directory_at_once_make_it_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = Directory(tmp_path / "run", keeps=True)
+    shutil.rmtree(directory.run_dir)
+    make, made = directory._open, Calls()  # pyright: ignore[reportPrivateUsage]
+
+    def make_slowly() -> object:
+        made()
+        time.sleep(0.2)
+        return make()
+
+    monkeypatch.setattr(directory, "_open", make_slowly)
+    other = Background(directory.restore)
+    made.wait()
+    directory.publish("r.cameras", "here")
+    other.result(timeout=10)
+    assert len(made) == 1
+    assert directory.lookup("r.cameras") == Entry(Status.UP, "here")
+
+
 def test_keys_of_registrars_and_actors_do_not_collide_and_are_checked() -> None:
     assert registrar_key("cameras") == "r.cameras"
     assert actor_key("root/cameras") == "a.root~cameras"
@@ -161,6 +193,17 @@ def test_a_deep_path_has_a_key_of_its_own_that_fits_a_file_name(directory: Direc
         assert len(key) < 250
         directory.publish(key, "x")
         assert directory.lookup(key) == Entry(Status.UP, "x")
+
+
+def test_no_entry_is_longer_than_any_file_system_allows(directory: Directory) -> None:
+    classes = [f"robots.cameras.Camera{number}" for number in range(200)]
+    directory.put_classes("cameras", classes)
+    directory.mark(registrar_key("cameras"), Status.STOPPED, "why " * 1000)
+    names = directory.run_dir / "names"
+    assert max(len(os.fsencode(os.readlink(path))) for path in names.iterdir()) <= 1023  # XFS
+    kept = directory.manager_classes()["cameras"]
+    assert kept == classes[: len(kept)]
+    assert len(kept) > 20
 
 
 def test_readers_see_the_old_entry_or_the_new_and_never_none(directory: Directory) -> None:

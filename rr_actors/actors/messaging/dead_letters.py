@@ -104,7 +104,8 @@ class Office:
             count = self.count
             self._kept.extend((count - len(letters) + number, letter) for number, letter in enumerate(letters, 1))
             unlogged = self._may_log(unheard)
-            telling = letters[-self._may_tell(len(letters)) :] if self.listener is not None else []
+            told = self._may_tell(len(letters)) if self.listener is not None else 0
+            telling = letters[len(letters) - told :]
         if unlogged:
             more = f"; {unlogged} since the last such line" if unlogged > 1 else ""
             logger.warning("dead letter to %s: %s (%s)%s", to, letters[-1].message, why, more)

@@ -126,7 +126,10 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             raise TimeoutError(str(error)) from None
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
-        """Wait, and return the exception that result() would raise; None if it would return.
+        """Wait, and return the exception that was set; None if a value was set.
+
+        A future from map(), join() and the like is never cancelled itself. It returns the CancelledError of the future
+        from which it was made.
 
         Raises:
             TimeoutError, concurrent.futures.CancelledError, UsageError: as for result().
@@ -138,10 +141,20 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             if self._cancelled and self._error is not None:
                 raise self._error
             return self._error
+        limit_s = time_limit(timeout, "timeout")
         try:
-            self.result(timeout)
-        except (TimeoutError, UsageError):
+            self.get(timeout=timeout)
+        except KeyboardInterrupt:
             raise
+        except pykka.Timeout as error:
+            if limit_s is None:  # so it was set
+                return error
+            raise TimeoutError(str(error)) from None
+        except UsageError as error:
+            event_loop.check_may_block(f"waiting for {self._whose()}")
+            if "ring" in error.details:
+                raise
+            return error
         except BaseException as error:
             return error
         return None
