@@ -1,1 +1,1 @@
-"""The Resource Registrar: what people call is here; what it decides is in core, what it does in engine and links."""
+"""The Resource Registrar: its public classes are here, its decisions in core, its actions in engine and links."""

@@ -1,4 +1,4 @@
-"""Arguments: what people hand to a registrar or a system, checked, and brought into the one form used inside."""
+"""Arguments: check what callers give to a registrar or a system, and bring it into one form."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from rr_actors.wire.name_service import Directory
 
 
 def server_target(server: object, directory: Directory) -> ServerId:
-    """As parse_server(); also of the method that declares a server.
+    """Return a server's id as parse_server() does, also for the method that declares it.
 
     Raises:
-        InvalidName: it is neither.
-        UnknownRegistrar, UsageError: not exactly one child of the system is of the class that declares it.
+        InvalidName: `server` is neither.
+        UnknownRegistrar, UsageError: none or several of the system's children have the declaring class.
     """
     return parse_server(id_in(cast("Declared[Any, Any, Any]", server), directory) if is_a(server, Declared) else server)
 
 
 def codec_for(response_type: Any) -> Codec:
-    """The codec that reads responses of a type.
+    """Return the codec that reads responses of a type.
 
     Raises:
-        NotSerializable: no values of that type can travel.
+        NotSerializable: values of that type cannot travel.
     """
     try:
         return _codec_for(response_type)
-    except TypeError:  # it has no hash: Annotated with a list, say
+    except TypeError:  # the type has no hash: Annotated with a list, say
         return Codec(response_type, _RESPONSE)
 
 
@@ -51,10 +51,10 @@ _codec_for = functools.lru_cache(256)(functools.partial(Codec, what=_RESPONSE))
 def status_callback(
     callback: Callable[..., Any] | None, who: str, field: str = "on_status"
 ) -> Callable[..., Any] | None:
-    """A callback for statuses as a function of our own; None for none.
+    """Return a function that calls a user's status callback; None for None.
 
     Raises:
-        UsageError: it cannot be called, or not with a status alone.
+        UsageError: `callback` cannot be called with a status alone.
     """
     if callback is None:
         return None
@@ -68,10 +68,10 @@ def status_callback(
 
 
 def target_id(target: object) -> str:
-    """The id of a query or a resource, or what is given as one.
+    """Return the id of a query or a resource; a text is an id already.
 
     Raises:
-        UsageError: it is nothing of these.
+        UsageError: `target` is none of these.
     """
     if is_a(target, (Query, ResourceInfo)):
         return cast("Query | ResourceInfo", target).id
@@ -81,7 +81,7 @@ def target_id(target: object) -> str:
 
 
 def resource_target(target: object) -> str:
-    """As target_id(); a query stands for its resource also when its own holder has left."""
+    """Return an id as target_id() does; for a query its resource's, valid also when the holder has left."""
     return cast("Query", target).resource_id if is_a(target, Query) else target_id(target)
 
 
@@ -89,10 +89,10 @@ def resource_target(target: object) -> str:
 
 
 def state_path(state_dir: object) -> Path:
-    """The state directory; "~" at its beginning is the user's home.
+    """Return the path of the state directory; "~" at its beginning is the user's home.
 
     Raises:
-        ConfigError: it is no path.
+        ConfigError: `state_dir` is no path.
     """
     text = path_text(state_dir)
     if text and "\0" not in text and has_home(text):
@@ -101,10 +101,10 @@ def state_path(state_dir: object) -> Path:
 
 
 def system_config(config: object) -> SystemConfig:
-    """The configuration; the default one for None.
+    """Return the configuration, or the default one for None.
 
     Raises:
-        ConfigError: it is no SystemConfig.
+        ConfigError: `config` is no SystemConfig.
     """
     if config is None:
         return SystemConfig()
@@ -119,10 +119,10 @@ def _wrong(key: str, expected: str, got: object) -> ConfigError:
 
 
 def stop_limit(timeout_s: object) -> float:
-    """The seconds that a stop may take.
+    """Return the seconds that a stop may take.
 
     Raises:
-        UsageError: it is no such number.
+        UsageError: `timeout_s` is no number of 0 or more.
     """
     if is_a(timeout_s, (int, float)) and not is_a(timeout_s, bool):
         seconds = exact_number(cast("float", timeout_s))
@@ -132,13 +132,13 @@ def stop_limit(timeout_s: object) -> float:
 
 
 def check_text(value: object, expected: str) -> str:
-    """The value.
+    """Return the value, which must be text.
 
     Args:
-        expected: what to say if it is no text.
+        expected: how the error's text begins.
 
     Raises:
-        UsageError: it is none.
+        UsageError: the value is no text.
     """
     if is_a(value, str):
         return exact_text(cast("str", value))

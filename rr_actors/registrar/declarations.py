@@ -1,4 +1,4 @@
-"""Declarations: the decorator by which a Manager's method declares a server, and what it makes of the method."""
+"""Declarations: the decorator with which a Manager's method declares a server, and the object that results."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ class server:  # noqa: N801 - used as a decorator
     @overload
     def __call__(self, load: Callable[[Any, Request], Response]) -> Declared[Request, Response, Response]: ...
     def __call__(self, load: Callable[[Any, Any], Any]) -> Declared[Any, Any, Any]:
-        """Take the load callback.
+        """Return the declaration of the server whose load callback is the decorated method.
 
         Raises:
-            InvalidSpec: it is no function.
+            InvalidSpec: the decorated object cannot be called.
         """
         if not callable(load):
             expected = "a method to decorate"
@@ -113,15 +113,15 @@ class Declared(Generic[Request, Returned, Response]):
         return self._name
 
     def unload(self, callback: F) -> F:
-        """Take the unload callback: ``(self, request, response)``."""
+        """Declare a method as the unload callback: ``(self, request, response)``."""
         return self._take("unload", callback)
 
     def status(self, callback: F) -> F:
-        """Take the status callback: ``(self, request, status)``."""
+        """Declare a method as the status callback: ``(self, request, status)``."""
         return self._take("status", callback)
 
     def recover(self, callback: F) -> F:
-        """Take the recover callback: ``(self, request, response) -> response``."""
+        """Declare a method as the recover callback: ``(self, request, response) -> response``."""
         return self._take("recover", callback)
 
     def _take(self, role: str, callback: F) -> F:
@@ -132,7 +132,7 @@ class Declared(Generic[Request, Returned, Response]):
         if role in self._others:
             raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
         name = callback.__name__
-        if name == self._load.__name__:  # as one is used to from properties
+        if name == self._load.__name__:  # a property's setter has the name of its getter; here it must differ
             expected = f"a method of another name than {name!r}, the load callback, which it would replace"
             text = f"server {self.name!r}: {role}: expected {expected}"
             raise InvalidSpec(text, field=role, expected=expected, got=name)
@@ -154,7 +154,7 @@ class Declared(Generic[Request, Returned, Response]):
         return of_subclass
 
     def _spec_for(self, manager: object) -> ServerSpec:
-        """Return the server of one manager, its callbacks bound to it. A subclass's method overrides by its name."""
+        """Return the spec of one manager's server. Its callbacks are bound; a subclass may override all but `load`."""
         roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
         load = functools.partial(self._load, manager)
         request_type, response_type = self._types
@@ -163,11 +163,11 @@ class Declared(Generic[Request, Returned, Response]):
         )
 
     def _id_in(self, directory: Directory) -> str:
-        """Return "registrar/server": the registrar is the one child of the system that is of the class.
+        """Return "registrar/server". The registrar is that of the one child of the system that has the declaring class.
 
         Raises:
-            UnknownRegistrar: no child is of that class.
-            UsageError: several are.
+            UnknownRegistrar: no child has that class.
+            UsageError: several children have it.
         """
         owner = self._owner
         if owner is None:
@@ -185,23 +185,23 @@ class Declared(Generic[Request, Returned, Response]):
         raise UsageError(f"{what}: {len(alive)} children of this system are a {owner.__name__}: name one: {names}")
 
 
-# For the package's own modules: people who complete a name see nothing of it.
+# For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
 id_in = Declared[Any, Any, Any]._id_in  # pyright: ignore[reportPrivateUsage]
 
 
 def says_recovery(declared: Declared[Any, Any, Any]) -> bool:
-    """Return whether its author has chosen what becomes of its resources when its manager is respawned."""
+    """Return whether the declaration says what becomes of the server's resources when its manager is respawned."""
     return declared._says_recovery  # pyright: ignore[reportPrivateUsage] - same file
 
 
 def class_name(cls: type) -> str:
-    """Return by what the directory names a manager's class."""
+    """Return the name of a manager's class in the directory."""
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
 def class_names(cls: type) -> list[str]:
-    """Return the names of a manager's class and of those that it is derived from."""
+    """Return the names of a manager's class and of its base classes."""
     return [class_name(base) for base in cls.__mro__ if base is not object]
 
 
@@ -217,7 +217,7 @@ def _bound(manager: object, callback: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _without_self(load: Callable[..., Any]) -> Callable[..., Any]:
-    """`load` as it is seen on an instance: its annotations are read from its second parameter on."""
+    """Return a callback without its `self`, so that its annotations are read from the second parameter on."""
     return functools.partial(load, None)
 
 

@@ -1,7 +1,7 @@
-"""Groups: loads that are held together or not at all, and the queries that come of them.
+"""Groups of loads: either all of a group are held, or none is; and the queries that a group results in.
 
-All are asked for at once. When one fails, those that are held are released and the others are withdrawn; then the
-caller hears of the first failure.
+All loads of a group begin at once. When one fails, the held ones are released, and the others are withdrawn. Then the
+caller gets the first error.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from rr_actors.runtime.shielding import Flag, shielded
 
 
 class Queries(tuple[Query, ...]):
-    """What load_all() holds, in the order of the requests. As a context manager it unloads all of them at the end."""
+    """The queries of load_all(), in the order of the requests. As a context manager it unloads them at the end."""
 
     __slots__ = ()
 
     def unload(self, *, timeout_s: float | None = 30.0) -> None:
-        """Release all that are still held, newest first, and return when that is done.
+        """Release all queries that are still held, newest first, and return when that is done.
 
         Args:
-            timeout_s: seconds to wait for each of them, if its provider is down.
+            timeout_s: seconds to wait for each query, if its provider is down.
 
         Raises:
             RrError: the first error that Query.unload() raised, after all have been tried; the others are its notes.
@@ -58,7 +58,7 @@ class Queries(tuple[Query, ...]):
 
 
 class Wanted(NamedTuple):
-    """One of the requests: checked, and ready to be sent."""
+    """One request of a group, checked and ready to be sent."""
 
     server: ServerId
     request: bytes
@@ -66,7 +66,7 @@ class Wanted(NamedTuple):
 
 
 def wanted(requests: Iterable[tuple[str, Any]]) -> list[Wanted]:
-    """Return the requests, checked.
+    """Return the requests of a group, checked and ready to be sent.
 
     Raises:
         UsageError, InvalidName, NotSerializable: one of them is no pair of a server and a request that can be sent.
@@ -109,7 +109,7 @@ class _Group:
         self._replies: list[Reply[Query]] = []
 
     def ask(self, parent: str, on_status: StatusCallback | None) -> None:
-        """Ask for all of them."""
+        """Begin all loads of the group."""
         for server, request, _ in self._requests:
             self._replies.append(self._loads.future(server, request, parent, on_status, self._timeout_s))
             self._replies[-1].add_done_callback(self._ended)
@@ -119,16 +119,16 @@ class _Group:
             self._settled()
 
     def failed(self) -> tuple[int, RrError] | None:
-        """Return the first request that has failed, by its place, and its error; None: all are held."""
+        """Return the place and error of the first load that failed, or None."""
         errors = map(_error_of, self._replies)
         return next(((place, error) for place, error in enumerate(errors) if error is not None), None)
 
     def queries(self) -> Queries:
-        """Return what is held."""
+        """Return the queries of the group, once all loads have succeeded."""
         return Queries(reply.get() for reply in self._replies)
 
     def undo(self) -> list[Reply[None]]:
-        """Release what is held, newest first, and withdraw the rest; return what waits for the releases."""
+        """Release the held queries, newest first, and withdraw the other loads; return the futures of the releases."""
         undone: list[Reply[None]] = []
         while self._replies:
             reply = self._replies.pop()
@@ -138,7 +138,7 @@ class _Group:
         return undone
 
     def error(self, failed: tuple[int, RrError], undone: Sequence[Reply[None]]) -> RrError:
-        """Return the error, which says whose it is, and what could not be released. Waits for all of `undone`."""
+        """Return the error, with notes that name its request and what was not released. Wait for all of `undone`."""
         place, error = failed
         server, _, request = self._requests[place]
         error.add_note(f"load_all: request {place + 1} of {len(self._requests)}, {server} with {request}")
@@ -147,14 +147,14 @@ class _Group:
             try:
                 reply.get()
             except UnknownQuery:
-                continue  # its provider has taken it away meanwhile
+                continue  # the provider has released the query meanwhile
             except RrError as refusal:
                 errors.append(refusal)
         return with_notes(errors)
 
 
 def _error_of(load: Reply[Query]) -> RrError | None:
-    """Return how a load has failed; None: it is held, withdrawn, or still loading."""
+    """Return the error of a load that has failed; None if it is held, withdrawn, or still loading."""
     return cast("RrError | None", load.exception()) if load.done() and not load.cancelled() else None
 
 
@@ -166,10 +166,10 @@ def wait(
     on_status: StatusCallback | None,
     timeout_s: float | None,
 ) -> Queries:
-    """Load all, and return when they are held.
+    """Load all requests, and return their queries when all are held.
 
     Raises:
-        RrError: how the first of them failed; none is held.
+        RrError: the error of the first load that failed; nothing is held.
     """
     if not requests:
         return Queries()
@@ -183,7 +183,7 @@ def wait(
         if failed is None:
             return group.queries()
         raise group.error(failed, shielded(group.undo))
-    except BaseException:  # KeyboardInterrupt, say: nobody will hold them
+    except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
         group.undo()
         raise
 
@@ -196,10 +196,10 @@ async def result(
     on_status: StatusCallback | None,
     timeout_s: float | None,
 ) -> Queries:
-    """As wait(), awaited on whatever loop this runs. Cancelled, it releases and withdraws all.
+    """Load all requests as wait() does, awaited on any event loop. If it is cancelled, nothing stays held.
 
     Raises:
-        RrError: how the first of them failed; none is held.
+        RrError: the error of the first load that failed; nothing is held.
     """
     if not requests:
         return Queries()
@@ -209,7 +209,7 @@ async def result(
     def settle() -> None:
         try:
             loop.call_soon_threadsafe(settled.set)
-        except RuntimeError:  # closed, with the task that waited
+        except RuntimeError:  # the event loop is closed, with the task that waited
             group.undo()
 
     group = _Group(loads, unloads, requests, timeout_s, settle)

@@ -1,7 +1,7 @@
-"""Loads and unloads: how each leaves the thread that asks for it, and how its end comes back.
+"""Loads and unloads: how the calling thread sends each one, and how the result comes back.
 
-Three ways to wait (in the thread, by a future, awaited) and two to go: by the registrar's actor, and, for a thread that
-waits, by a connection of its own (links/provider_link.py). No call waits for ever, and none waits on the loop.
+A caller waits in its thread, by a future, or by `await`. The registrar's actor sends the load or unload. For a thread
+that waits, the thread itself sends it, on a connection of its own (links/provider_link.py). No call waits on the loop.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from rr_actors.wire.transport import Exchange
 T = TypeVar("T")
 
 CALL_TIMEOUT_S = 30.0
-"""How long the loop may take for what it only has to look up."""
+"""Seconds for which a thread waits until the loop has answered a short call."""
 GRACE_S = 5.0
-"""How long, after a time limit, for the loop to say how it ended."""
+"""Seconds for which a thread waits, after a time limit, until the loop says how the call has ended."""
 
 
 class Wait:
-    """One thread waiting for one thing that the loop does."""
+    """The wait of one thread until the loop has done one task."""
 
     __slots__ = ("_lock", "done", "error", "value")
 
@@ -64,13 +64,13 @@ class Wait:
         self.error: BaseException | None = None
 
     def load_ended(self, _held: Held | None, error: RrError | None) -> None:
-        """How a load ended."""
+        """Note how the load ended, and wake the thread that waits."""
         self.error = error
         self.done = True
         self._lock.release()
 
     def run(self, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
-        """Run fn on the loop, for the thread that waits."""
+        """Run fn on the loop, and wake the thread that waits."""
         try:
             self.value = fn(*args)
         except Exception as error:
@@ -79,12 +79,12 @@ class Wait:
         self._lock.release()
 
     def done_within(self, timeout_s: float | None) -> bool:
-        """Wait; whether it is done."""
+        """Wait at most `timeout_s` seconds, and return whether the task is done."""
         return self._lock.acquire(timeout=-1 if timeout_s is None else max(0.0, timeout_s))
 
 
 class Calls:
-    """Calls to one registrar's actor."""
+    """The calls of any thread to one registrar's actor."""
 
     def __init__(self, actor: RegistrarActor) -> None:
         self.actor = actor
@@ -95,30 +95,30 @@ class Calls:
         """Raise if the registrar is closed.
 
         Raises:
-            RegistrarDown: it is.
+            RegistrarDown: the registrar is closed.
         """
         if self.actor.closed:
             raise self.actor.down()
 
     def check_may_wait(self) -> None:
-        """Raise if the calling thread is in the middle of a decision: a finalizer, which the garbage collector runs.
+        """Raise if the calling thread is in a finalizer that the garbage collector runs in the middle of a decision.
 
         Raises:
-            UsageError: it is.
+            UsageError: the thread is deciding.
         """
         if is_deciding():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
 
     def post(self, command: Any) -> None:
-        """Give the actor a command."""
+        """Give the actor a command, and do not wait."""
         self.dispatcher.call(self.actor.post, command)
 
     def call(self, fn: Callable[..., T], *args: Any) -> T:
         """Run fn on the loop and return what it returns.
 
         Raises:
-            RegistrarDown: closed. Unavailable: the loop does not answer.
+            RegistrarDown: the registrar is closed. Unavailable: the loop does not answer.
             Exception: what fn raised.
         """
         self.check_open()
@@ -137,7 +137,7 @@ class Calls:
         """Call a method of another registrar of the system, wherever it runs.
 
         Raises:
-            RrError: what it raised, or that it is not there.
+            RrError: the method raised it, or the other registrar cannot be reached.
         """
         node = self.actor.node
         here = node.registrars.get(registrar)
@@ -146,25 +146,25 @@ class Calls:
         return self.finish(node.handle(registrar).call(method, args, {}), CALL_TIMEOUT_S, f"{method} of {registrar!r}")
 
     def start(self, begin: Callable[[Callable[[RrError | None], None]], None]) -> Reply[None]:
-        """Have begin(done) called on the loop; the reply is set by done(error)."""
+        """Have begin(done) called on the loop, and return a reply, which done(error) sets."""
         future: Reply[None] = Reply()
         self.dispatcher.call(begin, functools.partial(settle, future))
         return future
 
     def command(self, command: Callable[[Any], Any], what: str) -> None:
-        """Give the actor a command made with a ticket, and wait for its answer.
+        """Give the actor a command, and wait for its answer. `command` makes it of a function that takes the answer.
 
         Raises:
-            RrError: what it was answered with.
+            RrError: the answer is this error.
         """
         self.check_open()
         self.finish(self.start(lambda done: self.actor.post(command(done))), CALL_TIMEOUT_S, what)
 
     def finish(self, future: Reply[Any], timeout_s: float | None, what: str, grace_s: float = 0.0) -> Any:
-        """Wait for the reply, for `grace_s` longer if the loop says after `timeout_s` how it ends.
+        """Return the reply's value. Wait `timeout_s`, and `grace_s` more for the loop to say how the call ended.
 
         Raises:
-            Unavailable: it took too long. RrError: what the reply was set with.
+            Unavailable: no reply came in time. RrError: the reply was set with this error.
         """
         self.check_may_wait()
         try:
@@ -174,7 +174,7 @@ class Calls:
 
 
 def settle(future: Reply[Any], error: Exception | None, value: Any = None) -> None:
-    """Set the reply as a waiter hears how something ended."""
+    """Set the reply with the error, or with the value if there is no error."""
     future.set(value) if error is None else fail(future, error)
 
 
@@ -186,9 +186,9 @@ def with_notes(errors: Sequence[RrError]) -> RrError:
 
 
 class Together:
-    """The reply of many calls, set when all have ended; the first error is raised then, the others are its notes.
+    """The reply of many calls, set when all have ended. It raises the first error; the others are its notes.
 
-    `pending` are the calls that have not ended. On the loop.
+    `pending` has the names of the calls that have not ended. On the loop.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -199,7 +199,7 @@ class Together:
             self.reply.set()
 
     def ended(self, name: str, error: RrError | None) -> None:
-        """How one of them ended."""
+        """Note how one of the calls ended; after the last one, set the reply."""
         del self.pending[name]
         if error is not None:
             self._errors.append(error)
@@ -214,7 +214,7 @@ Ended = Callable[[Held | None, RrError | None], None]
 
 
 def _recorded(actor: RegistrarActor, line: Exchange, provider: str, message: Message, timeout_s: float | None) -> Any:
-    """As `line.exchange`; both messages are recorded."""
+    """Send a message and return the answer, as `line.exchange` does, and record both."""
     recorder = actor.node.recorder
     recorder.message("sent", actor.name, provider, message)
     answer = line.exchange(message, timeout_s)
@@ -242,10 +242,11 @@ class Loads:
         hearer: Hearer | None = None,
         query_id: str = "",
     ) -> Query:
-        """Load, and return when it is held. `hearer` is called in this thread; with one, the loop sends the load.
+        """Load a resource, and return its query when the resource is held.
 
         Args:
-            query_id: that of a part that an interrupted run may have asked for already.
+            hearer: called in this thread. With one, the loop sends the load.
+            query_id: the id of a part that an interrupted run of a callback may have asked for already.
 
         Raises:
             RrError: how the load ended.
@@ -265,7 +266,7 @@ class Loads:
                 self._await_end(wait, query, timeout_s, timeout_s)
         except RrError:
             raise
-        except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
             self._withdraw(query)
             raise
         return query
@@ -289,7 +290,7 @@ class Loads:
         timeout_s: float | None,
         hearer: Hearer | None = None,
     ) -> Reply[Query]:
-        """Load, and return a future of the query at once. `hearer` is called in a worker."""
+        """Begin a load, and return a future of its query at once. A worker calls `hearer`."""
         future: Reply[Query] = Reply()
         query = self.views.new(new_id(), target, request, parent)
 
@@ -297,7 +298,7 @@ class Loads:
             settle(future, error, query)
             if hearer is not None:
                 self.actor.listeners.forget(query.id)
-                with contextlib.suppress(Unavailable):  # the registrar's threads end, and what they draw with them
+                with contextlib.suppress(Unavailable):  # the registrar's workers have ended, and the bar with them
                     self.actor.workers.serial(("progress", query.id), hearer.close)
 
         try:
@@ -308,7 +309,7 @@ class Loads:
             self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
         except RrError:
             raise
-        except BaseException:  # KeyboardInterrupt, say: nobody will get it
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the future
             self._withdraw(query)
             raise
         return future
@@ -322,7 +323,7 @@ class Loads:
         timeout_s: float | None,
         hearer: Hearer | None = None,
     ) -> Query:
-        """Load, awaited on whatever loop this runs. Cancelled, it withdraws the load. `hearer` is called on that loop.
+        """Load a resource, awaited on any event loop, which calls `hearer`. If it is cancelled, the load is withdrawn.
 
         Raises:
             RrError: how the load ended.
@@ -340,7 +341,7 @@ class Loads:
         def ended(_held: Held | None, error: RrError | None) -> None:
             try:
                 loop.call_soon_threadsafe(settle, error)
-            except RuntimeError:  # closed, with the task that waited
+            except RuntimeError:  # the event loop is closed, with the task that waited
                 self._withdraw(query)
 
         if hearer is not None:
@@ -348,7 +349,7 @@ class Loads:
         self.calls.dispatcher.call(self._begin, query, ask, ended, timeout_s)
         try:
             await future
-        except BaseException:  # cancelled, or KeyboardInterrupt on the caller's loop, say
+        except BaseException:  # cancelled, or for instance KeyboardInterrupt on the caller's loop
             self._withdraw(query)
             raise
         finally:
@@ -364,7 +365,7 @@ class Loads:
             self.views.listen(query.id, on_status)
 
     def _withdraw(self, query: Query) -> None:
-        """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
+        """Withdraw a load for which no caller waits any more, at any stage: asked for, loading, or held."""
         with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
             self.calls.dispatcher.call(self._withdraw_now, query)
 
@@ -376,16 +377,16 @@ class Loads:
             self.actor.post(c.GiveUp(query.id, Failure("LoadError", text, {"server": server}), unheard=True))
 
     def _ask(self, query: Query, request: bytes) -> c.Ask:
-        """The command for the loop."""
+        """Return the command with which the loop asks for the load."""
         seq = next(self.actor.sequence)
         return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
 
     def _begin(self, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
-        """Load by the registrar's actor. On the loop.
+        """Have the registrar's actor load the resource. On the loop.
 
         Args:
-            ended: called when that has ended.
-            timeout_s: seconds after which it is withdrawn; None: the one that waits looks to that.
+            ended: called when the load has ended.
+            timeout_s: seconds after which the load is withdrawn; None: the thread that waits does that.
         """
 
         def resolved(held: Held | None, error: RrError | None) -> None:
@@ -418,7 +419,7 @@ class Loads:
     # -- directly ------------------------------------------------------------------------------------------------
 
     def _directly(self, query: Query, request: bytes, timeout_s: float | None) -> bool:
-        """Load by a connection of this thread's own; False: the loop is to do it.
+        """Load on a connection of this thread's own. Return False if the loop has to load instead.
 
         Raises:
             RrError: how the load ended.
@@ -429,10 +430,10 @@ class Loads:
         if connections is None:
             return False
         line: Exchange | None = None
-        over: list[RrError] = []  # how the loop has ended this load, if it has: at any moment
+        over: list[RrError] = []  # with the error, once the loop has ended this load; at any moment
 
         def ended(_held: Held | None, error: RrError | None) -> None:
-            if error is not None and line is not None:  # one that ended well is answered on the line, too
+            if error is not None and line is not None:  # a load that succeeded is answered on the connection, too
                 over.append(error)
                 connections.cut(line)
 
@@ -457,7 +458,7 @@ class Loads:
             command = c.SendAgain(query.id)
         except NotSerializable as error:
             command = c.GiveUp(query.id, failure_of(error), unheard=True)
-        except BaseException:  # KeyboardInterrupt, say: anywhere
+        except BaseException:  # such as KeyboardInterrupt, which may come anywhere
             connections.drop_mine()
             raise
         else:
@@ -478,22 +479,22 @@ class Loads:
         return True
 
     def _not_held(self, query: Query, answer: Loaded | LoadRefused) -> c.Command:
-        """Return what the loop is to do about an answer: it was refused, or this thread cannot take it up.
+        """Return the loop's command after an answer that refuses the load, or that this thread could not store.
 
         Raises:
-            RrError: how the load has failed, if nobody else knows of it.
+            RrError: the load was refused, and the loop does not know of it.
         """
         actor, id = self.actor, query.id
         if isinstance(answer, Loaded):
             return c.Got(id, answer.resource_id, answer.response)
         if not actor.forget_refused(id):
-            # The loop may have sent it again: it is withdrawn, on disk, before anybody hears.
+            # The loop may have sent the load again. It is withdrawn, on disk, before the caller hears the error.
             return c.GiveUp(id, answer.failure, unheard=True)
         self.views.forget(id)
         raise error_of(answer.failure)
 
     def _go_on(self, query: Query, command: c.Command, left_s: float | None, timeout_s: float | None) -> None:
-        """Have the registrar's actor go on with the load, or end it, and wait for that."""
+        """Have the registrar's actor go on with the load, or end it, and wait until the load has ended."""
         wait = Wait()
 
         def ended(held: Held | None, error: RrError | None) -> None:
@@ -504,12 +505,12 @@ class Loads:
         self.calls.dispatcher.call(self.actor.go_on_loading, query.id, ended, command)
         if isinstance(command, c.GiveUp):
             wait.done_within(GRACE_S)
-            raise wait.error or error_of(command.failure)  # the disk is full: it is withdrawn when there is room
+            raise wait.error or error_of(command.failure)  # the disk is full: the loop withdraws the load later
         self._await_end(wait, query, left_s, timeout_s)
 
 
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
-    """Why a load is withdrawn that has taken too long, and what its provider seems to be doing."""
+    """Return the failure of a load that has taken too long. Its text says what the provider seems to be doing."""
     server = f"{query.registrar}/{query.server}"
     status, doing = _doing(actor, query.registrar, "load callback, or the unload callback before it,")
     text = f"{server}: not loaded within {timeout_s:g} s; {query.registrar} is {doing}; the load is withdrawn"
@@ -517,7 +518,10 @@ def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> F
 
 
 def _doing(actor: RegistrarActor, provider: str, callback: str) -> tuple[Status, str]:
-    """What a provider that has not answered is, as the directory says. `callback`: what may hold up one that is up."""
+    """Return the directory's status of a provider that has not answered, and words for the status.
+
+    `callback` names the callbacks for which a provider that is up may keep the caller waiting.
+    """
     entry = actor.node.find(provider)
     if entry is None:
         return Status.GONE, _DOING[Status.GONE]
@@ -536,9 +540,9 @@ _DOING = {
 
 # -- unloads -----------------------------------------------------------------------------------------------------------
 #
-# One query goes by the registrar's actor, or, for a thread that waits, by a connection of its own: the thread writes
-# that the release is owed, asks the provider, and forgets the query (engine/monitor.py). A thread that waits for a
-# provider that is down hears so when its time is up; the release stays owed, on disk, until the provider is back.
+# The registrar's actor releases a query; or a thread that waits does so, on a connection of its own. The thread writes
+# that the release is owed, asks the provider, and forgets the query (engine/monitor.py). If the provider is down, the
+# thread hears so when its time is up. The release stays owed, on disk, until the provider is back.
 
 
 Release = Callable[[str, UnloadWaiter], None]
@@ -553,7 +557,7 @@ class Unloads:
         self._views = views
 
     def wait(self, query_id: str, timeout_s: float | None) -> None:
-        """Let a query go, and return when that is done.
+        """Release a query, and return when that is done.
 
         Raises:
             RrError: how the unload ended.
@@ -569,13 +573,13 @@ class Unloads:
         self.calls.finish(reply, left_s, f"unloading {query_id}", GRACE_S)
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
-        """Let a query go, and return a future of that at once."""
+        """Begin to release a query, and return a future of its end at once."""
         reply: Reply[None] = Reply()
         self.calls.dispatcher.call(self._begin, self.release, query_id, timeout_s, timeout_s, reply)
         return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
-        """Unload a resource served here, also if it is held, and return when that is done.
+        """Unload a resource served here, even if it is held, and return when that is done.
 
         Raises:
             RrError: how the unload ended.
@@ -595,18 +599,18 @@ class Unloads:
         self.calls.finish(self.force_future(target), timeout_s, what)
 
     def force_future(self, target: str) -> Reply[None]:
-        """Unload a resource served here, also if it is held, and return a future of that at once."""
+        """Begin to unload a resource served here, even if it is held, and return a future of its end at once."""
         return self.calls.start(functools.partial(self._actor.force, target))
 
     def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        """Let every query go that is held and `wanted`, newest first; a future of when all have been tried."""
+        """Release every held query that `wanted` accepts, newest first. The future is set when all have been tried."""
         return self.calls.call(self._release_many, wanted, timeout_s)
 
     def at_server(self, server: ServerId, timeout_s: float | None) -> Reply[None]:
-        """Let every query go that is held at a server, newest first; a future of when all have been tried.
+        """Release every query that is held at a server, newest first. The future is set when all have been tried.
 
         Raises:
-            UnknownServer: nothing is held there, nor ever was.
+            UnknownServer: the registrar holds nothing at that server, and never did.
         """
         self.calls.call(self._check_client, server)
         return self.many(lambda held: (held.registrar, held.server) == server, timeout_s)
@@ -624,7 +628,7 @@ class Unloads:
     # -- directly ------------------------------------------------------------------------------------------------
 
     def _directly(self, query_id: str, timeout_s: float | None) -> bool:
-        """Let a query go by a connection of this thread's own; False: the loop is to do it.
+        """Release a query on a connection of this thread's own. Return False if the loop has to do it instead.
 
         Raises:
             RrError: how the unload ended.
@@ -652,9 +656,9 @@ class Unloads:
             connections.give_back(line)
             if type(answer) is Unloaded and not actor.forget_released(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
-        except OSError:  # TimeoutError, too: what is left of the time is nothing then
+        except OSError:  # also TimeoutError, and then no time is left
             connections.drop_mine()
-        except BaseException:  # KeyboardInterrupt, say: it is released all the same
+        except BaseException:  # such as KeyboardInterrupt: the loop goes on with the release
             connections.drop_mine()
             self.calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
             raise
@@ -684,7 +688,7 @@ class Unloads:
         release(query_id, ended)
 
     def release(self, query_id: str, done: UnloadWaiter) -> None:
-        """Let a query go by the registrar's actor; `done` hears how that ended."""
+        """Have the registrar's actor release a query, and call `done` with the error, or with None."""
         theirs = self._actor.catalog.queries.get(query_id)
         if query_id not in self._actor.catalog.held and theirs is not None and theirs.origin != self._actor.name:
             done(error_of(failures.not_holder(query_id, theirs.origin, self._actor.name)))
@@ -692,7 +696,7 @@ class Unloads:
             self._actor.release(query_id, done)
 
     def release_overdue(self, query_id: str, timeout_s: float | None) -> None:
-        """Have who waits for the unload of a query hear that its provider has not answered in time."""
+        """Send all waiters for the unload of a query the error that its provider has not answered in time."""
         actor = self._actor
         held = actor.catalog.held.get(query_id)
         if actor.closed or held is None:
@@ -707,7 +711,7 @@ class Unloads:
         actor.post(c.ReleaseOverdue(query_id, failure))
 
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        with self._actor.lock:  # meanwhile no thread lets one of them go
+        with self._actor.lock:  # meanwhile no thread releases one of them
             held = self._actor.whole().held
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             together = Together(mine)
@@ -725,4 +729,4 @@ class Unloads:
 
 
 def _no_one(_error: RrError | None) -> None:
-    """Who hears how an unload ends whose caller was interrupted."""
+    """Ignore how an unload has ended: its caller was interrupted."""

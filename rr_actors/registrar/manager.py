@@ -19,7 +19,7 @@ from rr_actors.wire.name_service import Status
 
 
 class _NotYet:
-    """Manager.registrar before there is one: the instance's own attribute comes in its place."""
+    """The class attribute Manager.registrar. It raises until the instance has an attribute of its own."""
 
     def __get__(self, instance: Manager | None, owner: type[Manager]) -> Any:
         if instance is None:
@@ -47,10 +47,10 @@ class Manager(Actor):
         The actor may be in any process. It need not run yet: the reference is to whatever runs there later.
 
         Args:
-            id: the actor's child id, or its path ("inner/models"). Of several, a child of the same supervisor is meant.
+            id: the actor's child id, or its path ("inner/models"). Of several, that of the same supervisor is meant.
 
         Raises:
-            NotFound: there is no such actor, or there are several; `.known` are the paths there are.
+            NotFound: no actor has this id, or several have it; `.known` has the paths that exist.
         """
         where = check_text(id, "ref: expected a child's id or path")
         return self._node.ref(where, self.actor_ref.path or "")
@@ -83,7 +83,7 @@ class Manager(Actor):
             raise
 
     def _register_servers(self, actor: RegistrarActor) -> None:
-        """In a worker: reading types and opening what was stored by value runs users' code."""
+        """Register the declared and the stored servers. In a worker: reading types and unpickling run users' code."""
         declared = self._declared_servers()
         for declaration in declared.values():
             register_spec(self.registrar, spec_for(declaration, self), says_recovery=says_recovery(declaration))
@@ -95,7 +95,7 @@ class Manager(Actor):
 
     @classmethod
     def _declared_servers(cls) -> dict[str, Declared[Any, Any, Any]]:
-        """The servers this class and those it is derived from declare, by name.
+        """Return the servers that this class and its base classes declare, by name.
 
         Raises:
             NameTaken: two methods declare the same name.
@@ -132,11 +132,11 @@ class Manager(Actor):
             self._node.close_registrar(self.registrar.name, status, erase=erase)
 
     def _is_mine(self) -> bool:
-        """Whether the registrar of this name is still this manager's: one that was abandoned has a successor."""
+        """Return whether this manager still owns the registrar of its name: an abandoned one may have a successor."""
         return self._node.registrars.get(self.registrar.name) is self._served
 
     def _registrar_failed(self, error: BaseException) -> None:
-        """A defect in the registrar ends the manager; its supervisor starts it again from the catalog."""
+        """Make the manager fail with its registrar's error; its supervisor then starts it again from the catalog."""
         self.actor_ref.tell(_RegistrarFailed(error))
 
     def _handle_receive(self, message: Any) -> Any:
@@ -149,7 +149,7 @@ def ref(id: str) -> ActorRef[Any]:
     """Return a reference to an actor of the system, in a load, unload, status or recover callback; see Manager.ref().
 
     Raises:
-        NotFound: there is no such actor, or there are several; `.known` are the paths there are.
+        NotFound: no actor has this id, or several have it; `.known` has the paths that exist.
         UsageError: this code does not run in a callback.
     """
     where = check_text(id, "rr.ref: expected a child's id or path")

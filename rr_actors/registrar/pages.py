@@ -1,7 +1,7 @@
-"""Pages: a few of a registrar's resources or queries at a time, as plain text, for those who look at a running system.
+"""Pages: a few of a registrar's resources or queries at a time, as plain text, for tools that show a running system.
 
-A registrar may serve 100,000 resources, and a screen shows fifty. So the process that has them picks the rows, and only
-those travel. The thread that asks lists the rows under the registrar's lock, and searches and decodes them without it.
+A registrar may serve 100,000 resources, and a screen shows fifty. So the registrar's process picks the rows, and sends
+only these. The calling thread lists the rows under the registrar's lock, and searches and decodes them without it.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from rr_actors.registrar.model.messages import readable
 from rr_actors.registrar.model.rows import Held, Phase, Resource
 
 HOLDERS_SHOWN = 20
-"""How many holders, and how many dependencies, a resource's row has; it says how many there are."""
+"""How many holders, and how many dependencies, a resource's row lists at most. It also has their total numbers."""
 _CELL = 400  # characters of a request or response
-_PREFIX = 4  # characters of an id that are enough to look for it
+_PREFIX = 4  # characters that a search for the beginning of an id needs
 _FOUND = 20
 
-_VALUE = re.compile(r"""["'{}()\[\],:]|\A[-+.\deE]+\Z""")  # more than a string's inside, or a number
+_VALUE = re.compile(r"""["'{}()\[\],:]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
 
 _Row = TypeVar("_Row", Resource, Held)
 _Found = TypeVar("_Found")
 
 
 class Wanted(msgspec.Struct, frozen=True):
-    """Which page: `limit` rows from number `offset` on, of those that have the text `match` in them.
+    """The page to return: `limit` rows from number `offset` on, of the rows that contain the text `match`.
 
-    With "id" the rows of the resource, or of the query, whose id is `match` or begins with it.
+    Responses are not searched. With "id", the rows of the resource and the query with this id or beginning of an id.
     """
 
     what: Literal["resources", "queries", "id"]
@@ -45,7 +45,7 @@ class Wanted(msgspec.Struct, frozen=True):
 
 
 class Holder(msgspec.Struct, frozen=True):
-    """A query on a resource: whose it is, and for which of its holder's own resources; "" for none."""
+    """A query on a resource, with its holder, and the holder's resource that depends on it; "" for none."""
 
     query_id: str
     origin: str
@@ -57,9 +57,9 @@ class ResourceRow(msgspec.Struct, frozen=True):
 
     Attributes:
         server: "registrar/server".
-        request, response: JSON, cut if it is long; Python's text of what JSON does not have.
+        request, response: as JSON, cut if it is long. What JSON does not have is shown as in Python.
         phase: "queued", "loading", "loaded", "unloading" or "unload_failed".
-        state, message: of its last status. While it is loading, `message` says how far that has come ("50% opening").
+        state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening").
         holders: the first 20 queries on it; `holder_count`: how many there are.
         parts: the ids of the first 20 queries that it depends on; `part_count`: how many there are.
     """
@@ -79,7 +79,7 @@ class ResourceRow(msgspec.Struct, frozen=True):
 
     @property
     def condition(self) -> str:
-        """The state of its last status; before it is loaded, and when it is not any more, its phase."""
+        """The state of the last status while the resource is loaded, else its phase."""
         return self.state if self.phase == "loaded" else self.phase
 
 
@@ -104,7 +104,7 @@ class QueryRow(msgspec.Struct, frozen=True):
 
 
 class Page(msgspec.Struct, frozen=True):
-    """The rows that were wanted, and how many there are in all."""
+    """The wanted rows, and how many rows match in all."""
 
     total: int
     resources: list[ResourceRow] = []
@@ -115,7 +115,7 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
     """Return a page of what a registrar serves or holds. From any thread.
 
     Raises:
-        RegistrarDown: it is closed.
+        RegistrarDown: the registrar is closed.
     """
     match wanted.what:
         case "resources":
@@ -131,7 +131,7 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
 
 
 def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
-    """What the reader returns of the catalog, with nothing decided meanwhile."""
+    """Return what `reader` returns of the catalog. The lock keeps all decisions out meanwhile."""
     actor.settle()
     with actor.enter():
         return reader(actor.whole())
@@ -152,7 +152,7 @@ def _chosen(rows: list[_Row], wanted: Wanted, name: str) -> tuple[list[_Row], in
 
 
 def _may_be_more_than_a_string(text: str) -> bool:
-    """Whether a text may be in a request as it is shown, and not in its bytes; to decode a request takes 5 us."""
+    """Return whether the text of a request may contain `text` though its bytes do not. To decode one takes 5 us."""
     return _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
 
@@ -163,7 +163,10 @@ def _texts(row: Resource | Held, name: str) -> tuple[str, ...]:
 
 
 def _of_id(actor: RegistrarActor, id: str) -> tuple[list[Resource], list[Held]]:
-    """The resource and the query of this id; else those whose ids begin so, or that a query of such an id is on."""
+    """Return the resource and the query of an id; else the first of those whose ids begin with it.
+
+    The id of a query that is served here stands for its resource.
+    """
 
     def exactly(catalog: Catalog) -> tuple[list[Resource], list[Held]]:
         resource, held = catalog.find(id), catalog.held.get(id)
@@ -216,7 +219,7 @@ def _query_row(name: str, row: Held) -> QueryRow:
 
 
 def text_of_value(raw: bytes | None) -> str:
-    """Return a request's or response's bytes as text: JSON where JSON has it; "" for none."""
+    """Return a request's or response's bytes as text: as JSON; "" for None."""
     if raw is None:
         return ""
     value: Any = shown_plain(raw)
@@ -226,10 +229,10 @@ def text_of_value(raw: bytes | None) -> str:
 
 
 def shortened_json(value: Any, limit: int) -> str:
-    """Return a value as JSON of at most `limit` characters; as Python shows it where JSON has no form of it."""
+    """Return a value as JSON of at most `limit` characters; what JSON does not have is shown as in Python."""
     try:
         text = msgspec.json.encode(value, enc_hook=repr).decode()
-    except Exception:  # keys that are no text, numbers that are too long, nested too deeply
+    except Exception:  # a key is no text, a number is too long, or the nesting is too deep
         text = repr(value)
     text = readable(text)
     return text if len(text) <= limit else text[: limit - 1] + "…"

@@ -1,7 +1,7 @@
 """Bars on the terminal for loads with progress=True. The one module of the registrar that needs the library rich.
 
-A terminal has one live display at a time, so all bars of the process are lines of one. It is there from the first
-report of a load until the last of those loads has ended. Where the error output is no terminal, nothing is drawn.
+A terminal has one live display at a time, so all bars of the process are lines of one. The display begins with the
+first report of a load, and ends with the last of these loads. If the error output is no terminal, nothing is drawn.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class _Display:
         self._bars = 0
 
     def add(self, description: str) -> tuple[Progress, TaskID] | None:
-        """Draw one bar more; None if this is no terminal, or another live display has it."""
+        """Draw one bar more. Return None if the output is no terminal, or another live display has it."""
         with self._lock:
             if self._shown is None:
                 console = Console(stderr=True)
@@ -35,7 +35,7 @@ class _Display:
                     return None
                 text = TextColumn("{task.description}", markup=False)
                 columns = (text, BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-                shared = sys.stdout.isatty()  # what is printed goes above the bars, and else where it always goes
+                shared = sys.stdout.isatty()  # then printed lines go above the bars; else they are left alone
                 shown = Progress(*columns, console=console, transient=True, redirect_stdout=shared)
                 try:
                     shown.start()
@@ -47,7 +47,7 @@ class _Display:
             return self._shown, self._shown.add_task(description, total=1.0)
 
     def remove(self, task: TaskID) -> None:
-        """One of its loads has ended."""
+        """Remove the bar of a load that has ended; with the last bar, end the display."""
         with self._lock:
             self._bars -= 1
             if self._shown is not None:
@@ -84,7 +84,7 @@ class Bar:
             display.update(task, completed=progress.fraction, description=description)
 
     def close(self) -> None:
-        """The load has ended: take the bar away."""
+        """Remove the bar, because the load has ended."""
         with self._lock:
             drawn, self._drawn, self._over = self._drawn, None, True
         if drawn is not None:

@@ -1,7 +1,7 @@
-"""Who hears how far a load has come: a callable of the caller's, or a bar on the terminal.
+"""Hearers: a callable of the caller, or a bar on the terminal, hears how far a load has come.
 
-It is called in the thread that waits: by load() in the calling thread, by load_async() on the event loop of the task,
-with block=False in a worker. One that is slow hears the newest report. One that raises is logged, and not called again.
+The thread that waits calls it: with load() the calling thread, with load_async() the task's event loop, with
+block=False a worker. A slow one hears only the newest report. One that raises is logged, and not called again.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ ProgressWanted = bool | ProgressCallback
 
 
 class Hearer:
-    """What hears of one load, until it is closed.
+    """The hearer of one load, until it is closed.
 
     Args:
         actor: the registrar that loads.
-        callback: called with each report.
+        callback: the callable, called with each report.
         end: called once, when the load has ended.
     """
 
@@ -55,14 +55,14 @@ class Hearer:
             callback(progress)
         except Exception as error:
             if isinstance(error, Raised) and not isinstance(error.error, Exception):
-                raise error.error from None  # KeyboardInterrupt, say: it is the caller's
+                raise error.error from None  # such as KeyboardInterrupt: it is for the caller
             self._callback = None
             self._actor.callback_failures += 1
             text = "%s: the progress callable of a load of %s raised, and is not called again"
             log_raised(logger, error, text, self._actor.name, progress.server)
 
     def close(self) -> None:
-        """The load has ended."""
+        """Stop calling the callable, and call `end`: the load has ended."""
         self._callback = None
         end, self._end = self._end, None
         if end is not None:
@@ -70,10 +70,10 @@ class Hearer:
 
 
 def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
-    """Return who hears of a load, by load()'s argument `progress`; None for nobody.
+    """Return the hearer that load()'s argument `progress` asks for; None if it asks for none.
 
     Raises:
-        UsageError: it is neither a bool nor a plain callable; or it is True, and rich is not installed.
+        UsageError: `progress` is neither a bool nor a plain callable; or it is True, and rich is not installed.
     """
     if progress is False or progress is None:
         return None
@@ -106,7 +106,7 @@ def _bar() -> _Bar:
 
 
 class HearingWait:
-    """One thread that waits for a load, and calls its hearer meanwhile; otherwise as loads.Wait."""
+    """The wait of one thread for a load. The thread calls its hearer meanwhile. Otherwise as loads.Wait."""
 
     def __init__(self, hearer: Hearer) -> None:
         self._hearer = hearer
@@ -115,17 +115,17 @@ class HearingWait:
         self.error: BaseException | None = None
 
     def load_ended(self, _held: Held | None, error: RrError | None) -> None:
-        """How a load ended. On the loop."""
+        """Note how the load ended, and wake the waiting thread. On the loop."""
         self.error = error
         self.done = True
         self._arrived.put(None)
 
     def progressed(self, progress: Progress) -> None:
-        """A report has arrived. On the loop."""
+        """Pass a report to the waiting thread. On the loop."""
         self._arrived.put(progress)
 
     def done_within(self, timeout_s: float | None) -> bool:
-        """Wait; whether it is done."""
+        """Wait, call the hearer meanwhile, and return whether the load has ended."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             try:
@@ -149,7 +149,7 @@ def on_this_loop(hearer: Hearer) -> Callable[[Progress], None]:
     def listener(progress: Progress) -> None:
         try:
             loop.call_soon_threadsafe(hearer.hear, progress, context=context)
-        except RuntimeError:  # closed, with the task that waited
+        except RuntimeError:  # the event loop is closed, with the task that waited
             return
 
     return listener

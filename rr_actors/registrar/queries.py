@@ -39,18 +39,18 @@ else:
 
 _KEPT_STATUSES = 256
 
-_lock = threading.Lock()  # of who waits for a status, of all queries
+_lock = threading.Lock()  # guards the list of waiting threads of every query
 
 
 class Holder(Protocol):
-    """What a query wants of the Registrar that holds it."""
+    """The methods of a Registrar that its queries call."""
 
     def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> object:
         """Release the query, and return when that is done."""
         ...
 
     async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
-        """As unload(), awaited."""
+        """Release the query as unload() does, awaited."""
         ...
 
 
@@ -119,12 +119,12 @@ class Query(Generic[Response]):
 
     @property
     def server_id(self) -> str:
-        """ "registrar/server"."""
+        """The id of the server, "registrar/server"."""
         return f"{self.registrar}/{self.server}"
 
     @property
     def request(self) -> Any:
-        """The request, as the server's request type."""
+        """The request, decoded as the server's request type."""
         if type(self._request) is _Bytes:
             codec = self._types(self.server_id)[0]
             self._request = codec.decode(self._request.raw, self.server_id)
@@ -132,7 +132,7 @@ class Query(Generic[Response]):
 
     @property
     def response(self) -> Response:
-        """The newest response, as the load's `response_type`, or else as the server's response type.
+        """The newest response, decoded as the load's `response_type`, or else as the server's response type.
 
         Raises:
             InvalidResponse: the response has another type than `response_type`; or it needs a declared type, and none
@@ -144,18 +144,18 @@ class Query(Generic[Response]):
         return self._response
 
     def unload(self, *, timeout_s: float | None = 30.0) -> None:
-        """Release it. Return when the unload callback has run, or at once if others hold the resource.
+        """Release the query. Return when the unload callback has run, or at once if others hold the resource.
 
         Raises:
-            UnknownQuery: it is unloaded already, or its provider has taken it away.
-            UnloadFailed: it was the last query and the unload callback raised. It is still held.
+            UnknownQuery: the query is unloaded already, or its provider has taken the resource away.
+            UnloadFailed: this was the last query, and the unload callback raised. The query is still held.
             Unavailable: the provider did not come back in time. The release stays owed.
         """
         self._asked_to_unload().unload(self, timeout_s=timeout_s)
         self._is_released = True
 
     async def unload_async(self, *, timeout_s: float | None = 30.0) -> None:
-        """As unload(), awaited. Cancelled, the unload goes on."""
+        """Release the query as unload() does, awaited. If it is cancelled, the unload goes on."""
         await self._asked_to_unload().unload_async(self, timeout_s=timeout_s)
         self._is_released = True
 
@@ -177,7 +177,7 @@ class Query(Generic[Response]):
         deadline = None if limit_s is None else time.monotonic() + limit_s
         while True:
             flag = Flag()
-            with _lock:  # first: what arrives from now on is not missed
+            with _lock:  # before it looks at the statuses, so that it misses none
                 self._waiters = [*(self._waiters or ()), flag]
             try:
                 if (found := self._take(wanted)) is not None:
@@ -204,7 +204,7 @@ class Query(Generic[Response]):
         return None
 
     def _hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
-        """A status has arrived. Called by the registrar, on the loop."""
+        """Note a status that has arrived, and wake the threads that wait for one. On the loop."""
         self.state = status.state
         if response is not None:
             self._response = _Bytes(response)
@@ -215,7 +215,7 @@ class Query(Generic[Response]):
         self._wake()
 
     def _end(self) -> None:
-        """It is held no more. Called by the registrar, on the loop."""
+        """Note that the query is not held any more, and wake the threads that wait for a status. On the loop."""
         self._over = self._is_released = True
         self._wake()
 
@@ -227,20 +227,20 @@ class Query(Generic[Response]):
                 flag.set()
 
     def _loaded(self, held: Held) -> None:
-        """The load has succeeded: this is its row. Called by the registrar, on the loop."""
+        """Note that the load has succeeded, with the values of its row. On the loop."""
         self.resource_id = held.resource_id
         self.state = held.state
         if held.response is not None:
             self._response = _Bytes(held.response)
 
     def _loaded_directly(self, resource_id: str, response: bytes) -> None:
-        """The load has succeeded. Called in the thread that loads."""
+        """Note that the load has succeeded. In the thread that loads."""
         self.resource_id = resource_id
-        if self._response is None:  # else an update has overtaken the answer
+        if self._response is None:  # otherwise an update arrived before the answer
             self._response = _Bytes(response)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Elsewhere it is a picture of this moment: readable, and good to name the query by."""
+        """Pickle the query as it is now. Elsewhere the copy can be read, and names the query."""
         facts = {
             name: getattr(self, name)
             for name in ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released")
@@ -248,7 +248,7 @@ class Query(Generic[Response]):
         return (_remade, (facts, self.request, self.response))
 
     def _set_values(self, request: Any, response: Any) -> None:
-        """Give a remade query its values; for unpickling."""
+        """Set the private fields of a query that is being unpickled."""
         self._holder = None
         self._over = True
         self._is_released = False
@@ -259,18 +259,18 @@ class Query(Generic[Response]):
         self._statuses = None
 
     def _read_as(self, codec: Codec) -> Self:
-        """Have the response read by this codec, whatever the server says of its type."""
+        """Decode the response with this codec, and not with that of the server's response type."""
         self._codec = codec
         if type(self._response) is not _Bytes and self._response is not None:
             self._response = _Bytes(codec.encode(self._response, self.server_id))
         return self
 
     def _response_bytes(self) -> bytes:
-        """The response's canonical bytes, as they came if nobody has read it."""
+        """Return the response's canonical bytes: those that arrived, if the response has not been read yet."""
         return self._response.raw if type(self._response) is _Bytes else encode(self._response, "response")
 
     def _held_by(self, holder: Holder) -> Self:
-        """Make `holder` the one that unload() asks."""
+        """Make `holder` the registrar that unload() calls."""
         self._holder = holder
         return self
 
@@ -281,7 +281,7 @@ class Query(Generic[Response]):
         self.unload_if_held()
 
     def unload_if_held(self, *, timeout_s: float | None = 30.0) -> None:
-        """Release it as unload() does; do nothing if it is unloaded already, or its provider has taken it away.
+        """Release the query as unload() does; do nothing if it is released already, by its holder or its provider.
 
         Raises:
             UnloadFailed, Unavailable: as for unload().
@@ -305,11 +305,11 @@ class Query(Generic[Response]):
                     raise
 
     def _may_be_gone(self) -> bool:
-        """Whether it is gone, or seen by a handle: such a query does not hear when it goes."""
+        """Return whether the query is gone, or belongs to a handle: such a query is not notified of its end."""
         return self._is_gone() or (self._over and self._holder is not None)
 
     def _is_gone(self) -> bool:
-        """Return whether it is released already, or its provider has taken it away."""
+        """Return whether the query is released already, by its holder or its provider."""
         return self.released or self._is_released
 
     def __eq__(self, other: object) -> bool:
@@ -331,7 +331,7 @@ class Query(Generic[Response]):
         return f"<Query {self.id} of {self.origin} on {self.server_id}, {self.state}>"
 
 
-# For the package's own modules; people who complete a name see nothing of it.
+# For the package's own modules. As private methods they stay out of an editor's list of names.
 hear = Query._hear  # pyright: ignore[reportPrivateUsage]  # same file
 end = Query._end  # pyright: ignore[reportPrivateUsage]
 loaded = Query._loaded  # pyright: ignore[reportPrivateUsage]
@@ -342,7 +342,7 @@ read_as = Query._read_as  # pyright: ignore[reportPrivateUsage]
 
 
 def read_later(loaded: Any, codec: Codec) -> Reply[Query]:
-    """A future of a load's query, its response read by this codec."""
+    """Return a future of a load's query whose response this codec decodes."""
     read: Reply[Query] = Reply()
     read.withdraw = loaded.cancel
 
@@ -366,7 +366,7 @@ def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
 
 
 class _Bytes(msgspec.Struct, frozen=True, gc=False):
-    """A value not decoded yet: that happens where it is used, never on the loop."""
+    """A value that is not decoded yet. The thread that reads the value decodes it, never the loop."""
 
     raw: bytes
 
@@ -375,13 +375,13 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     """A resource of this registrar at one moment.
 
     Attributes:
-        id, server, request, response: what was loaded; the response is None while it is loading.
-        state: in a word, always text: "queued", "loading", "unloading" or "unload_failed" while it is that, else the
-            last status's state, "OK" at first. `phase` and `status` have the two apart.
-        phase: where it is in its life, without the status.
-        status, message: of the last status.
-        attempt: how often its load callback was begun.
-        holders: the registrars that hold it, one entry a query.
+        id, server, request, response: the response is None while the resource is loading.
+        state: a str. While the resource is loaded, the state of the last status, "OK" at first. Otherwise its phase:
+            "queued", "loading", "unloading" or "unload_failed".
+        phase: the phase alone.
+        status, message: the state and the message of the last status.
+        attempt: how often its load callback has begun.
+        holders: the registrars that hold it, one entry for each query.
         queries: their query ids.
     """
 
@@ -398,7 +398,7 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     queries: tuple[str, ...]
 
 
-# Views: the Query objects of one registrar, who listens to them, and how to read their bytes.
+# Views: the Query objects of one registrar, the callbacks for their statuses, and the codecs for their bytes.
 
 logger = logging.getLogger("rr_actors.registrar")
 
@@ -409,10 +409,10 @@ _TYPES_S = 2.0
 
 
 class Views:
-    """One for each query that somebody has seen; a status reaches them, and the callbacks that listen.
+    """The Query objects that a registrar has given out, and the status callbacks. A status reaches both.
 
     Attributes:
-        holder: the Registrar that people use.
+        holder: the Registrar that the application uses.
     """
 
     def __init__(self, actor: RegistrarActor, holder: Holder) -> None:
@@ -422,42 +422,42 @@ class Views:
         self._on_query: dict[str, StatusCallback] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
-        self._codecs_of = self.codecs_of  # one for all queries
+        self._codecs_of = self.codecs_of  # one bound method for all queries
         self._left: set[tuple[str, str]] = set()  # servers where something was held, and released
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
-        """A Query that is being loaded, and not listened to (yet)."""
+        """Return a Query that is being loaded. No status reaches it before add()."""
         return Query(id, place, request, parent, self._actor.name, self.holder, self._codecs_of)
 
     def seen(self, held: Held) -> Query:
-        """A Query of its own of a held row."""
+        """Return a new Query of a held row."""
         query = self.new(held.id, ServerId(held.registrar, held.server), held.request, held.parent)
         loaded(query, held)
         return query
 
     def of(self, held: Held) -> Query:
-        """The Query of a held row; the same each time."""
+        """Return the Query of a held row, the same object each time."""
         view = self._queries.get(held.id)
         if view is None:
             view = self._queries[held.id] = self.seen(held)
         return view
 
     def add(self, query: Query) -> None:
-        """Have statuses reach it."""
+        """Have statuses reach a query."""
         self._queries[query.id] = query
 
     def listen(self, query_id: str, callback: StatusCallback) -> None:
-        """Have the callback called for one query."""
+        """Have the callback called with each status of one query."""
         self._actor.catalog.listened.add(query_id)
         self._on_query[query_id] = callback
 
     def listen_to_server(self, server: str, callback: StatusCallback) -> None:
-        """Have the callback called for every query at a server."""
+        """Have the callback called with each status of every query at a server."""
         self._actor.catalog.listened.add(server)
         self._on_server.setdefault(server, []).append(callback)
 
     def forget(self, query_id: str) -> None:
-        """The query is held no more."""
+        """Forget a query that is not held any more, and its callback; wake the threads that wait for its statuses."""
         if (view := self._queries.pop(query_id, None)) is not None:
             end(view)
             if view.resource_id:
@@ -468,7 +468,7 @@ class Views:
     def was_at(self, server: ServerId) -> bool:
         """Return whether the registrar holds something at the server, is loading it, or did once. On the loop.
 
-        What it held in an earlier life the catalog tells by the server's types, which it keeps.
+        The catalog keeps the types of each server where an earlier incarnation held something.
         """
         if server in self._left or str(server) in self._actor.catalog.server_types:
             return True
@@ -477,10 +477,10 @@ class Views:
         return any((row.registrar, row.server) == server for row in rows)
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
-        """A status has arrived. On the loop.
+        """Pass a status that has arrived to its Query and to the callbacks. On the loop.
 
-        `heard` is called when all callbacks have returned, with whether one of them has dealt with it: until then a
-        crash has the provider say it again.
+        `heard` is called when all callbacks have returned, with whether one of them has handled the status. After a
+        crash before that, the provider sends the status again.
         """
         status = status_of(notice, repeated=repeated)
         view = self._queries.get(held.id)
@@ -508,7 +508,7 @@ class Views:
             done(None, error)
 
     def codecs_of(self, server_id: str) -> tuple[Codec, Codec]:
-        """How to read the requests and responses of a server: by its types, as it told them. Not on the loop."""
+        """Return the codecs of a server's requests and responses, made of the types that it sent. Not on the loop."""
         known = self._actor.catalog.server_types.get(server_id) or self._ask_types(server_id)
         if known is None:
             return PLAIN, PLAIN
@@ -520,7 +520,7 @@ class Views:
         return cached[1]
 
     def _ask_types(self, server_id: str) -> ServerType | None:
-        """After a crash its types may not be in the catalog: ask the provider, and do without if it is down."""
+        """Ask the provider for a server's types, which a crash may have lost; None if it does not answer in time."""
         dispatcher = self._actor.node.dispatcher
         if dispatcher.is_loop_thread() or self._actor.closed:
             return None

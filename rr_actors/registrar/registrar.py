@@ -1,6 +1,6 @@
 """Registrar: the class with which an application loads, unloads and serves resources, from any thread.
 
-Each method gives a command to the registrar's actor and waits for its end, with a time limit, and never on the event
+Most methods give the registrar's actor a command and wait, with a time limit, for its end. None waits on the event
 loop. The docstrings have the promises.
 """
 
@@ -72,7 +72,7 @@ from rr_actors.runtime.time_limits import time_limit
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    Response = TypeVar("Response", default=Any)  # of a server that is named by a text
+    Response = TypeVar("Response", default=Any)  # for a server that is named by a str
 else:
     from typing import TypeVar
 
@@ -183,7 +183,7 @@ class Registrar:
             linger_s: seconds for which a resource without holders is kept.
             load_timeout_s: seconds after which a running `load` counts as failed.
             recovery: without `recover`: "keep" the resource, "reload" it, or give it up as "lost". None: as
-                "keep", and a warning in the log where a process that has died had loaded what is kept.
+                "keep", and the log has a warning if a process that has ended had loaded kept resources.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -208,9 +208,9 @@ class Registrar:
     def _register_spec(
         self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
     ) -> None:
-        """Register a server from its checked description; with `stored`, keep it in the catalog by value.
+        """Register a server from its checked spec. With `stored`, these bytes of the spec are kept in the catalog.
 
-        A server that is only `restored` from there gives way to the same name registered again.
+        A `restored` server, which comes from the catalog, is replaced if its name is registered again.
         """
         origin = f"{self.name}/{spec.name}"
         if stored is None and not restored:
@@ -223,7 +223,7 @@ class Registrar:
             logger.warning(_KEPT, self.name, spec.name, kept)
 
     def _register(self, server: ServerActor, stored: bytes | None) -> int:
-        """Take up a server on the loop; return how many held resources it has already."""
+        """Register a server on the loop, and return how many usable held resources it finds; 0 if it replaces one."""
         name = server.spec.name
         with self._actor.enter():
             catalog = self._actor.whole()
@@ -260,7 +260,7 @@ class Registrar:
         """Send a status of a resource served here to all its holders. Return when it is on disk.
 
         The status callback of its server runs first, and may stop the status by `status.handled()`. It does not run
-        for a status that it sends itself.
+        for a status that the callback itself sends.
 
         Args:
             query_or_resource_id: the resource or its id, or a query on it or the query's id.
@@ -321,17 +321,17 @@ class Registrar:
         it, the call is done. In an ``async def`` callback, call it with ``await asyncio.to_thread(...)``.
 
         Args:
-            status: what the callback was called with. `status.query_id` names the part.
-            request: what to load the spare with. The same, after a crash, as before.
-            server: where to load it; None: at the server of the part.
+            status: the status that the callback got. `status.query_id` names the part.
+            request: the request of the spare. After a crash it must be the same as before.
+            server: the server that loads the spare. None: the server of the part.
             response: makes the new response of the resource. It gets the spare's Query. None: the response stays.
             timeout_s: seconds that the load may take. None: no limit.
 
         Returns:
-            The Query of the spare. If the part was replaced before for this status, that of the spare it has.
+            The Query of the spare. If the part was replaced before for this status, the Query of that spare.
 
         Raises:
-            As load(), or as `response`: nothing is replaced, and the status goes up unless the callback handles it.
+            The errors of load() and `response`: nothing is replaced; the status goes up unless the callback handles it.
             InvalidResponse, NotSerializable: the new response has another type, or cannot travel.
             UnknownQuery: the resource does not hold the part any more.
             UsageError: not called in a status callback, or the status is of the resource itself.
@@ -439,13 +439,13 @@ class Registrar:
     ) -> Any:
         """Load the resource for this request, or share it if somebody holds it already.
 
-        Called in a callback, the resource becomes a dependency of the callback's resource.
+        If a callback makes the call, the resource becomes a dependency of the callback's resource.
 
         Args:
             server: "registrar/server"; or the method that declares it, such as `Cameras.open_camera`, if exactly one
                 child of the system has that class. Type checkers then know the response's type.
             request: a value of the server's request type (docs/values.md).
-            response_type: read the response as this type, not as the one that the server declares.
+            response_type: the type to read the response as, in place of the type that the server declares.
             on_status: a worker calls it with each Status of this query, in order. For a dependency it runs before the
                 status callback of the resource that needs it, and instead of it if it calls `status.handled()`.
             timeout_s: seconds that the whole load may take. After that the load is withdrawn. None: no limit.
@@ -532,7 +532,7 @@ class Registrar:
         return query if codec is None else read_as(query, codec)
 
     def _warn_in_event_loop(self, called: str, instead: str) -> None:
-        """Say once for each registrar that a call holds up the event loop of the calling thread.
+        """Warn once for each registrar that a call blocks the event loop of the calling thread.
 
         A notebook runs each cell on its kernel's event loop, which has nothing else to do.
         """
@@ -597,7 +597,10 @@ class Registrar:
         return await load_groups.result(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
-        """Who holds what is loaded now, and for which resource: in a callback of this system, the callback's."""
+        """Return the registrar that holds the next load, and the id of its resource that needs it; "" for none.
+
+        Without `parent`, in a callback of this system, these are the callback's own.
+        """
         context: Any = parent
         if context is None:
             context = current_or_none()
@@ -681,7 +684,7 @@ class Registrar:
     async def unload_async(
         self, query_or_id: Query | ResourceInfo | str, *, force: bool = False, timeout_s: float | None = 30.0
     ) -> None:
-        """As unload(), awaited. Cancelled, the unload goes on."""
+        """Release a query as unload() does, awaited. If it is cancelled, the unload goes on."""
         await self.unload(query_or_id, force=force, timeout_s=timeout_s, block=False)
 
     @overload
@@ -739,7 +742,7 @@ class Registrar:
 
         Raises:
             UnknownRegistrar, RegistrarDown: there is no such registrar, or it is gone for good.
-            Unavailable: it did not answer in time.
+            Unavailable: the provider did not answer in time.
         """
         limit_s = time_limit(timeout_s)
         self._calls.check_open()
@@ -767,7 +770,7 @@ class Registrar:
 
         Raises:
             UnknownQuery: this registrar serves and holds no such thing.
-            RegistrarDown, UnknownRegistrar: the provider is not there.
+            RegistrarDown, UnknownRegistrar: the provider does not run.
         """
         id = target_id(query)
         if is_a(query, Query):
@@ -809,7 +812,7 @@ class Registrar:
     def _info(
         self, resource: Resource, server: ServerActor | None, holders: tuple[str, ...], queries: tuple[str, ...]
     ) -> ResourceInfo:
-        """Decode what users' types are needed for, in the thread that asks."""
+        """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
         request = (server.request if server else PLAIN).show(resource.request)
         response = None
         if resource.response is not None:
@@ -836,9 +839,12 @@ class Registrar:
         return [row.id for row in self._calls.call(self._held_now) if row.hold is Hold.OWED]
 
     def stats(self) -> dict[str, int]:
-        """Return counts: resources, queries held, releases owed, loads and unloads in flight, what waits to be decided
-        ("mailbox"); and since the registrar was opened: commits, and status callbacks that have raised. Commits are
-        timed while somebody records ("timed_commits", and "commit_us", the microseconds that they took)."""
+        """Return counts of the present, and of events since the registrar was opened.
+
+        Present: resources, queries held, releases owed, loads and unloads in flight, notices, and messages that wait
+        for a decision ("mailbox"). Events: commits, and status and progress callbacks that raised. While a recording
+        runs, commits are timed: "timed_commits" of them took "commit_us" microseconds.
+        """
         return self._calls.call(self._stats_now)
 
     def _stats_now(self) -> dict[str, int]:
@@ -857,7 +863,7 @@ class Registrar:
         }
 
     def _page(self, wanted: Wanted) -> Page:
-        """Return a few of its resources or queries as text, for those who look at the system from outside."""
+        """Return a few of this registrar's resources or queries as text, for tools that show the system."""
         return page_of(self._actor, wanted)
 
     # -- status --------------------------------------------------------------------------------------------------
@@ -913,7 +919,7 @@ class Registrar:
         node.dispatcher.run(node.dismiss(self.name, limit_s))
 
 
-# For the package's own modules; people who complete a name see nothing of it.
+# For the package's own modules. As a private method it stays out of an editor's list of names.
 register_spec = Registrar._register_spec  # pyright: ignore[reportPrivateUsage]  # same file
 
 
@@ -921,7 +927,7 @@ def load_bytes(registrar: Registrar, server: str, request: bytes, timeout_s: flo
     """Load with a request's canonical bytes, and return the query and its response's bytes.
 
     Raises:
-        LoadError: see Registrar.load.
+        LoadError: the load failed, as in Registrar.load().
     """
     wait = registrar._loads.wait  # pyright: ignore[reportPrivateUsage]  # same file
     query = wait(parse_server(server), request, "", None, time_limit(timeout_s))
@@ -932,6 +938,6 @@ def page(registrar: Registrar, wanted: Wanted) -> Page:
     """Return a page of what a registrar, of this process or another, serves or holds.
 
     Raises:
-        RegistrarDown: it is not there.
+        RegistrarDown: the registrar is closed, or does not run.
     """
     return registrar._page(wanted)  # pyright: ignore[reportPrivateUsage]  # same file

@@ -29,20 +29,20 @@ _GRACE_S = 10.0
 
 
 class RegistrarHandle(Registrar):
-    """A registrar of another process; from System.registrar(). Each call runs there, in a worker.
+    """A registrar of another process, from System.registrar(). A worker of that process runs each call.
 
-    A registrar that is being started or respawned is waited for, within the call's time limit (30 s, if it has none);
-    `patient=False`: RegistrarDown at once. A call that was running when its process died is made again if it only
-    asks, else it raises RegistrarDown: whether it was done is not known.
+    A call waits for a registrar that is being started or respawned, within its time limit (30 s if it has none). With
+    `patient=False` it raises RegistrarDown at once. If the process dies during a call that changes nothing, the call is
+    made again. Any other call then raises RegistrarDown: whether it was done is not known.
 
-    What it loads, that registrar holds. Callbacks given to it travel there (by cloudpickle) and run there; a server
-    registered through it is kept in that registrar's catalog, and is there again after a respawn.
+    That registrar holds what the handle loads. Callbacks travel to its process by cloudpickle, and run there. Its
+    catalog keeps a server that is registered through the handle, so that a respawn restores the server.
     """
 
     def __init__(  # pyright: ignore[reportMissingSuperCall] - nothing in common
         self, node: Node, name: str, *, patient: bool = True, owner: object = None
     ) -> None:
-        self._owner = owner  # is not to be dropped while this is in use
+        self._owner = owner  # kept alive while this handle is in use
         self._node = node
         self._name = name
         self._patient = patient
@@ -55,7 +55,7 @@ class RegistrarHandle(Registrar):
 
     @property
     def config(self) -> RegistrarConfig:
-        """How its catalog is kept."""
+        """The configuration: where and how the catalog is kept."""
         return self._node.config.registrar(self._name)
 
     def __repr__(self) -> str:
@@ -64,10 +64,10 @@ class RegistrarHandle(Registrar):
     def _register_spec(
         self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
     ) -> None:
-        """Register a server there from its checked description; it comes back after a respawn."""
+        """Register a server in the other process from its checked spec; a respawn restores it."""
         log_unread_types(spec, f"{self.name}/{spec.name}")
         for role in ("load", "unload", "status", "recover"):
-            pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
+            pickling.dumps(getattr(spec, role), f"{role} callback")  # its error names the callback that cannot travel
         self._register_stored(pickling.dumps(spec, f"server {spec.name!r}"))
 
     def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
@@ -82,11 +82,12 @@ class RegistrarHandle(Registrar):
         progress: ProgressWanted = False,
         block: bool = True,
     ) -> Any:
-        """As Registrar.load(), held by that registrar; `on_status` is called there. In a callback, as anywhere, what is
-        loaded is held by the callback's own registrar.
+        """Load as Registrar.load() does. That registrar holds the resource, and its process runs `on_status`.
+
+        In a callback, the callback's own registrar holds the resource, as with any other registrar.
 
         Raises:
-            UsageError: with `progress`, outside of a callback: only a registrar of this process can hear it.
+            UsageError: `progress` is given outside of a callback: only a registrar of this process can hear it.
         """
         limit_s = time_limit(timeout_s)
         target = str(self._target(server))
@@ -110,7 +111,7 @@ class RegistrarHandle(Registrar):
             return owned
         try:
             return own(self._finish(reply, limit_s))
-        except BaseException:  # KeyboardInterrupt, say: nobody would know of it
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
             self._withdraw(reply)
             raise
 
@@ -125,7 +126,7 @@ class RegistrarHandle(Registrar):
         parent: Any = None,
         progress: ProgressWanted = False,
     ) -> Any:
-        """As load(), awaited. Cancelled, it withdraws the load."""
+        """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
         options: dict[str, Any] = {"response_type": response_type, "on_status": on_status, "timeout_s": timeout_s}
         owner, parent = self._holder(parent)
         if owner is not self:
@@ -146,7 +147,7 @@ class RegistrarHandle(Registrar):
         timeout_s: float | None = 30.0,
         parent: Any = None,
     ) -> Queries:
-        """As Registrar.load_all(), held by that registrar."""
+        """Load as Registrar.load_all() does. That registrar holds the resources."""
         owner, parent = self._holder(parent)
         if owner is not self:
             return owner.load_all(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
@@ -154,7 +155,7 @@ class RegistrarHandle(Registrar):
         reply, limit_s = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
         try:
             return self._own(self._finish(reply, limit_s))
-        except BaseException:  # KeyboardInterrupt, say: nobody would know of them
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
             self._withdraw(reply)
             raise
 
@@ -166,7 +167,7 @@ class RegistrarHandle(Registrar):
         timeout_s: float | None = 30.0,
         parent: Any = None,
     ) -> Queries:
-        """As load_all(), awaited. Cancelled, it releases all of them."""
+        """Load as load_all() does, awaited. If it is cancelled, all queries are released."""
         owner, parent = self._holder(parent)
         if owner is not self:
             return await owner.load_all_async(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
@@ -179,7 +180,7 @@ class RegistrarHandle(Registrar):
             raise
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
-        """Refused: a manager's registrar lives as long as its manager.
+        """Refuse to close: a manager's registrar lives as long as its manager.
 
         Raises:
             UsageError: always.
@@ -193,7 +194,7 @@ class RegistrarHandle(Registrar):
         return self._own(self._finish(reply, limit_s)) if block else reply
 
     def _begin(self, method: str, *args: Any, **options: Any) -> tuple[Reply[Any], float | None]:
-        """Have a method called there; return its answer to come, and for how many seconds it may be waited for."""
+        """Have the other process call a method. Return the reply, and the seconds that the caller may wait for it."""
         limit_s: float | None = 30.0
         if "timeout_s" in options:
             limit_s = options["timeout_s"] = time_limit(options["timeout_s"])
@@ -206,7 +207,7 @@ class RegistrarHandle(Registrar):
             raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
 
     def _withdraw(self, reply: Reply[Any]) -> None:
-        """The caller of a load has gone: if the load succeeds all the same, it is released again."""
+        """Release the queries of a load if it still succeeds, because its caller has gone."""
 
         def done(reply: Reply[Query]) -> None:
             with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it
@@ -223,7 +224,7 @@ class RegistrarHandle(Registrar):
             self.unload(query, block=False)
 
     def _own(self, got: Any) -> Any:
-        """Return what a call has returned; this handle is asked to unload the queries among it."""
+        """Return the result of a call, and make this handle the holder of the queries in it."""
         for one in got if is_a(got, (list, tuple)) else ():
             if is_a(one, Query):
                 held_by(one, self)
@@ -231,17 +232,17 @@ class RegistrarHandle(Registrar):
 
 
 def _called_there(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of Registrar as one of RegistrarHandle, which has it called in the registrar's process."""
+    """Return a method for RegistrarHandle that has a method of Registrar called in the registrar's process."""
     signature = inspect.signature(method)
 
     @functools.wraps(method)
     def call(self: RegistrarHandle, *args: Any, **options: Any) -> Any:
         bound = signature.bind(self, *args, **options)
-        bound.apply_defaults()  # they are sent, too: a call that waits to be sent has less of its timeout_s left
+        bound.apply_defaults()  # sent, too: while a call waits to be sent, its timeout_s gets less
         return self._ask(method.__name__, *bound.args[1:], **bound.kwargs)  # pyright: ignore[reportPrivateUsage]  # same file
 
     return call
 
 
-for _name in METHODS - vars(RegistrarHandle).keys():  # those that are not written out above
+for _name in METHODS - vars(RegistrarHandle).keys():  # the methods that are not defined above
     setattr(RegistrarHandle, _name, _called_there(getattr(Registrar, _name)))

@@ -1,8 +1,8 @@
-"""Replacements: a spare in the place of a part that failed, from within a status callback.
+"""Replacements: a status callback puts a spare in the place of a part that failed.
 
-A crash may come at any instruction. Before the swap is on disk, the status is heard again: the callback runs again, and
-finds the spare by its id, which is made of the ids of the part and of the status. After it, the part is no part any
-more: its release is owed, and its status concerns nobody.
+A crash may come at any instruction. If the swap is not on disk by then, the status arrives and its callback runs again.
+The callback finds the spare by its id, which is made of the ids of the part and of the status. After the swap, the
+resource does not hold the part any more: its release is owed, and its statuses concern nobody.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rr_actors.registrar.queries import Query, Views
 
 
 class _Found(NamedTuple):
-    """What a resource holds of a part: the part itself, and spares for it, the newest first."""
+    """A resource, its server, a part that it may hold, and the spares that it holds for this part, newest first."""
 
     resource: Resource
     server: ServerActor | None
@@ -51,7 +51,7 @@ class Replacements:
         response: Callable[[Query], Any] | None,
         timeout_s: float | None,
     ) -> Query:
-        """Load a spare, swap, release the part, and mark the status as handled; see Registrar.replace_part()."""
+        """Load a spare, swap it for the part, and mark the status as handled, as Registrar.replace_part() says."""
         resource_id = status_callback_of(self._actor)
         if not resource_id:
             where = "expected to be called in a status callback of a server of this registrar"
@@ -93,7 +93,7 @@ class Replacements:
         return self._calls.call(self._views.of, found.spares[0])
 
     def _loaded(self, found: _Found, place: ServerId, request: bytes) -> Query | None:
-        """The spare that an interrupted run has loaded."""
+        """Return the spare that an interrupted run of the callback has loaded, if there is one."""
         for row in found.spares:
             if (row.registrar, row.server, row.request) == (*place, request):
                 return self._calls.call(self._views.of, row)
@@ -119,7 +119,7 @@ def encoded_response(response: Any, resource: Resource | None, server: ServerAct
     """Return the bytes of a new response of a resource.
 
     Raises:
-        InvalidResponse, NotSerializable: it has another type, or cannot travel.
+        InvalidResponse, NotSerializable: the response has another type, or cannot travel.
     """
     if server is None:
         return encode(response, "response")
@@ -130,10 +130,10 @@ def encoded_response(response: Any, resource: Resource | None, server: ServerAct
 
 
 def new_response(function: Callable[[Query], Any] | None) -> Callable[[Query], Any] | None:
-    """The function that makes the new response, checked.
+    """Return the function that makes the new response, or None.
 
     Raises:
-        UsageError: it cannot be called.
+        UsageError: `function` cannot be called.
     """
     if function is None or callable(function):
         return function
@@ -142,7 +142,7 @@ def new_response(function: Callable[[Query], Any] | None) -> Callable[[Query], A
 
 
 def _family(part_id: str) -> str:
-    """How the ids of all spares for a part begin. They are UUIDv7, as all ids: the part's time, then a hash."""
+    """Return the beginning of the ids of all spares for a part: UUIDv7 with the part's time, then a hash."""
     bits = hashlib.blake2b(part_id.encode(), digest_size=4).hexdigest()
     return f"{part_id[:12]}7{bits[:3]}8{bits[3:]}"
 
