@@ -115,7 +115,7 @@ class Calls:
         self.dispatcher.call(self.actor.post, command)
 
     def call(self, fn: Callable[..., T], *args: Any) -> T:
-        """Run fn on the loop and return what it returns.
+        """Run fn on the loop, behind the commands that threads have given it before, and return what it returns.
 
         Raises:
             RegistrarDown: the registrar is closed. Unavailable: the loop does not answer.
@@ -126,12 +126,16 @@ class Calls:
         if self.dispatcher.is_loop_thread():
             return fn(*args)
         wait = Wait()
-        self.dispatcher.call(wait.run, fn, args)
+        self.dispatcher.call(self._run_in_order, wait, fn, args)
         if not wait.done_within(CALL_TIMEOUT_S):
             raise Unavailable(f"registrar {self.actor.name!r}: its loop has not answered for {CALL_TIMEOUT_S:g} s")
         if wait.error is not None:
             raise wait.error
         return wait.value
+
+    def _run_in_order(self, wait: Wait, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        self.actor.monitor.decide_waiting()
+        wait.run(fn, args)
 
     def ask_other(self, registrar: str, method: str, *args: Any) -> Any:
         """Call a method of another registrar of the system, wherever it runs.

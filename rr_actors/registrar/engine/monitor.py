@@ -425,7 +425,7 @@ class Monitor:
             finally:
                 self._busy = False
             if self._waiting:
-                self._decide_waiting()
+                self.decide_waiting()
             return
         self._waiting.append((what, sender))
         if self._busy or self._held_up:
@@ -435,7 +435,7 @@ class Monitor:
                 self._scheduled = True
                 self._dispatcher.loop.call_soon(self._turn)
         else:
-            self._decide_waiting()
+            self.decide_waiting()
 
     def decide_here(self, command: c.Command) -> bool:
         """Decide a command in the calling thread. Return False if the loop has to decide it.
@@ -493,9 +493,10 @@ class Monitor:
 
     def _turn(self) -> None:
         self._scheduled = False
-        self._decide_waiting()
+        self.decide_waiting()
 
-    def _decide_waiting(self) -> None:
+    def decide_waiting(self) -> None:
+        """Decide the messages and commands that wait for others, to be decided together with them."""
         if self._busy:
             return
         self._busy = True
@@ -565,7 +566,7 @@ class Monitor:
             self._do_effects()
         finally:
             self._busy = False
-        self._decide_waiting()
+        self.decide_waiting()
 
     def _do_effects(self) -> None:
         try:
