@@ -101,6 +101,29 @@ def test_comments_and_docstrings_of_the_package_use_standard_words() -> None:
     assert [str(module.relative_to(REPOSITORY)) for module in MODULES if PRIVATE.search(module.read_text())] == []
 
 
+NO_VERB = re.compile(
+    r"(a|all|an|and|as|at|each|every|for|from|how|if|in|it|its|no|none|nobody|now|of|on|one|only|some|such|that|the"
+    r"|their|them|there|these|they|this|those|to|two|under|what|when|where|whether|which|who|whose|with|without)\b",
+    re.IGNORECASE,
+)
+
+
+def is_property(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    return any("property" in ast.unparse(decorator) for decorator in function.decorator_list)
+
+
+def test_docstrings_of_functions_begin_with_a_verb() -> None:
+    """Those of properties name a thing; all others say what a call does."""
+    wrong = [
+        f"{module.relative_to(REPOSITORY)}:{function.lineno}: {text.splitlines()[0]}"
+        for module in MODULES
+        for function in ast.walk(ast.parse(module.read_text()))
+        if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)) and not is_property(function)
+        if (text := ast.get_docstring(function)) and NO_VERB.match(text)
+    ]
+    assert wrong == []
+
+
 def test_a_long_sentence_would_be_found() -> None:
     text = "# A page\n\n- Short.\n- " + "word " * 31 + "end.\n\n| " + "cell " * 40 + "|\n"
 
