@@ -23,6 +23,7 @@ from rr_actors.registrar.engine import progress as engine
 from rr_actors.registrar.model.messages import Progressed
 from rr_actors.registrar.model.rows import Phase
 from rr_actors.registrar.pages import Wanted
+from rr_actors.registrar.progress_hearers import HearingWait
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, eventually, kill, serve, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -525,3 +526,24 @@ def test_without_rich_the_error_says_what_to_install(
     monkeypatch.delitem(sys.modules, "rr_actors.registrar.progress_bar", raising=False)
     with pytest.raises(rr.UsageError, match=r"pip install 'rr-actors\[progress\]'"):
         app.load("provider/camera", "front", progress=True)
+
+
+def test_reports_that_come_faster_than_they_are_heard_hold_up_no_time_limit() -> None:
+    class Slow:
+        """Each report that it hears brings the next."""
+
+        heard = 0
+
+        def hear(self, report: engine.Progress) -> None:
+            self.heard += 1
+            assert self.heard < 1_000_000, "it does not end"
+            wait.progressed(report)
+
+    hearer: Any = Slow()
+    wait = HearingWait(hearer)
+    wait.progressed(engine.Progress(0.5, "half", "provider/thing", "r"))
+
+    assert not wait.done_within(0.05)
+    assert hearer.heard > 1
+    wait.load_ended(None, None)
+    assert wait.done_within(LIMIT_S)
