@@ -594,6 +594,11 @@ def test_the_jitter_is_the_callers_chance() -> None:
     assert made.starts["a"].delay_s == 6
 
 
+def test_a_backoff_of_no_delay_never_waits_however_many_restarts_there_were() -> None:
+    assert Backoff(delay_s=0.0).delay(10_000, 0.0) == 0.0
+    assert Backoff(delay_s=0.1, maximum_s=30.0).delay(10_000, 0.0) == 30.0
+
+
 def test_a_group_waits_for_the_backoff_of_the_one_that_fell() -> None:
     patient = child("b", backoff=Backoff(delay_s=3, jitter=0))
     made = world(child("a"), patient, strategy="one_for_all")
