@@ -38,6 +38,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+from rr_actors.supervision.event_history import History, Record
 from rr_actors.wire.name_service import Entry, Status, actor_key, open_state_dir, registrar_key
 from support import lives, quickly, wait_gone
 from support_supervision import Idle, Log, StuckManager, Threaded, Tree, Worker, eventually, let_go
@@ -739,6 +740,17 @@ def test_each_exit_is_one_structured_log_line(plant: Plant, log: Log, caplog: py
     facts: dict[str, Any] = line.__dict__["supervision"]
     assert (facts["event"], facts["code"], facts["signal"]) == ("exited", -9, "SIGKILL")
     assert line.levelno == logging.WARNING
+
+
+def test_a_child_stopped_while_it_waits_to_be_started_again_has_not_died_once_more() -> None:
+    history = History()
+    killed = Record("exited", "root/a", "actor", 1, 0.0, "restarting", reason="killed", code=-9, signal="SIGKILL")
+    history.add(killed)
+    assert history.deaths("root/a", 3) == ["SIGKILL"]
+    history.add(Record("stopped", "root/a", "actor", 1, 0.0, "stopped"))
+    assert history.deaths("root/a", 3) == []
+    history.add(killed)
+    assert history.deaths("root/a", 3) == ["SIGKILL"]
 
 
 def test_events_are_told_as_they_happen_from_every_process(plant: Plant, log: Log) -> None:
