@@ -661,6 +661,17 @@ def test_a_pykka_threading_actor_can_be_a_child(plant: Plant, placement: Any) ->
 
 
 @both
+@pytest.mark.parametrize("code", [None, 1])
+def test_the_asker_of_a_pykka_threading_actor_that_leaves_meanwhile_is_told(
+    plant: Plant, placement: Any, code: int | None
+) -> None:
+    tree = plant(ChildSpec(Threaded, id="a", restart="temporary", placement=placement))
+    with pytest.raises(pykka.ActorDeadError, match="root/a"):
+        tree.ask("root/a", ("leave", code))
+    eventually(lambda: reasons(tree, "root/a") == ["abnormal" if code else "normal"])
+
+
+@both
 def test_a_pykka_threading_actor_fails_to_start_when_its_on_start_raises(plant: Plant, placement: Any) -> None:
     with pytest.raises(StartFailed, match="as it was told"):
         plant(ChildSpec(Threaded, id="a", args=("fail",), placement=placement))
