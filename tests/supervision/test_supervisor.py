@@ -266,6 +266,25 @@ def test_a_sigterm_stops_a_child_gracefully(plant: Plant, log: Log) -> None:
     assert reasons(tree, "root/a") == ["shutdown"]
 
 
+def test_a_sigterm_before_the_specification_is_unpickled_stops_a_child_within_its_time(plant: Plant, log: Log) -> None:
+    here = os.getpid()
+
+    def unpickled() -> str:
+        assert os.getpid() != here
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.2)  # meanwhile the loop learns of it
+        return "a"
+
+    class Name:
+        def __reduce__(self) -> Any:
+            return unpickled, ()
+
+    args = (str(log.path), Name(), "", "hang")
+    tree = plant(ChildSpec(Worker, id="a", args=args, restart="temporary", shutdown_s=0.2))
+    eventually(lambda: reasons(tree, "root/a") == ["killed"])
+    assert log.lines() == ["start a"]
+
+
 # -- exits and restarts ----------------------------------------------------------------------------------------------
 
 
