@@ -730,6 +730,24 @@ def test_the_error_of_a_handles_call_reaches_a_caller_that_reads_late() -> None:
     assert raised.failure.message == "no worker"
 
 
+def test_threads_that_ask_at_once_for_a_handle_share_its_line(
+    system: rr.System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = threading.Barrier(2)
+
+    class Slow(remote_calls.HandleLine):
+        def __init__(self, *args: Any) -> None:
+            together.wait(LIMIT_S)
+            super().__init__(*args)
+
+    monkeypatch.setattr("rr_actors.system.hosting.node.HandleLine", Slow)
+    node = system._node  # pyright: ignore[reportPrivateUsage]
+    assert node is not None
+    with ThreadPoolExecutor() as threads:
+        one, other = threads.map(node.handle, ["far", "far"])
+    assert one is other
+
+
 def test_a_handle_on_an_unknown_registrar_is_an_error(system: rr.System) -> None:
     with pytest.raises(rr.UnknownRegistrar, match="nobody"):
         system.registrar("nobody").resources()
