@@ -356,6 +356,8 @@ def test_what_a_killed_application_held_for_its_clients_is_released_at_its_next_
         with rr.connect(state_dir) as client:
             worker = client.open_registrar("worker")
             worker.load("shop/thing", Order("r2"))
+            client.open_registrar("idle")
+            assert len(list(state_dir.glob("client.*"))) == 2
             application.kill()
             application.wait()
             with pytest.raises(NotRunning):
@@ -365,6 +367,7 @@ def test_what_a_killed_application_held_for_its_clients_is_released_at_its_next_
     workshop.wait("unload r2")
     eventually(lambda: system.registrar("shop").resources() == [])
     assert system.dormant() == []
+    assert list(state_dir.glob("client.*")) == []
 
 
 def test_a_name_of_clients_is_refused_to_the_application(system: rr.System) -> None:
