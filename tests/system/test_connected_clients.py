@@ -28,7 +28,7 @@ from rr_actors.base.errors import (
     UnknownQuery,
     UsageError,
 )
-from rr_actors.system.console import console_client, console_connections
+from rr_actors.system.console import console_client, console_connections, console_questions
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
 from rr_actors.system.console.console_messages import Find
 from rr_actors.wire.unix_sockets import Peer
@@ -416,3 +416,15 @@ def test_the_state_of_one_query_is_asked_for_and_no_other_row(
     with pytest.raises(UnknownQuery, match="does not hold it any more"):
         worker.fetch_state(first.id)
     assert worker.fetch_state(second) == "OK"
+
+
+def test_queries_that_are_not_known_are_no_empty_list(client: rr.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_question: Any) -> Any:
+        raise Unavailable("it does not answer")
+
+    worker = client.open_registrar("worker")
+    query = worker.load("provider/camera", "front")
+    assert [row.id for row in worker.queries()] == [query.id]
+    monkeypatch.setattr(console_questions, "page", refuse)
+    with pytest.raises(Unavailable, match=r"client.worker: its queries are not known: .*does not answer"):
+        worker.queries()
