@@ -28,9 +28,11 @@ from rr_actors.base.errors import (
     UnknownQuery,
     UsageError,
 )
+from rr_actors.base.values.canonical import encode
 from rr_actors.system.console import console_client, console_connections, console_questions
+from rr_actors.system.console.client_registrars import ClientRegistrars
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
-from rr_actors.system.console.console_messages import Find
+from rr_actors.system.console.console_messages import Find, Hold, Holding
 from rr_actors.wire.unix_sockets import Peer
 from support import TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
 from support_managers import Made, Order, Shop
@@ -255,6 +257,36 @@ def test_a_load_that_is_cancelled_is_released_when_it_has_ended_also_after_its_l
 
     eventually(lambda: provider.resources() == [])
     eventually(lambda: worker.queries() == [])
+
+
+def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
+    client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, worker = Gate(), client.open_registrar("worker")
+    hold = ClientRegistrars.hold
+
+    def held(*command: Any) -> Any:
+        answer = hold(*command)
+        gate()
+        return answer
+
+    monkeypatch.setattr(ClientRegistrars, "hold", held)
+    connection = client._connections.open()
+
+    def load() -> None:
+        with pytest.raises(NotRunning):
+            connection.ask(Hold("client.worker", "provider/camera", encode("front")), Holding)
+
+    loading = threading.Thread(target=load)
+    loading.start()
+    gate.wait_arrived()
+    connection.close()
+    loading.join()
+    worker.queries()  # the console reads this after the end of the other connection
+    gate.open()
+
+    eventually(lambda: provider.resources() == [])
+    assert worker.queries() == []
 
 
 def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(
