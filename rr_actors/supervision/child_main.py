@@ -88,15 +88,15 @@ class ChildProcess:
         self._inherited = inherited
         self._path = path
         self._spec = spec
-        self._spec_shutdown_s: Shutdown | None = None
+        self._shutdown_s: Shutdown  # from the specification
         self._channel: Channel | None = None
         self._hosted: Hosted | None = None
         self._told_to_start = asyncio.Event()
         self._stop: Stop | None = None
+        self._is_limited = False  # the parent limits the stops that it asks for
         self._told_to_stop = asyncio.Event()
         self._ended = asyncio.Event()
         self._report: ExitReport | None = None
-        self._shutdown_s: Shutdown = "infinity"  # the parent limits the stops that it asks for
 
     async def live(self) -> int:
         """Run the child until its end, and return the exit code."""
@@ -114,9 +114,8 @@ class ChildProcess:
 
     def terminate(self) -> None:
         """Stop the child gracefully, after SIGTERM or the loss of the supervisor."""
-        if self._stop is None and self._spec_shutdown_s is not None:
-            self._shutdown_s = self._spec_shutdown_s
-        self._stop = self._stop or Stop()
+        if self._stop is None:
+            self._stop, self._is_limited = Stop(), True
         self._told_to_stop.set()
 
     async def _live(self) -> int:
@@ -138,7 +137,7 @@ class ChildProcess:
 
     async def _start(self) -> bool:
         spec: ChildSpec = await self.node.dispatcher.workers.run(pickling.loads, self._spec)
-        self._spec_shutdown_s = spec.shutdown_s
+        self._shutdown_s = spec.shutdown_s
         cls, args, kwargs = target_of(spec)
         self._hosted = prepare(self.node, cls, self._path, self._exited, once=spec.restart == "temporary")
         starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent has the time limit
@@ -152,7 +151,8 @@ class ChildProcess:
     async def _stop_actor(self) -> ExitReport:
         assert self._hosted is not None
         assert self._stop is not None
-        return await self._hosted.stop(self._shutdown_s, final=self._stop.final)
+        limit_s = self._shutdown_s if self._is_limited else "infinity"
+        return await self._hosted.stop(limit_s, final=self._stop.final)
 
     def _leave(self, report: ExitReport) -> int:
         self._say(Exiting(report.reason, report.detail, report.traceback))

@@ -116,7 +116,8 @@ class History:
         for record in reversed(self._records):
             if record.path != path or record.event not in ("exited", "stopped", "start_failed"):
                 continue
-            if len(found) == count or record.reason in ("normal", "shutdown"):
+            dropped = record.event == "stopped" and not record.reason  # while it waited for its turn to start
+            if len(found) == count or dropped or record.reason in ("normal", "shutdown"):
                 break
             found.append(_how(record))
         return found[::-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Iterable
 from pathlib import Path
@@ -87,7 +88,9 @@ logger = logging.getLogger("rr_actors")
 
 
 def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
-    """Return the registrars whose catalog on disk holds or serves something, or cannot be read. In a worker.
+    """Return the registrars whose catalog on disk holds or serves something, or cannot be read, and all of clients.
+
+    Blocks.
 
     Args:
         except_for: names of registrars that are about to be opened.
@@ -99,7 +102,8 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
         if name in except_for:
             continue
         try:
-            if any(isinstance(row, Held | Peer | Resource) for row in read_rows(catalog)):
+            rows = read_rows(catalog)
+            if name.startswith(CLIENTS) or any(isinstance(row, Held | Peer | Resource) for row in rows):
                 found.append(name)
         except CatalogError as error:
             logger.warning("%s: not read: %s", name, error)
@@ -108,27 +112,37 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
 
 
 async def give_up_clients(node: Node, names: Iterable[str]) -> None:
-    """Give up the registrars in `names` that clients of a killed application have left. On the loop."""
+    """Give up the registrars in `names` that clients of a killed application have left, and erase their catalogs.
+
+    On the loop.
+    """
     for name in names:
         if name.startswith(CLIENTS):
             try:
-                await give_up(node, name)
+                await give_up(node, name, erase=True)
             except RrError as error:  # a damaged catalog, for instance: the system starts all the same
                 logger.warning("%s: what it holds is not released, and it stays dormant: %s", name, error)
 
 
-async def give_up(node: Node, name: str) -> None:
+async def give_up(node: Node, name: str, *, erase: bool = False) -> None:
     """Delete what a dormant registrar holds from its catalog, and have the providers release it. On the loop.
+
+    Args:
+        erase: remove the catalog from disk.
 
     Raises:
         CatalogError: its catalog cannot be opened.
     """
-    await node.dispatcher.workers.run(forget_held, node.config.registrar(name), Path(node.info.state_dir))
+    config, state_dir = node.config.registrar(name), Path(node.info.state_dir)
+    await node.dispatcher.workers.run(functools.partial(forget_held, config, state_dir, erase=erase))
     await node.retire(name)
 
 
-def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
+def forget_held(config: RegistrarConfig, state_dir: Path, *, erase: bool = False) -> None:
     """Delete the queries and peers of a registrar that nobody has open from its catalog. Blocks.
+
+    Args:
+        erase: remove the catalog from disk, too.
 
     Raises:
         CatalogError: its catalog cannot be opened or written.
@@ -139,5 +153,7 @@ def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
     try:
         content = store.load()
         store.commit([Drop(table, id) for table in _HELD for id in content[table]])
-    finally:
+    except BaseException:
         store.close()
+        raise
+    store.close(erase=erase)

@@ -9,13 +9,17 @@ import sys
 from typing import Self
 
 from rr_actors.base.checks import Extra
-from rr_actors.base.errors import Unavailable
+from rr_actors.base.errors import Unavailable, shown
 from rr_actors.runtime.processes.lifeline import kill_group
 
 _LIBRARIES = ("nicegui", "typer", "rich")
 """The libraries of the program. They are looked for and not imported here: only the page's process needs them."""
 _START_S = 60.0
 """Seconds that the page may take until it can be opened: a busy machine imports slowly."""
+
+
+_END_S = 5.0
+"""Seconds that the program may take until it has ended, once it has closed its output."""
 
 
 class WebPage:
@@ -79,7 +83,13 @@ class WebPage:
         ready = poll.poll(_START_S * 1000)
         line = output.readline().decode().strip() if ready else ""
         if not line.startswith("http"):
-            code = self._program.poll() if not ready else self._program.wait()
-            how = f"it has ended with exit code {code}" if code is not None else f"it is silent for {_START_S:g} s"
+            how = f"its first line is no address: {shown(line)}" if line else self._end()
             raise Unavailable(f"serve_web: the page did not start: {how}; its error output says why")
         return line
+
+    def _end(self) -> str:
+        """Say how the program, which prints nothing, has ended, if it has."""
+        try:
+            return f"it has ended with exit code {self._program.wait(_END_S)}"
+        except subprocess.TimeoutExpired:
+            return "it runs, and prints nothing"

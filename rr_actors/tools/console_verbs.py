@@ -232,7 +232,9 @@ def _say_event(event: c.Event, as_json: bool) -> None:
 
 def _say_missed(missed: c.Missed, as_json: bool) -> None:
     if as_json:
-        typer.echo(_json({"missed": missed.count, "seq": missed.seq, "tree": missed.tree.rows}))
+        typer.echo(
+            _json({"missed": missed.count, "seq": missed.seq, "total": missed.tree.total, "tree": missed.tree.rows})
+        )
     else:
         typer.echo(missed_line(missed))
 

@@ -14,11 +14,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import pytest
 
 import rr_actors as rr
+from rr_actors.system.hosting import remote_calls
 from support import (
     LIMIT_S,
     REPOSITORY,
@@ -693,6 +695,57 @@ def test_who_waits_by_a_handle_hears_of_the_systems_end(start: Start, workshop: 
             asked.result(LIMIT_S)
         with pytest.raises(rr.Unavailable):
             handle.queries()
+
+
+def test_the_error_of_a_handles_call_reaches_a_caller_that_reads_late() -> None:
+    class FullAtFirst:
+        def __init__(self, sent: asyncio.Future[Any]) -> None:
+            self.full = True
+            self.sent = sent
+
+        def send(self, message: Any) -> None:
+            if self.full:
+                self.full = False
+                raise rr.MailboxFull("it does not read", name="app", limit=1)
+            self.sent.set_result(message)
+
+        def flush(self) -> None: ...
+
+    def refuse(*_call: Any, **_options: Any) -> None:
+        raise rr.Unavailable("no worker")
+
+    async def answer() -> Any:
+        loop = asyncio.get_running_loop()
+        dispatcher = SimpleNamespace(loop=loop, workers=SimpleNamespace(submit=refuse))
+        link: Any = FullAtFirst(loop.create_future())
+        remote_calls.Door(SimpleNamespace(dispatcher=dispatcher), None, link).received(
+            link, remote_calls.Call(7, "x", b"")
+        )
+        async with asyncio.timeout(5):
+            return await link.sent
+
+    raised = asyncio.run(answer())
+
+    assert raised.number == 7
+    assert raised.failure.message == "no worker"
+
+
+def test_threads_that_ask_at_once_for_a_handle_share_its_line(
+    system: rr.System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = threading.Barrier(2)
+
+    class Slow(remote_calls.HandleLine):
+        def __init__(self, *args: Any) -> None:
+            together.wait(LIMIT_S)
+            super().__init__(*args)
+
+    monkeypatch.setattr("rr_actors.system.hosting.node.HandleLine", Slow)
+    node = system._node  # pyright: ignore[reportPrivateUsage]
+    assert node is not None
+    with ThreadPoolExecutor() as threads:
+        one, other = threads.map(node.handle, ["far", "far"])
+    assert one is other
 
 
 def test_a_handle_on_an_unknown_registrar_is_an_error(system: rr.System) -> None:

@@ -303,6 +303,18 @@ def test_a_restart_by_hand_that_its_group_overtakes_is_a_member_from_then_on() -
     assert [restart.id for restart in made.tree.restarts] == ["a", "b"]
 
 
+@pytest.mark.parametrize("outcome", ["ok", "fail"])
+def test_a_restart_by_hand_of_a_temporary_child_is_answered_though_its_group_restarts(outcome: str) -> None:
+    made = world(child("a"), strategy="one_for_all")
+    made.answer("update", Supervisor([child("a"), child("t", "temporary")], strategy="one_for_all"))
+    caller = made.call("restart_child", "t")
+    made.exit("a", "killed")
+    made.outcomes["t"].append(outcome)  # type: ignore[arg-type]
+    made.settle()
+    assert isinstance(made.replies[caller].error, StartFailed) is (outcome == "fail")
+    assert made.states() == {"a": "running", "t": "stopped" if outcome == "fail" else "running"}
+
+
 def test_calls_that_waited_for_it_are_answered_when_the_supervisor_gives_up_over_it() -> None:
     made = world(child("a"), child("b"), strategy="one_for_all", max_restarts=1)
     made.answer("terminate_child", "b")
@@ -580,6 +592,11 @@ def test_the_jitter_is_the_callers_chance() -> None:
     made.chance = 0.5
     made.exit("a", "killed")
     assert made.starts["a"].delay_s == 6
+
+
+def test_a_backoff_of_no_delay_never_waits_however_many_restarts_there_were() -> None:
+    assert Backoff(delay_s=0.0).delay(10_000, 0.0) == 0.0
+    assert Backoff(delay_s=0.1, maximum_s=30.0).delay(10_000, 0.0) == 30.0
 
 
 def test_a_group_waits_for_the_backoff_of_the_one_that_fell() -> None:

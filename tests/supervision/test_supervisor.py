@@ -38,6 +38,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+from rr_actors.supervision.event_history import History, Record
 from rr_actors.wire.name_service import Entry, Status, actor_key, open_state_dir, registrar_key
 from support import lives, quickly, wait_gone
 from support_supervision import Idle, Log, StuckManager, Threaded, Tree, Worker, eventually, let_go
@@ -263,6 +264,25 @@ def test_a_sigterm_stops_a_child_gracefully(plant: Plant, log: Log) -> None:
     eventually(lambda: tree.child("root/a").state == "stopped")
     assert log.lines() == ["start a", "stop a"]
     assert reasons(tree, "root/a") == ["shutdown"]
+
+
+def test_a_sigterm_before_the_specification_is_unpickled_stops_a_child_within_its_time(plant: Plant, log: Log) -> None:
+    here = os.getpid()
+
+    def unpickled() -> str:
+        assert os.getpid() != here
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.2)  # meanwhile the loop learns of it
+        return "a"
+
+    class Name:
+        def __reduce__(self) -> Any:
+            return unpickled, ()
+
+    args = (str(log.path), Name(), "", "hang")
+    tree = plant(ChildSpec(Worker, id="a", args=args, restart="temporary", shutdown_s=0.2))
+    eventually(lambda: reasons(tree, "root/a") == ["killed"])
+    assert log.lines() == ["start a"]
 
 
 # -- exits and restarts ----------------------------------------------------------------------------------------------
@@ -660,6 +680,17 @@ def test_a_pykka_threading_actor_can_be_a_child(plant: Plant, placement: Any) ->
 
 
 @both
+@pytest.mark.parametrize("code", [None, 1])
+def test_the_asker_of_a_pykka_threading_actor_that_leaves_meanwhile_is_told(
+    plant: Plant, placement: Any, code: int | None
+) -> None:
+    tree = plant(ChildSpec(Threaded, id="a", restart="temporary", placement=placement))
+    with pytest.raises(pykka.ActorDeadError, match="root/a"):
+        tree.ask("root/a", ("leave", code))
+    eventually(lambda: reasons(tree, "root/a") == ["abnormal" if code else "normal"])
+
+
+@both
 def test_a_pykka_threading_actor_fails_to_start_when_its_on_start_raises(plant: Plant, placement: Any) -> None:
     with pytest.raises(StartFailed, match="as it was told"):
         plant(ChildSpec(Threaded, id="a", args=("fail",), placement=placement))
@@ -739,6 +770,17 @@ def test_each_exit_is_one_structured_log_line(plant: Plant, log: Log, caplog: py
     facts: dict[str, Any] = line.__dict__["supervision"]
     assert (facts["event"], facts["code"], facts["signal"]) == ("exited", -9, "SIGKILL")
     assert line.levelno == logging.WARNING
+
+
+def test_a_child_stopped_while_it_waits_to_be_started_again_has_not_died_once_more() -> None:
+    history = History()
+    killed = Record("exited", "root/a", "actor", 1, 0.0, "restarting", reason="killed", code=-9, signal="SIGKILL")
+    history.add(killed)
+    assert history.deaths("root/a", 3) == ["SIGKILL"]
+    history.add(Record("stopped", "root/a", "actor", 1, 0.0, "stopped"))
+    assert history.deaths("root/a", 3) == []
+    history.add(killed)
+    assert history.deaths("root/a", 3) == ["SIGKILL"]
 
 
 def test_events_are_told_as_they_happen_from_every_process(plant: Plant, log: Log) -> None:

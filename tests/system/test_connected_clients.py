@@ -28,9 +28,11 @@ from rr_actors.base.errors import (
     UnknownQuery,
     UsageError,
 )
-from rr_actors.system.console import console_client, console_connections
+from rr_actors.base.values.canonical import encode
+from rr_actors.system.console import console_client, console_connections, console_questions
+from rr_actors.system.console.client_registrars import ClientRegistrars
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
-from rr_actors.system.console.console_messages import Find
+from rr_actors.system.console.console_messages import Find, Hold, Holding
 from rr_actors.wire.unix_sockets import Peer
 from support import TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
 from support_managers import Made, Order, Shop
@@ -257,6 +259,36 @@ def test_a_load_that_is_cancelled_is_released_when_it_has_ended_also_after_its_l
     eventually(lambda: worker.queries() == [])
 
 
+def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
+    client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, worker = Gate(), client.open_registrar("worker")
+    hold = ClientRegistrars.hold
+
+    def held(*command: Any) -> Any:
+        answer = hold(*command)
+        gate()
+        return answer
+
+    monkeypatch.setattr(ClientRegistrars, "hold", held)
+    connection = client._connections.open()
+
+    def load() -> None:
+        with pytest.raises(NotRunning):
+            connection.ask(Hold("client.worker", "provider/camera", encode("front")), Holding)
+
+    loading = threading.Thread(target=load)
+    loading.start()
+    gate.wait_arrived()
+    connection.close()
+    loading.join()
+    worker.queries()  # the console reads this after the end of the other connection
+    gate.open()
+
+    eventually(lambda: provider.resources() == [])
+    assert worker.queries() == []
+
+
 def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(
     client: rr.Client, system: rr.System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -356,6 +388,8 @@ def test_what_a_killed_application_held_for_its_clients_is_released_at_its_next_
         with rr.connect(state_dir) as client:
             worker = client.open_registrar("worker")
             worker.load("shop/thing", Order("r2"))
+            client.open_registrar("idle")
+            assert len(list(state_dir.glob("client.*"))) == 2
             application.kill()
             application.wait()
             with pytest.raises(NotRunning):
@@ -365,6 +399,7 @@ def test_what_a_killed_application_held_for_its_clients_is_released_at_its_next_
     workshop.wait("unload r2")
     eventually(lambda: system.registrar("shop").resources() == [])
     assert system.dormant() == []
+    assert list(state_dir.glob("client.*")) == []
 
 
 def test_a_name_of_clients_is_refused_to_the_application(system: rr.System) -> None:
@@ -413,3 +448,15 @@ def test_the_state_of_one_query_is_asked_for_and_no_other_row(
     with pytest.raises(UnknownQuery, match="does not hold it any more"):
         worker.fetch_state(first.id)
     assert worker.fetch_state(second) == "OK"
+
+
+def test_queries_that_are_not_known_are_no_empty_list(client: rr.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_question: Any) -> Any:
+        raise Unavailable("it does not answer")
+
+    worker = client.open_registrar("worker")
+    query = worker.load("provider/camera", "front")
+    assert [row.id for row in worker.queries()] == [query.id]
+    monkeypatch.setattr(console_questions, "page", refuse)
+    with pytest.raises(Unavailable, match=r"client.worker: its queries are not known: .*does not answer"):
+        worker.queries()

@@ -19,6 +19,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.system.console import console_feed
+from rr_actors.system.console.console_messages import Children, ChildRow, Missed
+from rr_actors.tools import console_verbs
 from rr_actors.tools.explanations import ago
 from support import Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
 from support_cli import run_cli
@@ -537,6 +539,13 @@ def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Regis
     assert entries[0]["name"] == "Load"
     assert "no query or resource" in refused(2, "sequence", "ffffffff", "--file", file)
     assert "there is a file already" in refused(2, "record", file)
+
+
+def test_a_line_about_missed_events_says_how_many_rows_the_tree_has(capsys: pytest.CaptureFixture[str]) -> None:
+    page = Children(501, [ChildRow("root", 0, "supervisor", "running")])
+    console_verbs._say_missed(Missed(3, 9, page), True)
+    said = json.loads(capsys.readouterr().out)
+    assert (said["missed"], said["seq"], said["total"], len(said["tree"])) == (3, 9, 501, 1)
 
 
 def test_sequence_says_how_many_entries_it_was_too_slow_for(

@@ -23,6 +23,7 @@ import pytest
 from playwright.async_api import Page
 
 import rr_actors as rr
+from rr_actors.system import web_process
 from support import LIMIT_S, Workshop, child, kill, lives, pid_of, quickly, serve, wait_gone
 from support_browser import Chromium, Tab, needs_chromium, web
 from support_managers import Order, Shop
@@ -385,6 +386,21 @@ def test_prometheus_reads_figures_with_the_token_in_a_header(shop: rr.System) ->
 
 
 # -- its life --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("prints", "said"), [("echo hello", "hello"), ("exec >&-", "prints nothing")])
+def test_a_program_that_prints_no_address_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prints: str, said: str
+) -> None:
+    program = tmp_path / "python"
+    program.write_text(f"#!/bin/sh\n{prints}\nexec sleep 60\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(web_process, "_END_S", 0.2)
+    began = time.monotonic()
+    with pytest.raises(rr.Unavailable, match=said):
+        web_process.WebPage(str(tmp_path), "127.0.0.1", 0)
+    assert time.monotonic() - began < 30
 
 
 def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None:

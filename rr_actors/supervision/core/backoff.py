@@ -45,5 +45,5 @@ class Backoff:
         try:
             wait_s = min(self.maximum_s, self.delay_s * self.factor**attempt)
         except OverflowError:
-            wait_s = self.maximum_s
+            wait_s = self.maximum_s if self.delay_s else 0.0
         return wait_s * (1 - self.jitter * chance)

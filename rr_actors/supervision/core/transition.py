@@ -151,7 +151,9 @@ class Draft:
                 case Phase.RUNNING:
                     self.put(child, phase=Phase.CONDEMNED)
                 case Phase.STARTING:  # not up yet: its start is repeated, for the same purpose
-                    self.put(child, phase=Phase.CONDEMNED, why=Why.RESTART if child.why is Why.MANUAL else child.why)
+                    # A temporary child never becomes a member that is restarted: its caller waits for the second start.
+                    joins = child.why is Why.MANUAL and child.spec.restart != "temporary"
+                    self.put(child, phase=Phase.CONDEMNED, why=Why.RESTART if joins else child.why)
                 case Phase.STOPPED if self.forgets(child):  # an update added it, and it was never started
                     self.down(child, "stopped")
                 case Phase.STOPPED:  # OTP: the whole group is started, also children stopped by hand

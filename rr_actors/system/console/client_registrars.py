@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import threading
-from collections.abc import Callable
 
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownRegistrar, shown, text_of
 from rr_actors.base.names import CLIENTS, check_name
@@ -68,17 +67,15 @@ class ClientRegistrars:
                     "registrar %s: its client has gone, and not all that it held is released", registrar.name
                 )
 
-    def hold(self, command: Hold, is_gone: Callable[[], bool]) -> Holding:
-        """Load a resource for a client; release it again if the client does not wait any more.
+    def hold(self, command: Hold) -> Holding:
+        """Load a resource for a client.
 
         Raises:
             RrError: as Registrar.load(), or the response is too long.
         """
         registrar = self._of(command.registrar)
         query, response = load_bytes(registrar, command.server, command.request, command.timeout_s)
-        if is_gone():
-            registrar.unload(query.id, timeout_s=command.timeout_s)
-        elif len(response) + _ROOM_BYTES > ANSWER_LIMIT_BYTES:
+        if len(response) + _ROOM_BYTES > ANSWER_LIMIT_BYTES:
             registrar.unload(query.id, timeout_s=command.timeout_s)
             text = f"a response of {len(response)} bytes is over a client's limit of {ANSWER_LIMIT_BYTES}"
             raise NotSerializable(f"{command.server}: {text}; give the name of a file, say", path="response")
@@ -92,6 +89,15 @@ class ClientRegistrars:
         """
         self._of(command.registrar).unload(command.query_id, timeout_s=command.timeout_s)
         return Done(f"released {command.query_id}")
+
+    def release_unheard(self, registrar: str, query_id: str) -> None:
+        """Release a query of a client that left before it heard the query's id."""
+        try:
+            self._of(registrar).unload(query_id)
+        except UnknownRegistrar:
+            logger.debug("query %s: released with its registrar, as the client has gone", query_id)
+        except RrError:
+            logger.exception("query %s: its client has gone, and it is not released", query_id)
 
     def _of(self, name: str) -> Registrar:
         with self._lock:

@@ -169,9 +169,17 @@ class ClientRegistrar:
         self._connections.ask(Release(self.name, _id_of(query_or_id), limit_s), Done, limit_s + _GRACE_S)
 
     def queries(self) -> list[QueryRow]:
-        """Return the queries that the registrar holds, each with the state of its last status."""
+        """Return the queries that the registrar holds, each with the state of its last status.
+
+        Raises:
+            NotRunning: the system has ended.
+            Unavailable: the registrar does not answer.
+        """
         with self._connections.lent() as client:
-            return client.queries(self.name).rows
+            found = client.queries(self.name)
+        if found.notes:
+            raise Unavailable(f"{self.name}: its queries are not known: {'; '.join(found.notes)}")
+        return found.rows
 
     def fetch_state(self, query_or_id: ClientQuery | str) -> str:
         """Ask the system for the state of the last status of a query: "OK", "WARNING" ...

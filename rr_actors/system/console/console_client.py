@@ -132,7 +132,7 @@ class ConsoleClient:
     def follow(self, follow: Follow) -> Iterator[Events | Missed]:
         """Yield the events from now on, until the system ends. The connection has no other use after that.
 
-        A Missed has the number of events that this reader was too slow for, and the tree as it is now.
+        A Missed has the number of events that this reader was too slow for, and the first page of the tree now.
 
         Raises:
             RrError: the system refused the request.

@@ -87,7 +87,7 @@ class Commands:
             case OpenRegistrar():
                 return self.clients.open(self._view, command.name, connection)
             case Hold():
-                return self.clients.hold(command, is_gone)
+                return self.clients.hold(command)
             case Release():
                 return self.clients.release(command)
             case AskActor():

@@ -410,7 +410,10 @@ class Entries(_Message, frozen=True):
 
 
 class Missed(_Message, frozen=True):
-    """A notice that the reader was too slow: it missed `count` events, up to number `seq`. `tree` is the tree now."""
+    """A notice that the reader was too slow: it missed `count` events, up to number `seq`.
+
+    `tree` is the first page of the tree as it is now; ListChildren asks for the others.
+    """
 
     count: int
     seq: int

@@ -7,11 +7,12 @@ hold at most one worker, one answer and one list of events, and the system waits
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 
@@ -31,6 +32,8 @@ from rr_actors.system.console.console_messages import (
     Follow,
     Following,
     Hello,
+    Hold,
+    Holding,
     Missed,
     OpenRegistrar,
     Refused,
@@ -141,14 +144,15 @@ class Console:
         await asyncio.sleep(0)
         steps.end("the console is not closed altogether")
 
-    def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> bytes:
-        """Return the frame that answers a request. In a worker."""
+    def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> tuple[bytes, str]:
+        """Return the frame that answers a request, and the id of the query that it loaded for a client. In a worker."""
         try:
-            return framed(self._answer(request, is_gone, connection), ANSWER_LIMIT_BYTES)
+            answer = self._answer(request, is_gone, connection)
+            return framed(answer, ANSWER_LIMIT_BYTES), answer.query_id if isinstance(answer, Holding) else ""
         except Exception as error:
             if not isinstance(error, RrError):
                 logger.exception("console: %s failed", type(request).__name__)
-            return refusal(error)
+            return refusal(error), ""
 
     def _answer(self, request: Request, is_gone: Callable[[], bool], connection: object) -> Answer:
         if isinstance(request, Hello | Follow | BeginRecording):
@@ -248,15 +252,14 @@ class Connection(asyncio.Protocol):
         if self._reader is not None:
             self._console.feed.remove(self._reader)
         if self._has_registrars:
-            self._close_registrars()
+            self._clean_up(self._console.commands.clients.close, self)
 
-    def _close_registrars(self) -> None:
-        """Have the client's registrars closed, after an opening that may still be in progress."""
-        console = self._console
+    def _clean_up(self, fn: Callable[..., None], *args: Any) -> None:
+        """Have a worker release what the client has left, after an opening that may still be in progress."""
         try:
-            console.node.dispatcher.workers.serial(self._key, console.commands.clients.close, self)
+            self._console.node.dispatcher.workers.serial(self._key, fn, *args)
         except MailboxFull:
-            asyncio.get_running_loop().call_later(_AGAIN_S, self._close_registrars)
+            asyncio.get_running_loop().call_later(_AGAIN_S, self._clean_up, fn, *args)
         except Unavailable:  # the process is closing, and with it all its registrars
             logger.debug("the registrars of a client are closed with the system")
 
@@ -301,18 +304,20 @@ class Connection(asyncio.Protocol):
         try:
             if isinstance(request, OpenRegistrar):
                 self._has_registrars = True
-                workers.serial(self._key, *answer, done=self._answered)
+                workers.serial(self._key, *answer, done=functools.partial(self._answered, request))
             else:
-                workers.submit(*answer, done=self._answered)
+                workers.submit(*answer, done=functools.partial(self._answered, request))
         except Unavailable as error:
-            self._answered(refusal(error), None)
+            self._answered(request, (refusal(error), ""), None)
 
-    def _answered(self, frame: bytes | None, error: BaseException | None) -> None:
+    def _answered(self, request: Request, answer: tuple[bytes, str] | None, error: BaseException | None) -> None:
         self._busy = False
-        if self._ended:
-            return
-        self._transport.write(refusal(error or Unavailable("it was not answered")) if frame is None else frame)
-        self._next()
+        frame, query_id = answer or (refusal(error or Unavailable("it was not answered")), "")
+        if not self._ended:
+            self._transport.write(frame)
+            self._next()
+        elif query_id and isinstance(request, Hold):
+            self._clean_up(self._console.commands.clients.release_unheard, request.registrar, query_id)
 
     # -- the feed ----------------------------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from rr_actors.actors.refs import ref_to
 from rr_actors.actors.remote.hub import running
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.checks import invalid
-from rr_actors.base.errors import StartFailed, is_a
+from rr_actors.base.errors import StartFailed, is_a, text_of
 from rr_actors.registrar.declarations import Declared
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime.callback_errors import raised_by
@@ -278,6 +278,13 @@ class HostedThread(Hosted):
         call = self._node.dispatcher.call
         ref = ref_to(self.path)
         on_start, handle, loop, fail = actor.on_start, actor._handle_receive, actor._actor_loop, actor._handle_failure
+        take = actor.actor_inbox.get
+        envelope: Any = None  # of the message that the actor handles
+
+        def wrapped_take(*args: Any, **kwargs: Any) -> Any:
+            nonlocal envelope
+            envelope = take(*args, **kwargs)
+            return envelope
 
         def wrapped_on_start() -> None:
             answer = on_start()
@@ -294,6 +301,11 @@ class HostedThread(Hosted):
             except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
                 if not (isinstance(error, SystemExit) and not error.code):
                     self._report = abnormal(raised_by(error))
+                reply, envelope.reply_to = envelope.reply_to, None  # Pykka would set it to None
+                if reply is not None:
+                    dead = pykka.ActorDeadError(f"{self.path} ended while it handled the message: {text_of(error)}")
+                    dead.__cause__ = error
+                    reply.set_exception((pykka.ActorDeadError, dead, None))
                 actor._stop()
                 return None
 
@@ -312,6 +324,7 @@ class HostedThread(Hosted):
 
         actor.on_start, actor._handle_receive = wrapped_on_start, wrapped_handle
         actor._actor_loop, actor._handle_failure = wrapped_loop, wrapped_fail
+        actor.actor_inbox.get = wrapped_take
         actor.use_daemon_thread = True
         self.ref = actor.actor_ref
         actor._start_actor_loop()

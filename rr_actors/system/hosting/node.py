@@ -149,7 +149,7 @@ class Node:
         steps.take("ending to look after the files", self.keeper.stop)
         for name in list(self.registrars):
             steps.take(f"closing registrar {name!r}", self.close_registrar, name, Status.STOPPED)
-        for line in self._handles.values():
+        for line in list(self._handles.values()):
             steps.take("closing the line of a handle", line.close)
         try:
             await steps.take_async("closing the links of this process", self.local.close())
@@ -174,10 +174,10 @@ class Node:
         raise UnknownRegistrar(f"registrar {hello.to!r}: not in this process", registrar=hello.to)
 
     def handle(self, registrar: str) -> HandleLine:
-        """Return the line to a registrar of another process, for its handle."""
+        """Return the line to a registrar of another process, for its handle. From any thread."""
         line = self._handles.get(registrar)
-        if line is None:
-            line = self._handles[registrar] = HandleLine(self, registrar)
+        if line is None:  # of the lines that several threads make at once, all take the first
+            line = self._handles.setdefault(registrar, HandleLine(self, registrar))
         return line
 
     def ref(self, id: str, near: str = "") -> ActorRef[Any]:

@@ -87,8 +87,7 @@ class Door:
                 self._send_parts(link, message.number, memoryview(body))
             else:
                 own = error.details if type(error) is CallbackRaised else failure_of(error)
-                link.send(Raised(message.number, own))
-                link.flush()
+                self._send_error(link, Raised(message.number, own))
 
         try:
             workers.submit(self._calling, message, done=done)
@@ -113,6 +112,14 @@ class Door:
             link.send(Returned(number, bytes(left)))
         except MailboxFull:  # the caller must read a part of it first
             self._node.dispatcher.loop.call_later(_RETRY_S, self._send_parts, link, number, left)
+        link.flush()
+
+    def _send_error(self, link: Link, error: Raised) -> None:
+        """Send a call's error, if need be every 10 ms until the link takes it."""
+        try:
+            link.send(error)
+        except MailboxFull:
+            self._node.dispatcher.loop.call_later(_RETRY_S, self._send_error, link, error)
         link.flush()
 
     def lost(self, link: Link, reason: Exception | None) -> None:
