@@ -680,16 +680,16 @@ class Unloads:
     def _begin(
         self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None, reply: Reply[None]
     ) -> None:
+        if left_s is None:
+            release(query_id, functools.partial(settle, reply))
+            return
         overdue = functools.partial(self.release_overdue, query_id, timeout_s)
+        self.calls.limits.begin(left_s, overdue)
+        release(query_id, functools.partial(self._ended, left_s, overdue, reply))
 
-        def ended(error: RrError | None) -> None:
-            if left_s is not None:
-                self.calls.limits.end(left_s, overdue)
-            settle(reply, error)
-
-        if left_s is not None:
-            self.calls.limits.begin(left_s, overdue)
-        release(query_id, ended)
+    def _ended(self, left_s: float, overdue: Callable[[], object], reply: Reply[None], error: RrError | None) -> None:
+        self.calls.limits.end(left_s, overdue)
+        settle(reply, error)
 
     def release(self, query_id: str, done: UnloadWaiter) -> None:
         """Have the registrar's actor release a query, and call `done` with the error, or with None."""
