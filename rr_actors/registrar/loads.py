@@ -552,6 +552,35 @@ _DOING = {
 Release = Callable[[str, UnloadWaiter], None]
 
 
+class _Unloading:
+    """One unload by the loop: one object, as thousands may be in flight, and the garbage collector visits each."""
+
+    __slots__ = ("_left_s", "_query_id", "_reply", "_timeout_s", "_unloads")
+
+    def __init__(
+        self, unloads: Unloads, query_id: str, left_s: float | None, timeout_s: float | None, reply: Reply[None]
+    ) -> None:
+        self._unloads = unloads
+        self._query_id = query_id
+        self._left_s = left_s
+        self._timeout_s = timeout_s
+        self._reply = reply
+
+    def begin(self, release: Release) -> None:
+        """Begin the time limit, and release the query."""
+        if self._left_s is not None:
+            self._unloads.calls.limits.begin(self._left_s, self._overdue)
+        release(self._query_id, self._ended)
+
+    def _ended(self, error: RrError | None) -> None:
+        if self._left_s is not None:
+            self._unloads.calls.limits.end(self._left_s, self._overdue)
+        settle(self._reply, error)
+
+    def _overdue(self) -> None:
+        self._unloads.release_overdue(self._query_id, self._timeout_s)
+
+
 class Unloads:
     """The unloads of one registrar. From any thread."""
 
@@ -573,13 +602,13 @@ class Unloads:
 
     def _finish(self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None) -> None:
         reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(self._begin, release, query_id, left_s, timeout_s, reply)
+        self.calls.dispatcher.call(_Unloading(self, query_id, left_s, timeout_s, reply).begin, release)
         self.calls.finish(reply, left_s, f"unloading {query_id}", GRACE_S)
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Begin to release a query, and return a future of its end at once."""
         reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(self._begin, self.release, query_id, timeout_s, timeout_s, reply)
+        self.calls.dispatcher.call(_Unloading(self, query_id, timeout_s, timeout_s, reply).begin, self.release)
         return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
@@ -676,20 +705,6 @@ class Unloads:
         return True
 
     # -- on the loop ---------------------------------------------------------------------------------------------
-
-    def _begin(
-        self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None, reply: Reply[None]
-    ) -> None:
-        if left_s is None:
-            release(query_id, functools.partial(settle, reply))
-            return
-        overdue = functools.partial(self.release_overdue, query_id, timeout_s)
-        self.calls.limits.begin(left_s, overdue)
-        release(query_id, functools.partial(self._ended, left_s, overdue, reply))
-
-    def _ended(self, left_s: float, overdue: Callable[[], object], reply: Reply[None], error: RrError | None) -> None:
-        self.calls.limits.end(left_s, overdue)
-        settle(reply, error)
 
     def release(self, query_id: str, done: UnloadWaiter) -> None:
         """Have the registrar's actor release a query, and call `done` with the error, or with None."""
