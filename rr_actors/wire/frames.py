@@ -25,6 +25,10 @@ _encode = msgspec.msgpack.Encoder().encode
 
 GOODBYE = _pack_length(0)
 
+# The errors of the encoder: for a type, an int over 64 bits, half a character, too deep a nesting. An exception that a
+# signal handler raises meanwhile is none of these.
+_NOT_ENCODED = (TypeError, OverflowError, UnicodeEncodeError, RecursionError)
+
 
 class FrameReader(Generic[T]):
     """Cuts a stream into messages, whatever pieces it arrives in.
@@ -109,7 +113,7 @@ def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
     """
     try:
         body = _encode(message)
-    except Exception as error:  # TypeError, OverflowError (int over 64 bits), UnicodeEncodeError, RecursionError
+    except _NOT_ENCODED as error:
         raise NotSerializable(
             f"{type(message).__name__} cannot travel: {error}", path=type(message).__name__
         ) from error
