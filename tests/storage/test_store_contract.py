@@ -107,14 +107,18 @@ def test_what_was_committed_is_loaded_after_it_was_opened_again(either: FileDisk
     store.close(erase=True)
 
 
-def test_what_was_loaded_is_the_callers_to_change(new_store: Callable[[], Store]) -> None:
-    store = new_store()
-    store.commit([Put(query("a")), Put(query("b"))])
+def change_what_is_loaded(store: Store) -> None:
     for _ in range(2):
         loaded = store.load()
         assert loaded == content_of([query("a"), query("b")])
         del loaded["queries"]["a"]
         loaded["peers"]["p"] = Peer("p")
+
+
+def test_what_was_loaded_is_the_callers_to_change(new_store: Callable[[], Store]) -> None:
+    store = new_store()
+    store.commit([Put(query("a")), Put(query("b"))])
+    change_what_is_loaded(store)
     store.close()
 
 
@@ -123,11 +127,7 @@ def test_what_was_loaded_at_an_opening_is_the_callers_to_change(either: FileDisk
     store.commit([Put(query("a")), Put(query("b"))])
     store.close()
     store = either.open()
-    for _ in range(2):
-        loaded = store.load()
-        assert loaded == content_of([query("a"), query("b")])
-        del loaded["queries"]["a"]
-        loaded["peers"]["p"] = Peer("p")
+    change_what_is_loaded(store)
     store.close()
     store = either.open()
     assert content(store) == [query("a"), query("b")]
