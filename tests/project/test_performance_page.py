@@ -27,9 +27,28 @@ def test_figures_with_an_aim_and_their_yardsticks_become_a_table_with_one_figure
 
     assert lines[0].startswith("Taken on 2026-11-23 at commit abc1234 by `make bench`; python 3.")
     assert lines[4:] == [
-        "| raw pipe echo, on one core | 16.8 | µs | 20 |  |  |  |",
-        "| warm load, durability process | 40.2 | µs | 119 | 2.40 | ≤ 2.5 × pipe | yes |",
-        "| its p99 | 140 | µs |  | 3.50 | ≤ 3 × median | no |",
+        "| raw pipe echo, on one core | 16.8 µs | 20 |  |  |",
+        "| warm load, durability process | 40.2 µs | 119 | 2.40 | ≤ 2.5 × pipe |",
+        "| its p99 | 140 µs |  | 3.50 | ≤ 3 × median, **missed** |",
+    ]
+
+
+def test_of_figures_for_several_sizes_the_table_has_the_worst(tmp_path: Path) -> None:
+    rows = [
+        Row("100 held: unload", 30.0, "µs"),
+        Row("1,000 held: unload", 36.0, "µs", None, 1.2, "at 100", at_most=1.25),
+        Row("10,000 held: unload", 33.0, "µs", None, 1.1, "at 100", at_most=1.25),
+        Row("memory: one of 10,000 queries", 539.0, "B", at_most=1_000),
+        Row("memory: one of 100,000 queries", 603.0, "B", at_most=1_000),
+    ]
+    write(tmp_path / "bench.json", rows)
+    results = msgspec.json.decode((tmp_path / "bench.json").read_bytes(), type=Results)
+
+    lines = markdown(results, "2026-11-23", "abc1234").splitlines()
+
+    assert [line.split(" | ")[0] for line in lines[4:]] == [
+        "| 1,000 held: unload",
+        "| memory: one of 100,000 queries",
     ]
 
 
