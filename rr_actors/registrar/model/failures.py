@@ -23,6 +23,11 @@ def unknown_server(catalog: Catalog, server: str) -> Failure:
 def unknown_target(catalog: Catalog, target: str) -> Failure:
     """Return the failure of a call for an id that is neither a resource nor a query served here."""
     what = "serves no resource and no query of this id (never did, or unloaded already)"
+    for held in catalog.held.values():
+        if target in (held.id, held.resource_id) and held.registrar != catalog.name:
+            owner = held.registrar
+            what = f"holds it, and does not serve it: call {owner!r}, which serves it as {owner}/{held.server}"
+            break
     text = f"{shortened(target)}: {catalog.name!r} {what}"
     return Failure("UnknownQuery", text, {"query_id": target})
 
