@@ -92,26 +92,23 @@ def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[
 
 
 def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], list[Held]]:
-    """Return the `kept` rows within `same`, and all rows outside of it, oldest first.
+    """Return, of the rows HELD at a provider, the `kept` ones within `same`, and all outside of it, oldest first.
 
     Rows within `same` agree with the provider; the caller has a note to remove only for the `kept` ones. A row whose
     number is greater than all that Fetch told came meanwhile: by a thread's own line, or after the provider compared.
     It counts as agreed if the provider has said that it has nothing behind the last span.
     """
-    held = catalog.held
     bounds = [number for bound in same for number in bound]
 
-    def is_agreed(row: Held) -> bool:
-        return row.hold is _HELD and bisect_left(bounds, row.seq) % 2 == 1
+    def is_within(row: Held) -> bool:
+        return bisect_left(bounds, row.seq) % 2 == 1
 
-    noted = [held[id] for id in catalog.kept if id in held]
+    kept = [catalog.held[id] for id in catalog.kept if id in catalog.held]
+    agreed = [row for row in kept if row.registrar == provider and row.hold is _HELD and is_within(row)]
     if same == [(_FIRST, _LAST)]:
-        others = catalog.unsettled_at(provider)
-    else:
-        rows = _rows(held, catalog.outbound.get(provider, ()))
-        others = [row for row in rows if row.hold is not _HELD or bisect_left(bounds, row.seq) % 2 == 0]
-    others.sort(key=_number)
-    return [row for row in noted if row.registrar == provider and is_agreed(row)], others
+        return agreed, []
+    others = [row for row in held_at(catalog, provider) if not is_within(row)]
+    return agreed, sorted(others, key=_number)
 
 
 def _rows(table: dict[str, R], ids: Collection[str]) -> Iterable[R]:
