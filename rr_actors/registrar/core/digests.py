@@ -116,12 +116,6 @@ def _rows(table: dict[str, R], ids: Collection[str]) -> Iterable[R]:
     return table.values() if len(ids) == len(table) else map(table.__getitem__, ids)
 
 
-def response_of(catalog: Catalog, query: Query) -> bytes | None:
-    """Return a query's response as Fetched gives it: None while its resource is loading, or being unloaded."""
-    resource = catalog.resources[query.resource_id]
-    return None if resource.id in catalog.moving else resource.response or b""
-
-
 def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:
     """Return the resources with these ids. If each resource has one query, in the same order, no id is looked up."""
     resources = catalog.resources

@@ -17,16 +17,7 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
 from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
-from rr_actors.registrar.model.messages import (
-    Failure,
-    Load,
-    Loaded,
-    LoadRefused,
-    Noticed,
-    Unload,
-    Unloaded,
-    UnloadRefused,
-)
+from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Noticed, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import HELD, OK, OWED, PENDING, Held, Notice, Phase, State
 
 _replace = msgspec.structs.replace
@@ -49,20 +40,15 @@ def ask(decision: Decision, command: Ask) -> None:
             return
         attempt = resource.attempt
         if (known := catalog.held.get(command.query_id)) is not None:
-            _asked_again(decision, known)
+            if known.hold is HELD:
+                decision.cause(LoadResolved(known, None))
+            elif known.hold is OWED:
+                decision.cause(LoadResolved(known, failures.withdrawn(known, "it is being released")))
             return
     held = pending(command, attempt, catalog.next_seq(command.seq))
     look_there(decision, command.registrar)
     decision.put_here(held)
     request(decision, held.registrar, load_of(decision, held))
-
-
-def _asked_again(decision: Decision, held: Held) -> None:
-    """Answer a load whose id has a row: the part is held already, or it is being released."""
-    if held.hold is HELD:
-        decision.cause(LoadResolved(held, None))
-    elif held.hold is OWED:
-        decision.cause(LoadResolved(held, failures.withdrawn(held, "it is being released")))
 
 
 def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
@@ -114,7 +100,8 @@ def send_again(decision: Decision, command: SendAgain) -> None:
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
-        _end_unknown(decision, command.query_id, failures.taken_before_heard(command.query_id))
+        failure = failures.taken_before_heard(command.query_id)
+        decision.cause(LoadResolved(_unknown(command.query_id), failure))
     elif held.hold is PENDING and held.id in decision.catalog.ending:  # taken away; its holders are hearing of it
         decision.cause(LoadResolved(held, failures.taken_before_heard(held.id)))
     elif held.hold is PENDING:
@@ -126,12 +113,8 @@ def send_again(decision: Decision, command: SendAgain) -> None:
         request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
-def _end_unknown(decision: Decision, query_id: str, failure: Failure) -> None:
-    """Fail a load whose query was taken away, and whose row went when its holders had heard of that."""
-    decision.cause(LoadResolved(_unknown(query_id), failure))
-
-
 def _unknown(query_id: str) -> Held:
+    """Return a row for a query that was taken away, and whose own row went when its holders had heard of that."""
     return Held(query_id, "", "", b"", None, "", "", 0, 0, PENDING, State.FATAL)
 
 
@@ -193,7 +176,7 @@ def give_up(decision: Decision, command: GiveUp) -> None:
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
-        _end_unknown(decision, command.query_id, command.failure)
+        decision.cause(LoadResolved(_unknown(command.query_id), command.failure))
     elif held.hold is PENDING or (command.unheard and held.hold is HELD):
         withdraw(decision, held, command.failure)
 
@@ -315,7 +298,7 @@ def unload_refused(decision: Decision, message: UnloadRefused) -> None:
     parent = catalog.resources.get(held.parent)
     wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
     if wanted and held.resource_id:
-        decision.note(decision.catalog.kept, held.id, True)
+        decision.note(catalog.kept, held.id, True)
         decision.put(_replace(held, hold=HELD))
     decision.cause(UnloadResolved(held.id, message.failure))
     released(decision, held.id)

@@ -11,11 +11,11 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import end_release, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, request
-from rr_actors.registrar.model.catalog import Catalog, Decision
+from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
-from rr_actors.registrar.model.rows import Held, Hold, Query, State
+from rr_actors.registrar.model.rows import Held, Hold, State
 
 # -- as a consumer -------------------------------------------------------------------------------------------------
 #
@@ -164,8 +164,11 @@ def fetch(decision: Decision, message: Fetch) -> None:
     rows: list[FetchedQuery] = []
     size = 0
     for query in queries:
-        row = _fetched(catalog, query)
-        more = len(row.request) + len(row.response or b"")
+        resource = catalog.resources[query.resource_id]
+        response = None if resource.id in catalog.moving else resource.response or b""
+        place = (query.parent, query.attempt, query.seq, str(resource.state))
+        row = FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
+        more = len(row.request) + len(response or b"")
         if rows and (len(rows) == _CHUNK or size + more > _CHUNK_BYTES):
             decision.cause(Reply(message.origin, Fetched(rows, True, message.number, same)))
             rows, size = [], 0
@@ -181,13 +184,6 @@ def fetch(decision: Decision, message: Fetch) -> None:
         decision.note(catalog.consumers, message.origin, True)
         for notice_id in list(catalog.notices_to.get(message.origin, ())):
             send_notice(decision, catalog.notices[notice_id])
-
-
-def _fetched(catalog: Catalog, query: Query) -> FetchedQuery:
-    resource = catalog.resources[query.resource_id]
-    place = (query.parent, query.attempt, query.seq, str(resource.state))
-    response = digests.response_of(catalog, query)
-    return FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
 
 
 def consumer_lost(decision: Decision, command: ConsumerLost) -> None:

@@ -86,8 +86,7 @@ def release_parts(
     for id in ids:
         owe(decision, catalog.held[id], "withdrawn, what asked for it is gone")
     if not ids:
-        for effect in after:
-            decision.cause(effect)
+        decision.effects += after
         return
     catalog.closings_made += 1
     number = catalog.closings_made
@@ -128,5 +127,4 @@ def _step(decision: Decision, number: int) -> None:
             decision.cause(Connect(held.registrar))
         remaining = remaining[1:]
     decision.forget(catalog.closings, number)
-    for effect in closing.after:
-        decision.cause(effect)
+    decision.effects += closing.after

@@ -23,7 +23,7 @@ from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import SetResponse, SetStatus, Swap
 from rr_actors.registrar.model.effects import Answer, Happened, StartStatus
 from rr_actors.registrar.model.messages import Unload
-from rr_actors.registrar.model.rows import Hold, Notice, Phase, Resource, State
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, State
 
 _replace = msgspec.structs.replace
 
@@ -43,28 +43,22 @@ def spread(
     repeated: bool = False,
 ) -> None:
     """Note a status on the resource, and send it once to every holder."""
-    resource = _note(decision, resource, state, message, response)
     said = Notice(event, "", "", resource.id, event, state, message, source, False, response)
-    _tell_holders(decision, resource, said, repeated=repeated)
+    _tell_holders(decision, _note(decision, resource, said), said, repeated=repeated)
 
 
-def _note(decision: Decision, resource: Resource, state: State, message: str, response: bytes | None) -> Resource:
-    lasting = State.FATAL if resource.state is State.FATAL else state
-    resource = _replace(
-        resource,
-        state=lasting,
-        message=message,
-        response=resource.response if response is None else response,
-    )
+def _note(decision: Decision, resource: Resource, said: Notice) -> Resource:
+    lasting = State.FATAL if resource.state is State.FATAL else said.state
+    response = resource.response if said.response is None else said.response
+    resource = _replace(resource, state=lasting, message=said.message, response=response)
     decision.put(resource)
-    decision.cause(Happened("status", resource.id, resource.server, f"{state} {message}".rstrip()))
+    decision.cause(Happened("status", resource.id, resource.server, f"{said.state} {said.message}".rstrip()))
     return resource
 
 
 def _tell_holders(decision: Decision, resource: Resource, said: Notice, *, repeated: bool = False) -> None:
-    what = (said.event, said.state, said.message, said.source)
     for query in decision.catalog.queries_of(resource.id):
-        notify(decision, query, *what, response=said.response, repeated=repeated)
+        notify(decision, query, said, repeated=repeated)
     _end_if_unwanted(decision, resource)
 
 
@@ -152,9 +146,8 @@ def swap(decision: Decision, command: Swap) -> None:
     """Put a spare in the place of a part: one commit has the spare held, the part owed, and the new response."""
     catalog = decision.catalog
     resource = catalog.resources.get(command.resource_id)
-    spare = catalog.held.get(command.spare)
-    is_loaded = resource is not None and resource.phase is Phase.LOADED
-    if resource is None or spare is None or not (is_loaded and _are_parts(catalog, command)):
+    part, spare = (_part(catalog, command.resource_id, id) for id in (command.part, command.spare))
+    if resource is None or resource.phase is not Phase.LOADED or part is None or spare is None:
         _release(decision, command.resource_id, (command.spare,))
         failure = failures.not_swapped(catalog, command.resource_id, command.part)
         decision.cause(Answer(command.ticket, failure))
@@ -167,16 +160,15 @@ def swap(decision: Decision, command: Swap) -> None:
     decision.cause(Answer(command.ticket, None))
 
 
-def _are_parts(catalog: Catalog, command: Swap) -> bool:
-    rows = (catalog.held.get(command.part), catalog.held.get(command.spare))
-    return all(row is not None and row.hold is Hold.HELD and row.parent == command.resource_id for row in rows)
+def _part(catalog: Catalog, resource_id: str, query_id: str) -> Held | None:
+    held = catalog.held.get(query_id)
+    return held if held is not None and held.hold is Hold.HELD and held.parent == resource_id else None
 
 
 def _release(decision: Decision, resource_id: str, ids: Iterable[str]) -> None:
     """Release parts so that they are not held again, even if their unload callback raises."""
     for id in ids:
-        held = decision.catalog.held.get(id)
-        if held is not None and held.hold is Hold.HELD and held.parent == resource_id:
+        if (held := _part(decision.catalog, resource_id, id)) is not None:
             decision.put(_replace(held, hold=Hold.OWED, resource_id=""))
             request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
@@ -186,8 +178,8 @@ def _say(
 ) -> None:
     source = decision.catalog.origin_of(resource)
     event, message = command.event, command.message
-    resource = _note(decision, resource, state, message, response)
     said = Notice(f"{event}:", "", "", resource.id, event, state, message, source, False, response)
+    resource = _note(decision, resource, said)
     server = decision.catalog.servers.get(resource.server)
     if server is None or not server.has_status or command.callback_of == resource.id:
         _tell_holders(decision, resource, said)

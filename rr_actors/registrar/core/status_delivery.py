@@ -29,30 +29,29 @@ Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 
 def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     """Decide about a status of one of this registrar's queries: pass it on, pass it over, or end the query."""
-    notice = message.notice
+    catalog, notice = decision.catalog, message.notice
     add_in_flight(decision, notice.query_id)
-    held = decision.catalog.held.get(notice.query_id)
+    held = catalog.held.get(notice.query_id)
     if held is None:
         _acknowledge(decision, provider, notice.id)
     elif held.resource_id and held.resource_id != notice.resource_id:
-        _acknowledge(
-            decision, provider, notice.id
-        )  # about an earlier resource of the query; the notice was held back until on_start returned
+        # It is about an earlier resource of the query, and was held back until on_start returned.
+        _acknowledge(decision, provider, notice.id)
     elif held.hold is Hold.OWED:
         if notice.released:
             if held.resource_id:
                 end_release(decision, held)
             else:  # withdrawn: its Load may have been sent again since, so only the provider's answer can end it
-                request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+                request(decision, held.registrar, Unload(held.id, catalog.name))
             _acknowledge(decision, provider, notice.id)
         # else the provider drops the notice with the query, or sends it again if the unload fails
-    elif held.hold is Hold.PENDING and notice.released and held.id not in decision.catalog.direct:
+    elif held.hold is Hold.PENDING and notice.released and held.id not in catalog.direct:
         # its Load was sent again since, and gets an answer of its own; this notice is about the time before
         decision.put_here(_replace(held, state=State.OK, response=None))
         _acknowledge(decision, provider, notice.id)
-    elif notice.id in decision.catalog.hearing:
+    elif notice.id in catalog.hearing:
         pass  # a second sending; the notice is acknowledged when its receivers have dealt with it
-    elif held.id in decision.catalog.ending:
+    elif held.id in catalog.ending:
         _acknowledge(decision, provider, notice.id)  # its holders know that they have lost it
     else:
         _hear(decision, held, notice, provider, message.repeated)
@@ -72,15 +71,14 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
         decision.note(decision.catalog.heard, place, (notice.id,))
         decision.cause(Hear(held, notice, repeated))
     resource = decision.catalog.resources.get(held.parent)
-    if resource is not None and _concerns(
-        decision, StartStatus(resource, notice, provider, repeated), listened=listened
-    ):
-        receivers += 1
+    if resource is not None:
+        start = StartStatus(resource, notice, provider, repeated)
+        receivers += _concerns(decision, start, listened=listened)
+    ends = held.id if notice.released else ""
     if receivers:
-        ends = held.id if notice.released else ""
         decision.note(decision.catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
     else:
-        _end(decision, held.id if notice.released else "")
+        _end(decision, ends)
         _acknowledge(decision, provider, notice.id)
 
 
@@ -184,17 +182,16 @@ def _dealt_with(decision: Decision, place: Place) -> None:
 
 def _end(decision: Decision, held_id: str) -> None:
     """Remove a query that was taken away, when its holders know; on disk before the notice is acknowledged."""
-    decision.forget(decision.catalog.ending, held_id)
-    held = decision.catalog.held.get(held_id)
+    catalog = decision.catalog
+    decision.forget(catalog.ending, held_id)
+    held = catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
-        if (
-            held.hold is Hold.PENDING and held_id not in decision.catalog.direct
-        ):  # its thread's line broke, and the load waits for the link
-            decision.cause(
-                LoadResolved(held, failures.withdrawn(held, "taken away before the answer to its load came"))
-            )
+        if held.hold is Hold.PENDING and held_id not in catalog.direct:
+            # Its thread's line broke, and the load waits for the link.
+            failure = failures.withdrawn(held, "taken away before the answer to its load came")
+            decision.cause(LoadResolved(held, failure))
         end_direct(decision, held_id)
-        decision.forget(decision.catalog.kept, held_id)
+        decision.forget(catalog.kept, held_id)
         decision.drop(held)
 
 

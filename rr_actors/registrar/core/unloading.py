@@ -29,6 +29,7 @@ from rr_actors.registrar.model.rows import (
     QUEUED,
     UNLOAD_FAILED,
     UNLOADING,
+    Notice,
     Phase,
     Query,
     Resource,
@@ -76,16 +77,14 @@ def _release(decision: Decision, query: Query) -> None:
 def unheld(decision: Decision, resource: Resource) -> None:
     """Decide about a resource that nobody holds any more: drop, keep warm or unload it, by its phase."""
     if resource.phase is QUEUED:
-        for answer in answers_to_owners(decision, resource, None):
-            decision.cause(answer)
+        decision.effects += answers_to_owners(decision, resource, None)
         drop_resource(decision, resource)
         settle(decision, resource.server)
     elif resource.phase in (LOADED, UNLOAD_FAILED):
         retire(decision, resource)
     elif resource.tries == NOT_BEGUN and resource.server in decision.catalog.servers:
-        begin_unload(
-            decision, _replace(resource, tries=0)
-        )  # the load does not run again; the unload callback cleans up after the interrupted run
+        # The load does not run again; the unload callback cleans up after the interrupted run.
+        begin_unload(decision, _replace(resource, tries=0))
 
 
 def _lingers(decision: Decision, resource: Resource) -> bool:
@@ -149,8 +148,7 @@ def unload_erred(decision: Decision, erred: UnloadErred) -> None:
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try
             decision.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
         send_notices(decision, query)  # the holder passed them over while it was releasing the query
-    for answer in answers_to_owners(decision, resource, erred.failure):
-        decision.cause(answer)
+    decision.effects += answers_to_owners(decision, resource, erred.failure)
     _next_in_queue(decision, resource)
     settle(decision, resource.server, erred.failure)
 
@@ -212,27 +210,22 @@ def unregister(decision: Decision, command: Unregister) -> None:
 def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None:
     match resource.phase:
         case Phase.QUEUED | Phase.LOADING:
-            _refuse_holders(decision, resource, why)
+            decision.effects += refuse_all(decision, resource, failures.evicted(decision.catalog, resource, why))
+            unheld(decision, resource)  # a running load goes on; the resource is unloaded when it returns
         case Phase.LOADED | Phase.UNLOAD_FAILED:
             source = decision.catalog.origin_of(resource)
+            said = Notice(event, "", "", resource.id, event, State.FATAL, why, source, released=True)
             failure = failures.evicted(decision.catalog, resource, why)
             for query in decision.catalog.queries_of(resource.id):
                 decision.drop(query)
                 remember(decision, query.id, failure)
-                notify(decision, query, event, State.FATAL, why, source, released=True)
+                notify(decision, query, said)
             if resource.id not in decision.catalog.recovering:  # else the end of its recovery unloads it
                 begin_unload(decision, resource)
         case Phase.UNLOADING:
             for query in decision.catalog.queries_of(resource.id):
                 drop_query(decision, query)
                 decision.cause(Reply(query.origin, Unloaded(query.id)))
-
-
-def _refuse_holders(decision: Decision, resource: Resource, why: str) -> None:
-    """Refuse all that wait for a resource. A running load goes on; the resource is unloaded when it returns."""
-    for reply in refuse_all(decision, resource, failures.evicted(decision.catalog, resource, why)):
-        decision.cause(reply)
-    unheld(decision, resource)
 
 
 def gone(decision: Decision, message: Gone) -> None:
