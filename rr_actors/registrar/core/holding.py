@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.base.errors import CatalogError, shortened
 from rr_actors.registrar.core import releasing
@@ -19,9 +19,6 @@ from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, Releas
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Noticed, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import HELD, OK, OWED, PENDING, Held, Notice, Phase, State
-
-_replace = msgspec.structs.replace
-
 
 # -- load ----------------------------------------------------------------------------------------------------------
 
@@ -60,7 +57,7 @@ def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
     asked = catalog.in_flight.get(id)
     if asked is None or asked.registrar not in catalog.up:
         return False
-    row = _replace(asked, response=answer.response, resource_id=answer.resource_id, hold=HELD)
+    row = replace(asked, response=answer.response, resource_id=answer.resource_id, hold=HELD)
     catalog.unfinished = [(catalog.in_flight, id, asked), ("held", id, ABSENT)]
     catalog.held[id] = row
     add(catalog.outbound, asked.registrar, id)
@@ -82,7 +79,7 @@ def got(decision: Decision, command: Got) -> None:
     held = catalog.held.get(id)
     if held is None:  # the query was loaded and taken away, and its holders know: the load itself succeeded
         taken = _unknown(id)
-        decision.cause(LoadResolved(_replace(taken, resource_id=command.resource_id, response=command.response), None))
+        decision.cause(LoadResolved(replace(taken, resource_id=command.resource_id, response=command.response), None))
         return
     if held.registrar not in catalog.up:
         decision.note(catalog.fresh, id, True)
@@ -140,7 +137,7 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
         request(decision, provider, Unload(message.query_id, decision.catalog.name))
     elif held.hold is PENDING:
         response = message.response if held.response is None else held.response  # an UPDATE has come before it
-        held = _replace(held, hold=HELD, resource_id=message.resource_id, response=response)
+        held = replace(held, hold=HELD, resource_id=message.resource_id, response=response)
         decision.put_later(held)
         decision.cause(LoadResolved(held, None))
 
@@ -208,7 +205,7 @@ def owed(catalog: Catalog, query_id: str) -> Held | None:
         return None
     if query_id in catalog.kept or query_id in catalog.ending:
         return None
-    return _replace(held, hold=OWED)
+    return replace(held, hold=OWED)
 
 
 def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
@@ -299,7 +296,7 @@ def unload_refused(decision: Decision, message: UnloadRefused) -> None:
     wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
     if wanted and held.resource_id:
         decision.note(catalog.kept, held.id, True)
-        decision.put(_replace(held, hold=HELD))
+        decision.put(replace(held, hold=HELD))
     decision.cause(UnloadResolved(held.id, message.failure))
     released(decision, held.id)
 
@@ -328,4 +325,4 @@ def begin_again(decision: Decision) -> None:
         if held.hold is PENDING:
             decision.drop_later(held)  # if the provider has the query, reconciling takes it back or releases it
         elif held.hold is HELD and held.parent and (parent is None or parent.phase is Phase.LOADING):
-            decision.put(_replace(held, hold=OWED))
+            decision.put(replace(held, hold=OWED))

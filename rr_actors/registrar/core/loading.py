@@ -14,7 +14,7 @@ A Load may come twice, by two ways. If the first was refused, the second is refu
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import end_limit, limit_load, running, start_load
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
@@ -28,7 +28,6 @@ from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.registrar.model.rows import LOADED, LOADING, OK, PENDING, QUEUED, Query, Resource
 
-_replace = msgspec.structs.replace
 _NONE: dict[bytes, str] = {}
 _WAITS = (LOADING, QUEUED)
 
@@ -139,7 +138,7 @@ def load_done(decision: Decision, done: LoadDone) -> None:
     resource = running(catalog, done.resource_id, LOADING, done.attempt)
     if resource is None:
         return
-    resource = _replace(resource, phase=LOADED, response=done.response)
+    resource = replace(resource, phase=LOADED, response=done.response)
     decision.put(resource)
     decision.cause(Happened("loaded", resource.id, resource.server, ""))
     end_limit(decision, resource)

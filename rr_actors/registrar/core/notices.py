@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Failure, Load, LoadRefused, Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Notice, Query, Resource, is_own
 
-_replace = msgspec.structs.replace
-
 # Notices: statuses on their way to the holders of queries. A notice is a row until its holder has dealt with it.
 
 
 def notify(decision: Decision, query: Query, said: Notice, *, repeated: bool = False) -> None:
     """Add a notice for the query's holder with what `said` says of the resource, and send it."""
-    notice = _replace(said, id=f"{said.event}:{query.id}", query_id=query.id, origin=query.origin)
+    notice = replace(said, id=f"{said.event}:{query.id}", query_id=query.id, origin=query.origin)
     decision.put(notice)
     if repeated:  # the holder may have got this status before a crash
         decision.note(decision.catalog.told, notice.id, True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import groupby
 from operator import attrgetter
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import end_release, load_of, loaded, lose
@@ -22,8 +22,6 @@ from rr_actors.registrar.model.rows import Held, Hold, State
 # The provider's list says which of our queries it has. Our own rows of this incarnation say which of these we want: we
 # may have released some since.
 
-_replace = msgspec.structs.replace
-
 
 def reconcile(decision: Decision, command: Reconcile) -> None:
     """Agree with a provider, over a new link, on the queries held there; then send all open messages again."""
@@ -35,7 +33,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
         if held.hold is Hold.PENDING and (held.response is not None or held.state is not State.OK):
             # An earlier link brought this. It may have lost the news that the query was taken away. The list is newer:
             # if it does not have the query, the query is loaded anew.
-            decision.put_here(_replace(held, response=None, state=State.OK))
+            decision.put_here(replace(held, response=None, state=State.OK))
     for query in command.queries:
         _agree(decision, command.registrar, query)
     if command.registrar in catalog.outbound:  # perhaps the list has brought the first row at this provider
@@ -76,10 +74,10 @@ def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     if held is None:
         _take_back(decision, registrar, query)
     elif held.hold is Hold.PENDING and query.response is not None:
-        decision.put_here(_replace(held, state=State(query.state)))
+        decision.put_here(replace(held, state=State(query.state)))
         loaded(decision, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
-        now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
+        now = replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
         decision.forget(decision.catalog.kept, held.id)
         if now != held:  # a crash came after a status was acknowledged, and before the row was written
             decision.put_later(now)
@@ -135,7 +133,7 @@ def peer_gone(decision: Decision, command: PeerGone) -> None:
             if command.final:
                 decision.drop_later(held)
             else:
-                decision.put(_replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
+                decision.put(replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
         elif not command.final:
             continue
         elif held.hold is Hold.OWED:

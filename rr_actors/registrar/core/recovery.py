@@ -9,10 +9,10 @@ An interrupted load whose resource nobody holds any more does not run again. Its
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core import holding
-from rr_actors.registrar.core.callback_runs import load_again, start_load, start_queued, start_unload
+from rr_actors.registrar.core.callback_runs import start_load, start_queued, start_unload
 from rr_actors.registrar.core.loading import load
 from rr_actors.registrar.core.notices import refuse_all
 from rr_actors.registrar.core.releasing import release_parts
@@ -25,9 +25,6 @@ from rr_actors.registrar.model.commands import RecoverDone, RecoverErred, Regist
 from rr_actors.registrar.model.effects import StartRecover
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import NOT_BEGUN, Phase, Resource, State
-
-_replace = msgspec.structs.replace
-
 
 ATTEMPTS = 3
 """How often a load begins whose process dies each time. With the default restart intensity, one more death would end
@@ -45,11 +42,11 @@ def begin_again(decision: Decision) -> None:
         if resource.phase is not Phase.LOADING or resource.tries == NOT_BEGUN:  # no server was there to begin it
             continue
         if resource.attempt < ATTEMPTS:
-            decision.put(_replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
+            decision.put(replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
         else:
             decision.effects += refuse_all(decision, resource, failures.interrupted(decision.catalog, resource))
             # A part or all of it may be loaded. With the next number, the parts of the last attempt are released.
-            decision.put(_replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
+            decision.put(replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
 
 
 def register(decision: Decision, command: Register) -> None:
@@ -77,7 +74,9 @@ def register(decision: Decision, command: Register) -> None:
 def _interrupted(decision: Decision, resource: Resource) -> None:
     """Run an interrupted load again if somebody holds its resource; otherwise clean up what it left."""
     if resource.id in decision.catalog.holders:
-        load_again(decision, resource)
+        resource = replace(resource, tries=0)
+        decision.put(resource)
+        start_load(decision, resource)
     else:
         unheld(decision, resource)
 
@@ -106,7 +105,7 @@ def _recover(decision: Decision, resource: Resource, has_recover: bool, policy: 
         decision.note(decision.catalog.recovering, resource.id, ())
         decision.cause(StartRecover(resource, reload=False))
     elif policy == "reload":
-        again = _replace(resource, attempt=resource.attempt + 1)
+        again = replace(resource, attempt=resource.attempt + 1)
         decision.put(again)
         decision.note(decision.catalog.recovering, resource.id, ())
         release_parts(decision, resource.id, (StartRecover(again, reload=True),), keep_attempt=again.attempt)

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Closing, Decision
 from rr_actors.registrar.model.effects import Connect, Effect, LoadResolved, Request
 from rr_actors.registrar.model.messages import Failure, Message, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Peer
-
-_replace = msgspec.structs.replace
 
 
 def request(decision: Decision, registrar: str, message: Message) -> None:
@@ -66,14 +64,14 @@ def owe(decision: Decision, held: Held, why: str) -> None:
     if held.hold is Hold.PENDING:
         decision.forget(decision.catalog.direct, held.id)
         decision.cause(LoadResolved(held, failures.withdrawn(held, why)))
-    decision.put(_replace(held, hold=Hold.OWED))
+    decision.put(replace(held, hold=Hold.OWED))
 
 
 def withdraw(decision: Decision, held: Held, failure: Failure) -> None:
     """End a load that nobody waits for any longer. If it succeeds later, the provider releases it."""
     decision.forget(decision.catalog.direct, held.id)
     decision.cause(LoadResolved(held, failure))
-    decision.put(_replace(held, hold=Hold.OWED, resource_id=""))
+    decision.put(replace(held, hold=Hold.OWED, resource_id=""))
     request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
@@ -100,7 +98,7 @@ def released(decision: Decision, held_id: str) -> None:
     number = decision.forget(catalog.closing_of, held_id)
     if number is not None:
         closing = catalog.closings[number]
-        decision.note(catalog.closings, number, _replace(closing, remaining=closing.remaining[1:]))
+        decision.note(catalog.closings, number, replace(closing, remaining=closing.remaining[1:]))
         _step(decision, number)
 
 
@@ -119,7 +117,7 @@ def _step(decision: Decision, number: int) -> None:
     while remaining:
         held = catalog.held.get(remaining[0])
         if held is not None and held.registrar in catalog.up:
-            decision.note(catalog.closings, number, _replace(closing, remaining=remaining))
+            decision.note(catalog.closings, number, replace(closing, remaining=remaining))
             decision.note(catalog.closing_of, held.id, number)
             decision.cause(Request(held.registrar, Unload(held.id, catalog.name)))
             return

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.notices import drop_notice, notify, own_notices
 from rr_actors.registrar.core.releasing import request
@@ -24,9 +24,6 @@ from rr_actors.registrar.model.commands import SetResponse, SetStatus, Swap
 from rr_actors.registrar.model.effects import Answer, Happened, StartStatus
 from rr_actors.registrar.model.messages import Unload
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, State
-
-_replace = msgspec.structs.replace
-
 
 # -- to the holders ------------------------------------------------------------------------------------------------
 
@@ -50,7 +47,7 @@ def spread(
 def _note(decision: Decision, resource: Resource, said: Notice) -> Resource:
     lasting = State.FATAL if resource.state is State.FATAL else said.state
     response = resource.response if said.response is None else said.response
-    resource = _replace(resource, state=lasting, message=said.message, response=response)
+    resource = replace(resource, state=lasting, message=said.message, response=response)
     decision.put(resource)
     decision.cause(Happened("status", resource.id, resource.server, f"{said.state} {said.message}".rstrip()))
     return resource
@@ -78,7 +75,7 @@ def start_status(decision: Decision, start: StartStatus) -> None:
         deferred = decision.catalog.deferred
         decision.note(deferred, resource.id, (*deferred.get(resource.id, ()), start))
     else:
-        decision.cause(_replace(start, resource=resource))
+        decision.cause(replace(start, resource=resource))
 
 
 def is_busy(catalog: Catalog, resource: Resource) -> bool:
@@ -114,7 +111,7 @@ def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
         _end_if_unwanted(decision, resource)
     else:
         newest = None if notice.response is None else resource.response
-        _tell_holders(decision, resource, _replace(notice, response=newest))
+        _tell_holders(decision, resource, replace(notice, response=newest))
 
 
 # -- calls of the owner --------------------------------------------------------------------------------------------
@@ -169,7 +166,7 @@ def _release(decision: Decision, resource_id: str, ids: Iterable[str]) -> None:
     """Release parts so that they are not held again, even if their unload callback raises."""
     for id in ids:
         if (held := _part(decision.catalog, resource_id, id)) is not None:
-            decision.put(_replace(held, hold=Hold.OWED, resource_id=""))
+            decision.put(replace(held, hold=Hold.OWED, resource_id=""))
             request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 

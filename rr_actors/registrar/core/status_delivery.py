@@ -8,7 +8,7 @@ a crash comes before that, the provider sends it again, marked as repeated.
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.holding import end_direct, end_release
 from rr_actors.registrar.core.releasing import add_in_flight, request
@@ -20,7 +20,6 @@ from rr_actors.registrar.model.effects import Hear, LoadResolved, StartStatus
 from rr_actors.registrar.model.messages import Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Notice, State, is_own
 
-_replace = msgspec.structs.replace
 _REMEMBERED = 20_000
 _SWEPT_EVERY = 1024
 
@@ -47,7 +46,7 @@ def noticed(decision: Decision, provider: str, message: Noticed) -> None:
         # else the provider drops the notice with the query, or sends it again if the unload fails
     elif held.hold is Hold.PENDING and notice.released and held.id not in catalog.direct:
         # its Load was sent again since, and gets an answer of its own; this notice is about the time before
-        decision.put_here(_replace(held, state=State.OK, response=None))
+        decision.put_here(replace(held, state=State.OK, response=None))
         _acknowledge(decision, provider, notice.id)
     elif notice.id in catalog.hearing:
         pass  # a second sending; the notice is acknowledged when its receivers have dealt with it
@@ -61,7 +60,7 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
     receivers = 0
     heard_all = held.hold is Hold.HELD and held.id not in decision.catalog.kept
     if repeated and notice.response is not None and heard_all:
-        notice = _replace(notice, response=held.response)  # reconciling has brought the newest
+        notice = replace(notice, response=held.response)  # reconciling has brought the newest
     place = ("query", held.id, notice.event)
     listened = False
     if place not in decision.catalog.heard:
@@ -84,7 +83,7 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
 
 def _note(decision: Decision, held: Held, notice: Notice) -> None:
     response = held.response if notice.response is None else notice.response
-    told = _replace(held, state=notice.state, response=response)
+    told = replace(held, state=notice.state, response=response)
     if held.hold is Hold.PENDING:
         decision.put_here(told)
     else:
@@ -94,11 +93,7 @@ def _note(decision: Decision, held: Held, notice: Notice) -> None:
 
 
 def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool:
-    """Have the resource hear the status once for each event; return whether the notice has to wait for it.
-
-    Args:
-        listened: whether listeners of the query are hearing the status now; the resource hears it after them.
-    """
+    """Have the resource hear each event once, after listeners that hear it now; return whether the notice waits."""
     catalog, resource, notice = decision.catalog, start.resource, start.notice
     place = ("resource", resource.id, notice.event)
     waiting = catalog.heard.get(place)
@@ -173,7 +168,7 @@ def _dealt_with(decision: Decision, place: Place) -> None:
         if hearing is None:
             continue
         if hearing.receivers > 1:
-            decision.note(catalog.hearing, notice_id, _replace(hearing, receivers=hearing.receivers - 1))
+            decision.note(catalog.hearing, notice_id, replace(hearing, receivers=hearing.receivers - 1))
         else:
             decision.forget(catalog.hearing, notice_id)
             _end(decision, hearing.ends)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import running, start_queued, start_unload
 from rr_actors.registrar.core.notices import (
@@ -35,8 +35,6 @@ from rr_actors.registrar.model.rows import (
     Resource,
     State,
 )
-
-_replace = msgspec.structs.replace
 
 
 def unload(decision: Decision, message: Unload) -> None:
@@ -84,7 +82,7 @@ def unheld(decision: Decision, resource: Resource) -> None:
         retire(decision, resource)
     elif resource.tries == NOT_BEGUN and resource.server in decision.catalog.servers:
         # The load does not run again; the unload callback cleans up after the interrupted run.
-        begin_unload(decision, _replace(resource, tries=0))
+        begin_unload(decision, replace(resource, tries=0))
 
 
 def _lingers(decision: Decision, resource: Resource) -> bool:
@@ -142,7 +140,7 @@ def unload_erred(decision: Decision, erred: UnloadErred) -> None:
     resource = running(decision.catalog, erred.resource_id, UNLOADING, erred.tries)
     if resource is None:
         return
-    decision.put(_replace(resource, phase=UNLOAD_FAILED, message=erred.failure.message))
+    decision.put(replace(resource, phase=UNLOAD_FAILED, message=erred.failure.message))
     decision.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try

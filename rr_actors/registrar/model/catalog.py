@@ -206,12 +206,9 @@ class Catalog:
         """
         rows: list[tuple[Table, str]] = []
         for where, key, old in reversed(self.unfinished or ()):
-            entries: dict[Any, Any]
             if isinstance(where, str):
                 rows.append((where, key))
-                entries = self.tables[where]
-            else:
-                entries = where
+            entries: dict[Any, Any] = self.tables[where] if isinstance(where, str) else where
             if old is ABSENT:
                 entries.pop(key, None)
             else:

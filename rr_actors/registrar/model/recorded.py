@@ -69,7 +69,8 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
     match message:
         case Load():
             provider = peer if event == "sent" else registrar
-            request = _shown(message.request)
+            size = len(message.request)
+            request = shortened(repr(shown_plain(message.request))) if size <= _LONG else f"<{size} bytes>"
             return Entry(*where, message.query_id, "", message.parent, f"{provider}/{message.server}", request)
         case Loaded():
             return Entry(*where, message.query_id, message.resource_id)
@@ -87,7 +88,3 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
             return Entry(*where, detail=message.origin)
         case _:
             return Entry(*where)
-
-
-def _shown(request: bytes) -> str:
-    return shortened(repr(shown_plain(request))) if len(request) <= _LONG else f"<{len(request)} bytes>"
