@@ -96,11 +96,9 @@ def send_again(decision: Decision, command: SendAgain) -> None:
     add_in_flight(decision, command.query_id)
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
-    if held is None:
+    if held is None or (held.hold is PENDING and held.id in decision.catalog.ending):  # it was taken away
         failure = failures.taken_before_heard(command.query_id)
-        decision.cause(LoadResolved(_unknown(command.query_id), failure))
-    elif held.hold is PENDING and held.id in decision.catalog.ending:  # taken away; its holders are hearing of it
-        decision.cause(LoadResolved(held, failures.taken_before_heard(held.id)))
+        decision.cause(LoadResolved(held or _unknown(command.query_id), failure))
     elif held.hold is PENDING:
         request(decision, held.registrar, load_of(decision, held))
     elif held.hold is HELD:

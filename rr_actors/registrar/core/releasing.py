@@ -89,7 +89,7 @@ def release_parts(
     catalog.closings_made += 1
     number = catalog.closings_made
     decision.note(catalog.closings, number, Closing(tuple(ids), tuple(after)))
-    _step(decision, number)
+    _step(decision, number, tuple(ids))
 
 
 def released(decision: Decision, held_id: str) -> None:
@@ -97,9 +97,7 @@ def released(decision: Decision, held_id: str) -> None:
     catalog = decision.catalog
     number = decision.forget(catalog.closing_of, held_id)
     if number is not None:
-        closing = catalog.closings[number]
-        decision.note(catalog.closings, number, replace(closing, remaining=closing.remaining[1:]))
-        _step(decision, number)
+        _step(decision, number, catalog.closings[number].remaining[1:])
 
 
 def provider_lost(decision: Decision, registrar: str) -> None:
@@ -110,10 +108,9 @@ def provider_lost(decision: Decision, registrar: str) -> None:
         released(decision, id)
 
 
-def _step(decision: Decision, number: int) -> None:
+def _step(decision: Decision, number: int, remaining: tuple[str, ...]) -> None:
     catalog = decision.catalog
     closing = catalog.closings[number]
-    remaining = closing.remaining
     while remaining:
         held = catalog.held.get(remaining[0])
         if held is not None and held.registrar in catalog.up:

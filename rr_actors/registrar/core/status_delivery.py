@@ -57,39 +57,33 @@ def noticed(decision: Decision, provider: str, message: Noticed) -> None:
 
 
 def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
+    catalog = decision.catalog
     receivers = 0
-    heard_all = held.hold is Hold.HELD and held.id not in decision.catalog.kept
+    heard_all = held.hold is Hold.HELD and held.id not in catalog.kept
     if repeated and notice.response is not None and heard_all:
         notice = replace(notice, response=held.response)  # reconciling has brought the newest
     place = ("query", held.id, notice.event)
     listened = False
-    if place not in decision.catalog.heard:
+    if place not in catalog.heard:
         receivers += 1
-        listened = is_listened(decision.catalog, held)
-        _note(decision, held, notice)
-        decision.note(decision.catalog.heard, place, (notice.id,))
+        listened = is_listened(catalog, held)
+        response = held.response if notice.response is None else notice.response
+        put = decision.put_here if held.hold is Hold.PENDING else decision.put_later
+        put(replace(held, state=notice.state, response=response))
+        if notice.released:
+            decision.note(catalog.ending, held.id, True)
+        decision.note(catalog.heard, place, (notice.id,))
         decision.cause(Hear(held, notice, repeated))
-    resource = decision.catalog.resources.get(held.parent)
+    resource = catalog.resources.get(held.parent)
     if resource is not None:
         start = StartStatus(resource, notice, provider, repeated)
         receivers += _concerns(decision, start, listened=listened)
     ends = held.id if notice.released else ""
     if receivers:
-        decision.note(decision.catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
+        decision.note(catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
     else:
         _end(decision, ends)
         _acknowledge(decision, provider, notice.id)
-
-
-def _note(decision: Decision, held: Held, notice: Notice) -> None:
-    response = held.response if notice.response is None else notice.response
-    told = replace(held, state=notice.state, response=response)
-    if held.hold is Hold.PENDING:
-        decision.put_here(told)
-    else:
-        decision.put_later(told)
-    if notice.released:
-        decision.note(decision.catalog.ending, held.id, True)
 
 
 def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool:
@@ -191,21 +185,17 @@ def _end(decision: Decision, held_id: str) -> None:
 
 
 def _remember(decision: Decision, place: Place) -> None:
-    heard = decision.catalog.heard
+    catalog, heard = decision.catalog, decision.catalog.heard
     decision.note(heard, place, ())
     if len(heard) % _SWEPT_EVERY == 0:
-        for old in [old for old, pending in heard.items() if not pending and not _is_there(decision, old)]:
-            decision.forget(heard, old)
+        for old, pending in list(heard.items()):
+            kind, id, _ = old
+            if not pending and id not in (catalog.held if kind == "query" else catalog.resources):
+                decision.forget(heard, old)
     if len(heard) > _REMEMBERED:
         for old in list(heard)[: _REMEMBERED // 2]:
             if not heard[old]:
                 decision.forget(heard, old)  # so old that its notice was acknowledged long ago
-
-
-def _is_there(decision: Decision, place: Place) -> bool:
-    """Return whether the query or resource of the place still exists."""
-    kind, id, _ = place
-    return id in (decision.catalog.held if kind == "query" else decision.catalog.resources)
 
 
 def _acknowledge(decision: Decision, provider: str, notice_id: str) -> None:

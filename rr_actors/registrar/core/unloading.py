@@ -231,11 +231,10 @@ def gone(decision: Decision, message: Gone) -> None:
     catalog = decision.catalog
     drop_parked(decision, lambda parked: parked.origin == message.origin)
     for query_id in list(catalog.by_origin.get(message.origin, ())):
-        query = catalog.queries.get(query_id)
-        if query is not None:
-            resource = catalog.resources[query.resource_id]
-            drop_query(decision, query)
-            if resource.id not in catalog.holders and resource.id not in catalog.recovering:
-                unheld(decision, resource)
+        query = catalog.queries[query_id]
+        resource = catalog.resources[query.resource_id]
+        drop_query(decision, query)
+        if resource.id not in catalog.holders and resource.id not in catalog.recovering:
+            unheld(decision, resource)
     for notice_id in list(catalog.notices_to.get(message.origin, ())):
         drop_notice(decision, catalog.notices[notice_id])
