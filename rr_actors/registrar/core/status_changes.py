@@ -95,7 +95,7 @@ def start_own(decision: Decision, server: str) -> None:
         if resource.server == server:
             for notice in own_notices(decision, resource_id):
                 if decision.forget(catalog.told, notice.id):
-                    start_status(decision, StartStatus(resource, notice, "", repeated=True))
+                    start_status(decision, StartStatus(resource, notice, repeated=True))
 
 
 def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
@@ -182,4 +182,4 @@ def _say(
         _tell_holders(decision, resource, said)
     else:
         decision.put(said)
-        start_status(decision, StartStatus(resource, said, "", repeated=False))
+        start_status(decision, StartStatus(resource, said, repeated=False))

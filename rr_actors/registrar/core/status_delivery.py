@@ -76,8 +76,7 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
         decision.cause(Hear(held, notice, repeated))
     resource = catalog.resources.get(held.parent)
     if resource is not None:
-        start = StartStatus(resource, notice, provider, repeated)
-        receivers += _concerns(decision, start, listened=listened)
+        receivers += _concerns(decision, StartStatus(resource, notice, repeated), listened=listened)
     ends = held.id if notice.released else ""
     if receivers:
         decision.note(catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
@@ -133,7 +132,7 @@ def start_deferred(decision: Decision, resource_id: str) -> None:
         resource = catalog.resources.get(resource_id)
         server = None if resource is None else catalog.servers.get(resource.server)
         if resource is None or server is None:
-            status_done(decision, StatusDone(resource_id, start.notice, start.provider, handled=False))
+            status_done(decision, StatusDone(resource_id, start.notice, handled=False))
         else:
             start_status(decision, start)
 
