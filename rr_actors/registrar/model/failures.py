@@ -8,7 +8,7 @@ from rr_actors.base.errors import did_you_mean, shortened, shown
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Failure
-from rr_actors.registrar.model.rows import Held, Resource
+from rr_actors.registrar.model.rows import Held, Hold, Resource
 
 
 def unknown_server(catalog: Catalog, server: str) -> Failure:
@@ -24,7 +24,7 @@ def unknown_target(catalog: Catalog, target: str) -> Failure:
     """Return the failure of a call for an id that is neither a resource nor a query served here."""
     what = "serves no resource and no query of this id (never did, or unloaded already)"
     for held in catalog.held.values():
-        if target in (held.id, held.resource_id) and held.registrar != catalog.name:
+        if held.hold is Hold.HELD and target in (held.id, held.resource_id) and held.registrar != catalog.name:
             owner = held.registrar
             what = f"holds it, and does not serve it: call {owner!r}, which serves it as {owner}/{held.server}"
             break
