@@ -18,14 +18,13 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import Held, Hold, Query, Resource
+from rr_actors.registrar.model.rows import HELD, Held, Query, Resource
 
 R = TypeVar("R")
 
 LENGTH = 1024
 """The queries in a span: if one of them differs, all are listed."""
 
-_HELD = Hold.HELD
 _number, _id, _resource_id = map(attrgetter, ("seq", "id", "resource_id"))
 _response, _state = map(attrgetter, ("response", "state"))
 _FACTS = (_id, _resource_id, _response, _state)
@@ -52,7 +51,7 @@ def held_at(catalog: Catalog, provider: str) -> list[Held]:
 
     Pending and owed queries are left out: their spans differ anyway.
     """
-    return [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is _HELD]
+    return [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is HELD]
 
 
 def known(rows: list[Held], before: Known | None = None) -> Known:
@@ -104,7 +103,7 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
         return bisect_left(bounds, row.seq) % 2 == 1
 
     kept = [catalog.held[id] for id in catalog.kept if id in catalog.held]
-    agreed = [row for row in kept if row.registrar == provider and row.hold is _HELD and is_within(row)]
+    agreed = [row for row in kept if row.registrar == provider and row.hold is HELD and is_within(row)]
     if same == [(_FIRST, _LAST)]:
         return agreed, []
     others = [row for row in held_at(catalog, provider) if not is_within(row)]

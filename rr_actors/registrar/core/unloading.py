@@ -208,12 +208,12 @@ def unregister(decision: Decision, command: Unregister) -> None:
 def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None:
     match resource.phase:
         case Phase.QUEUED | Phase.LOADING:
-            decision.effects += refuse_all(decision, resource, failures.evicted(decision.catalog, resource, why))
+            decision.effects += refuse_all(decision, resource, failures.load_failed(decision.catalog, resource, why))
             unheld(decision, resource)  # a running load goes on; the resource is unloaded when it returns
         case Phase.LOADED | Phase.UNLOAD_FAILED:
             source = decision.catalog.origin_of(resource)
             said = Notice(event, "", "", resource.id, event, State.FATAL, why, source, released=True)
-            failure = failures.evicted(decision.catalog, resource, why)
+            failure = failures.load_failed(decision.catalog, resource, why)
             for query in decision.catalog.queries_of(resource.id):
                 decision.drop(query)
                 remember(decision, query.id, failure)

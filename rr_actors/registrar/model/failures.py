@@ -59,23 +59,21 @@ def not_swapped(catalog: Catalog, resource_id: str, part: str) -> Failure:
 
 def overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
     """Return the failure of a load whose callback takes too long."""
-    name = catalog.origin_of(resource)
-    text = f"{name}: the load callback took longer than load_timeout_s={limit_s:g} s"
-    return Failure("LoadFailed", text, {"server": name, "timeout_s": limit_s}, [(name, text)])
+    why = f"the load callback took longer than load_timeout_s={limit_s:g} s"
+    return load_failed(catalog, resource, why, timeout_s=limit_s)
 
 
 def interrupted(catalog: Catalog, resource: Resource) -> Failure:
     """Return the failure of a load in each of whose attempts the process died."""
-    origin = catalog.origin_of(resource)
     how = f" (it died of: {catalog.deaths})" if catalog.deaths else ""
-    text = f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again"
-    return Failure("LoadFailed", f"{origin}: {text}", {"server": origin}, [(origin, text)])
+    why = f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again"
+    return load_failed(catalog, resource, why)
 
 
-def evicted(catalog: Catalog, resource: Resource, why: str) -> Failure:
-    """Return the failure of a load whose resource was taken away."""
+def load_failed(catalog: Catalog, resource: Resource, why: str, **details: float) -> Failure:
+    """Return the failure of a load of this resource for a reason that its callback has not raised."""
     origin = catalog.origin_of(resource)
-    return Failure("LoadFailed", f"{origin}: {why}", {"server": origin}, [(origin, why)])
+    return Failure("LoadFailed", f"{origin}: {why}", {"server": origin, **details}, [(origin, why)])
 
 
 def left_behind(catalog: Catalog, resources: Sequence[Resource]) -> Failure:
