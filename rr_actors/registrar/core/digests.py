@@ -97,16 +97,13 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
     number is greater than all that Fetch told came meanwhile: by a thread's own line, or after the provider compared.
     It counts as agreed if the provider has said that it has nothing behind the last span.
     """
-    bounds = [number for bound in same for number in bound]
-
-    def is_within(row: Held) -> bool:
-        return bisect_left(bounds, row.seq) % 2 == 1
-
+    bounds = [number for bound in same for number in bound]  # a number within one has an odd place among them
     kept = [catalog.held[id] for id in catalog.kept if id in catalog.held]
-    agreed = [row for row in kept if row.registrar == provider and row.hold is HELD and is_within(row)]
+    kept = [row for row in kept if row.registrar == provider and row.hold is HELD]
+    agreed = [row for row in kept if bisect_left(bounds, row.seq) % 2 == 1]
     if same == [(_FIRST, _LAST)]:
         return agreed, []
-    others = [row for row in held_at(catalog, provider) if not is_within(row)]
+    others = [row for row in held_at(catalog, provider) if bisect_left(bounds, row.seq) % 2 == 0]
     return agreed, sorted(others, key=_number)
 
 
