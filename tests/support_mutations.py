@@ -27,7 +27,7 @@ from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved
 from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
 from rr_actors.registrar.model.effects import Request, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
-from rr_actors.registrar.model.rows import Change, Held, Hold, Phase, Put, is_own
+from rr_actors.registrar.model.rows import Change, Held, Hold, Phase, Put, Resource, is_own
 from simulation import sim_registrar
 from simulation.sim_links import TO_PROVIDER, SimLine, SimLink
 from simulation.sim_process import SimShell
@@ -471,7 +471,7 @@ def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
     """Lists are taken for equal that have the same queries, whatever has become of them."""
 
     def ids_of(catalog: Catalog, queries: Any, *_: Any) -> list[list[str]]:
-        return [[query.id for query in queries if digests.response_of(catalog, query) is not None]]
+        return [[query.id for query in queries if query.resource_id not in catalog.moving]]
 
     patch(digests, "_FACTS", (attrgetter("id"),))
     patch(digests, "_facts", ids_of)
@@ -573,7 +573,13 @@ def loses_what_waited(patch: Patch) -> type[SimRegistrar]:
 
 def loads_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
     """A load that a crash has interrupted is run again, whoever wants it."""
-    patch(recovery, "_interrupted", callback_runs.load_again)
+
+    def again(decision: Decision, resource: Resource) -> None:
+        resource = _replace(resource, tries=0)
+        decision.put(resource)
+        callback_runs.start_load(decision, resource)
+
+    patch(recovery, "_interrupted", again)
     return SimRegistrar
 
 

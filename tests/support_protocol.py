@@ -154,7 +154,7 @@ class Script:
                 self.say(name, f"runs the unload callback of {resource.id}{given}, try {resource.tries}")
             case e.StartRecover(resource, reload):
                 self.say(name, f"runs the {'load' if reload else 'recover'} callback of {resource.id} again")
-            case e.StartStatus(resource, notice, _, _):
+            case e.StartStatus(resource, notice, _):
                 side.statuses[resource.id] = effect
                 self.say(name, f"runs the status callback of {resource.id}: {status_text(notice)}")
             case e.SetTimer(key, None, _):
@@ -322,7 +322,7 @@ def _heard(script: Script, name: str, id: str, verb: str) -> None:
 
 def _status_done(script: Script, name: str, id: str, verb: str) -> None:
     start = script.side(name).statuses.pop(id)
-    script.post(name, c.StatusDone(id, start.notice, start.provider, handled=verb == "handles it"))
+    script.post(name, c.StatusDone(id, start.notice, handled=verb == "handles it"))
 
 
 def _fires(script: Script, name: str, key: str) -> None:

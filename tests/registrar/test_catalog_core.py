@@ -955,7 +955,7 @@ def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not
     else:
         assert requests(registrar) == []
         assert registrar.started(e.StartStatus) == ["q"]
-        registrar.obey(c.StatusDone("q", notice, "lens", handled=False))
+        registrar.obey(c.StatusDone("q", notice, handled=False))
     assert [reply.notice.query_id for reply in registrar.replies] == ([] if handled else ["q"])
     assert requests(registrar) == [NoticesHandled(["s:part"])]
 
@@ -980,19 +980,19 @@ def test_a_status_goes_to_the_status_callback_of_its_own_server_first_and_then_t
 
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", "ticket"))
     assert registrar.effects[-2:] == [
-        e.StartStatus(registrar.catalog.resources["q"], own(), "", repeated=False),
+        e.StartStatus(registrar.catalog.resources["q"], own(), repeated=False),
         e.Answer("ticket", None),
     ]
     assert Put(own()) in registrar.changes
     assert told(registrar) == []
     assert registrar.catalog.resources["q"].state is State.WARNING
 
-    registrar.obey(c.StatusDone("q", own(), "", handled))
+    registrar.obey(c.StatusDone("q", own(), handled))
     assert told(registrar) == ([] if handled else [("q", State.WARNING)])
     assert Drop("notices", "s:") in registrar.changes
     assert registrar.catalog.own_notices == {}
 
-    registrar.obey(c.StatusDone("q", own(), "", handled=False))
+    registrar.obey(c.StatusDone("q", own(), handled=False))
     assert registrar.effects == []
 
 
@@ -1011,7 +1011,7 @@ def test_a_new_response_reaches_the_holders_whatever_the_status_callback_says_of
     registrar = provider("loaded", has_status=True)
     registrar.obey(c.SetResponse("q", "r", b"new", "", None))
     registrar.obey(c.SetResponse("q", "later", b"newest", "", None, callback_of="q"))
-    registrar.obey(c.StatusDone("q", own("r", State.UPDATE, "", b"new"), "", handled=True))
+    registrar.obey(c.StatusDone("q", own("r", State.UPDATE, "", b"new"), handled=True))
     (noticed,) = registrar.replies
     assert noticed.notice.response == b"newest"
     assert registrar.catalog.resources["q"].response == b"newest"
@@ -1064,7 +1064,7 @@ def test_a_status_callback_that_runs_while_its_server_is_registered_anew_is_not_
     registrar.obey(c.Register(Server("cam", has_status=True), "event"))
     assert registrar.started(e.StartStatus) == []
     assert list(registrar.catalog.own_notices) == ["q"]
-    registrar.obey(c.StatusDone("q", own(), "", handled=False))
+    registrar.obey(c.StatusDone("q", own(), handled=False))
     assert registrar.catalog.own_notices == {}
 
 
@@ -1072,7 +1072,7 @@ def test_a_status_callback_that_runs_while_its_server_is_registered_anew_is_not_
 def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
     registrar = provider(phase, has_status=True)
     if phase == "fatal":
-        registrar.obey(c.StatusDone("q", own("e", State.FATAL, ""), "", handled=False))
+        registrar.obey(c.StatusDone("q", own("e", State.FATAL, ""), handled=False))
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
     assert list(registrar.catalog.own_notices) == ["q"]
     registrar.obey(c.ForceUnload("q", "f", None))
@@ -1119,7 +1119,7 @@ def test_what_a_part_says_waits_until_the_load_or_recover_callback_has_returned(
 
     started = [effect.notice.event for effect in registrar.effects if isinstance(effect, e.StartStatus)]
     assert started == ["s", "later"]
-    registrar.obey(c.StatusDone("q", of_part().notice, "lens", handled=False))
+    registrar.obey(c.StatusDone("q", of_part().notice, handled=False))
     assert told(registrar) == [("q", State.WARNING)]
     assert requests(registrar) == [NoticesHandled(["s:part"])]
 
@@ -1153,7 +1153,7 @@ def test_a_part_that_is_taken_away_while_the_whole_loads_is_dropped_when_the_who
     registrar.obey(c.Heard("part", "s"))
     assert "part" in registrar.catalog.held
     registrar.obey(c.LoadDone("q", 1, b"feed"))
-    registrar.obey(c.StatusDone("q", gone.notice, "lens", handled=True))
+    registrar.obey(c.StatusDone("q", gone.notice, handled=True))
     assert "part" not in registrar.catalog.held
     assert requests(registrar) == [NoticesHandled(["s:part"])]
 

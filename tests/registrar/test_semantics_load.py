@@ -473,8 +473,10 @@ def test_a_server_may_bound_the_time_of_its_load_callback(
     app: rr.Registrar, provider: rr.Registrar, gate: Gate
 ) -> None:
     serve(provider, "slow", load=gate, load_timeout_s=0.05)
-    with pytest.raises(rr.LoadError, match="slow"):
+    with pytest.raises(rr.LoadFailed, match="slow") as caught:
         app.load("provider/slow", "x", timeout_s=10.0)
+    why = "provider/slow: the load callback took longer than load_timeout_s=0.05 s"
+    assert [str(frame) for frame in caught.value.trace] == [why]
     gate.open()
     eventually(lambda: not provider.resources())
 

@@ -121,6 +121,21 @@ def test_a_status_for_what_is_not_there_is_an_error(app: rr.Registrar, provider:
             provider.send_status(gone, WARNING)
 
 
+def test_a_status_that_a_holder_sends_is_refused_and_the_error_names_the_owner(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    refused = "'app' holds it, and does not serve it: call 'provider', which serves it as provider/camera"
+    for target in (query, query.id, query.resource_id):
+        with pytest.raises(rr.UnknownQuery, match=refused):
+            app.send_status(target, WARNING)
+    with pytest.raises(rr.UnknownQuery, match=refused):
+        app.update_response(query, "late")
+    with pytest.raises(rr.UnknownQuery, match=refused):
+        app.unload(query.id, force=True)
+
+
 def test_a_server_callback_may_send_a_status_of_the_resource_it_has_loaded(
     app: rr.Registrar, provider: rr.Registrar
 ) -> None:

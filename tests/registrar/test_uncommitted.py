@@ -111,7 +111,7 @@ AGAIN: list[Any] = [
     c.RecoverErred("r", 1, WHY, "event"),
     c.LingerOver("r"),
     c.Heard("mine", "event"),
-    c.StatusDone("r", NOTICE, "p", False),
+    c.StatusDone("r", NOTICE, False),
     c.Reconcile("p", [], "event"),
     c.ConsumerLost("app"),
     c.LinkLost("p"),

@@ -78,10 +78,10 @@ def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
         shell.world.ledger.hear_own(notice, shell.epoch, effect.repeated)
     server = shell.catalog.servers.get(resource.server)
     if server is None or not server.has_status:
-        shell.post(c.StatusDone(resource.id, notice, effect.provider, handled=False))
+        shell.post(c.StatusDone(resource.id, notice, handled=False))
         return
     run = shell.start_run("status", resource.id, notice.event, resource)
-    run.notice, run.provider = notice, effect.provider
+    run.notice = notice
 
 
 def _hear(shell: SimShell, effect: e.Hear) -> None:

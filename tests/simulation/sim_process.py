@@ -70,7 +70,7 @@ class Surroundings(Protocol):
 class Run:
     """One callback that runs: load, reload, unload, recover or status of a resource, or hear of a query."""
 
-    __slots__ = ("id", "key", "kind", "listener", "notice", "number", "provider", "resource", "subs", "waits")
+    __slots__ = ("id", "key", "kind", "listener", "notice", "number", "resource", "subs", "waits")
 
     def __init__(self, registrar: str, kind: str, id: str, number: Any, resource: Resource | None) -> None:
         self.kind = kind
@@ -79,7 +79,6 @@ class Run:
         self.key = ("call", registrar, kind, id, number)
         self.resource = resource
         self.notice: Notice | None = None
-        self.provider = ""
         self.listener = ""  # the resource on whose behalf it listens to a part, if it may deal with the status
         self.subs = 0
         self.waits = ""

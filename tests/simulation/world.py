@@ -170,7 +170,7 @@ class World(People):
                 ledger.own_heard.add((run.id, run.number))
                 if not ok:
                     ledger.handled.add((run.id, run.number))
-                return c.StatusDone(run.id, run.notice, run.provider, not ok)
+                return c.StatusDone(run.id, run.notice, not ok)
             case _:
                 event = self.new_event()
                 if not ok:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
@@ -10,21 +10,12 @@ from rr_actors.registrar.model.commands import LoadOverdue
 from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
 from rr_actors.registrar.model.rows import LOADING, UNLOADING, Phase, Resource
 
-_replace = msgspec.structs.replace
-
 
 def start_load(decision: Decision, resource: Resource) -> None:
     """Run the load callback; if the server is not registered (yet), the resource waits for it."""
     if resource.server in decision.catalog.servers:
         decision.cause(StartLoad(resource))
         limit_load(decision, resource)
-
-
-def load_again(decision: Decision, resource: Resource) -> None:
-    """Run the load callback again after a crash has interrupted it; the server is registered."""
-    resource = _replace(resource, tries=0)
-    decision.put(resource)
-    start_load(decision, resource)
 
 
 def limit_load(decision: Decision, resource: Resource) -> None:
@@ -45,7 +36,7 @@ def end_limit(decision: Decision, resource: Resource) -> None:
 
 def start_unload(decision: Decision, resource: Resource) -> None:
     """Run the unload callback, perhaps once more; if the server is not registered, the resource waits for it."""
-    resource = _replace(resource, phase=UNLOADING, tries=resource.tries + 1)
+    resource = replace(resource, phase=UNLOADING, tries=resource.tries + 1)
     decision.put(resource)
     if resource.server in decision.catalog.servers:
         decision.cause(StartUnload(resource))
@@ -54,7 +45,7 @@ def start_unload(decision: Decision, resource: Resource) -> None:
 def start_queued(decision: Decision, resource: Resource) -> None:
     """Load a QUEUED resource, if no resource of the same request is being unloaded any more."""
     if (resource.server, resource.request) not in decision.catalog.unloading:
-        resource = _replace(resource, phase=LOADING)
+        resource = replace(resource, phase=LOADING)
         decision.put(resource)
         start_load(decision, resource)
 

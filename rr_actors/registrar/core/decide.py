@@ -25,7 +25,6 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import messages as m
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import Answer, LoadResolved, Reply, UnloadResolved
-from rr_actors.registrar.model.messages import Failure, Load
 from rr_actors.registrar.model.rows import Hold, Put
 
 Item = tuple[Any, str | None]
@@ -35,8 +34,7 @@ Item = tuple[Any, str | None]
 def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
     """Decide messages and commands in their order as one decision: either all of them happen, or none.
 
-    The catalog in memory is changed at once. Then either commit the decision, close() it and carry out its effects, or
-    undo() it.
+    The catalog in memory is changed at once. Then commit the decision, close() it and act, or undo() it.
 
     Raises:
         TypeError: an item is no message or command that a registrar handles.
@@ -64,24 +62,12 @@ def _describe(decision: Decision, sender: str, message: m.Describe) -> None:
         decision.cause(Reply(sender, m.Described(message.server, server.types)))
 
 
-def _begin_again(decision: Decision, _: c.BeginAgain) -> None:
-    recovery.begin_again(decision)
-
-
 def _set_rows(decision: Decision, command: c.SetRows) -> None:
     for change in command.changes:
         if isinstance(change, Put):
             decision.put(change.row)
         elif (row := decision.catalog.tables[change.table].get(change.id)) is not None:
             decision.drop(row)
-
-
-def _refuse_load(decision: Decision, command: c.RefuseLoad) -> None:
-    decision.cause(refuse(decision, command.origin, command.query_id, command.failure))
-
-
-def _add_in_flight(decision: Decision, _: c.AddInFlight) -> None:
-    releasing.add_all_in_flight(decision)
 
 
 _MESSAGES: dict[type[Any], Callable[[Decision, Any], None]] = {
@@ -104,9 +90,9 @@ _MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
 """The messages that do not name their sender, and whose function needs it."""
 
 _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
-    c.BeginAgain: _begin_again,
+    c.BeginAgain: lambda decision, _: recovery.begin_again(decision),
     c.SetRows: _set_rows,
-    c.RefuseLoad: _refuse_load,
+    c.RefuseLoad: lambda decision, it: decision.cause(refuse(decision, it.origin, it.query_id, it.failure)),
     c.Register: recovery.register,
     c.Unregister: unloading.unregister,
     c.LoadDone: loading.load_done,
@@ -126,7 +112,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.SendAgain: holding.send_again,
     c.GiveUp: holding.give_up,
     c.Release: holding.release,
-    c.AddInFlight: _add_in_flight,
+    c.AddInFlight: lambda decision, _: releasing.add_all_in_flight(decision),
     c.ReleaseOverdue: holding.release_overdue,
     c.Heard: status_delivery.heard,
     c.StatusDone: status_delivery.status_done,
@@ -137,23 +123,18 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
 }
 
 
-# Uncommitted messages and commands: their changes could not be written.
-#
-# Nothing of them has happened. Callers that wait get the error. The other items are decided again in their order, and
-# later messages wait behind them, because the decisions rely on the order of messages.
+def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: m.Failure) -> tuple[Decision, list[Item]]:
+    """Refuse items whose changes could not be written; return that decision, and the items to be decided again.
 
-
-def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure) -> tuple[Decision, list[Item]]:
-    """Refuse the items that can be refused, with `failure`; return that decision, and the items to be decided again.
-
-    The decision has effects only and no changes, so it needs no room on the disk. The caller has undone the decision of
-    the items.
+    The caller has undone their decision: nothing of them has happened. Callers that wait get `failure`. Later messages
+    have to wait behind the items to be decided again, because decisions rely on the order of messages. The decision
+    returned has effects only and no changes, so it needs no room on the disk.
     """
     decision = Decision(catalog)
     again: list[Item] = []
     for item, sender in items:
         match item:
-            case Load() if item.query_id not in decision.catalog.queries:
+            case m.Load() if item.query_id not in decision.catalog.queries:
                 decision.cause(refuse(decision, item.origin, item.query_id, failure))
             case c.Ask():
                 decision.cause(LoadResolved(holding.pending(item, 0, 0), failure))

@@ -18,14 +18,13 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import Held, Hold, Query, Resource
+from rr_actors.registrar.model.rows import HELD, Held, Query, Resource
 
 R = TypeVar("R")
 
 LENGTH = 1024
 """The queries in a span: if one of them differs, all are listed."""
 
-_HELD = Hold.HELD
 _number, _id, _resource_id = map(attrgetter, ("seq", "id", "resource_id"))
 _response, _state = map(attrgetter, ("response", "state"))
 _FACTS = (_id, _resource_id, _response, _state)
@@ -52,7 +51,7 @@ def held_at(catalog: Catalog, provider: str) -> list[Held]:
 
     Pending and owed queries are left out: their spans differ anyway.
     """
-    return [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is _HELD]
+    return [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is HELD]
 
 
 def known(rows: list[Held], before: Known | None = None) -> Known:
@@ -92,37 +91,25 @@ def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[
 
 
 def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], list[Held]]:
-    """Return the `kept` rows within `same`, and all rows outside of it, oldest first.
+    """Return, of the rows HELD at a provider, the `kept` ones within `same`, and all outside of it, oldest first.
 
     Rows within `same` agree with the provider; the caller has a note to remove only for the `kept` ones. A row whose
     number is greater than all that Fetch told came meanwhile: by a thread's own line, or after the provider compared.
     It counts as agreed if the provider has said that it has nothing behind the last span.
     """
-    held = catalog.held
-    bounds = [number for bound in same for number in bound]
-
-    def is_agreed(row: Held) -> bool:
-        return row.hold is _HELD and bisect_left(bounds, row.seq) % 2 == 1
-
-    noted = [held[id] for id in catalog.kept if id in held]
+    bounds = [number for bound in same for number in bound]  # a number within one has an odd place among them
+    kept = [catalog.held[id] for id in catalog.kept if id in catalog.held]
+    kept = [row for row in kept if row.registrar == provider and row.hold is HELD]
+    agreed = [row for row in kept if bisect_left(bounds, row.seq) % 2 == 1]
     if same == [(_FIRST, _LAST)]:
-        others = catalog.unsettled_at(provider)
-    else:
-        rows = _rows(held, catalog.outbound.get(provider, ()))
-        others = [row for row in rows if row.hold is not _HELD or bisect_left(bounds, row.seq) % 2 == 0]
-    others.sort(key=_number)
-    return [row for row in noted if row.registrar == provider and is_agreed(row)], others
+        return agreed, []
+    others = [row for row in held_at(catalog, provider) if bisect_left(bounds, row.seq) % 2 == 0]
+    return agreed, sorted(others, key=_number)
 
 
 def _rows(table: dict[str, R], ids: Collection[str]) -> Iterable[R]:
     """Return the rows with these ids: some rows of the table or, often, all of them."""
     return table.values() if len(ids) == len(table) else map(table.__getitem__, ids)
-
-
-def response_of(catalog: Catalog, query: Query) -> bytes | None:
-    """Return a query's response as Fetched gives it: None while its resource is loading, or being unloaded."""
-    resource = catalog.resources[query.resource_id]
-    return None if resource.id in catalog.moving else resource.response or b""
 
 
 def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:

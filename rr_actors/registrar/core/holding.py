@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.base.errors import CatalogError, shortened
 from rr_actors.registrar.core import releasing
@@ -17,20 +17,8 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
 from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
-from rr_actors.registrar.model.messages import (
-    Failure,
-    Load,
-    Loaded,
-    LoadRefused,
-    Noticed,
-    Unload,
-    Unloaded,
-    UnloadRefused,
-)
+from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Noticed, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import HELD, OK, OWED, PENDING, Held, Notice, Phase, State
-
-_replace = msgspec.structs.replace
-
 
 # -- load ----------------------------------------------------------------------------------------------------------
 
@@ -49,20 +37,15 @@ def ask(decision: Decision, command: Ask) -> None:
             return
         attempt = resource.attempt
         if (known := catalog.held.get(command.query_id)) is not None:
-            _asked_again(decision, known)
+            if known.hold is HELD:
+                decision.cause(LoadResolved(known, None))
+            elif known.hold is OWED:
+                decision.cause(LoadResolved(known, failures.withdrawn(known, "it is being released")))
             return
     held = pending(command, attempt, catalog.next_seq(command.seq))
     look_there(decision, command.registrar)
     decision.put_here(held)
     request(decision, held.registrar, load_of(decision, held))
-
-
-def _asked_again(decision: Decision, held: Held) -> None:
-    """Answer a load whose id has a row: the part is held already, or it is being released."""
-    if held.hold is HELD:
-        decision.cause(LoadResolved(held, None))
-    elif held.hold is OWED:
-        decision.cause(LoadResolved(held, failures.withdrawn(held, "it is being released")))
 
 
 def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
@@ -74,7 +57,7 @@ def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
     asked = catalog.in_flight.get(id)
     if asked is None or asked.registrar not in catalog.up:
         return False
-    row = _replace(asked, response=answer.response, resource_id=answer.resource_id, hold=HELD)
+    row = replace(asked, response=answer.response, resource_id=answer.resource_id, hold=HELD)
     catalog.unfinished = [(catalog.in_flight, id, asked), ("held", id, ABSENT)]
     catalog.held[id] = row
     add(catalog.outbound, asked.registrar, id)
@@ -96,7 +79,7 @@ def got(decision: Decision, command: Got) -> None:
     held = catalog.held.get(id)
     if held is None:  # the query was loaded and taken away, and its holders know: the load itself succeeded
         taken = _unknown(id)
-        decision.cause(LoadResolved(_replace(taken, resource_id=command.resource_id, response=command.response), None))
+        decision.cause(LoadResolved(replace(taken, resource_id=command.resource_id, response=command.response), None))
         return
     if held.registrar not in catalog.up:
         decision.note(catalog.fresh, id, True)
@@ -113,10 +96,9 @@ def send_again(decision: Decision, command: SendAgain) -> None:
     add_in_flight(decision, command.query_id)
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
-    if held is None:
-        _end_unknown(decision, command.query_id, failures.taken_before_heard(command.query_id))
-    elif held.hold is PENDING and held.id in decision.catalog.ending:  # taken away; its holders are hearing of it
-        decision.cause(LoadResolved(held, failures.taken_before_heard(held.id)))
+    if held is None or (held.hold is PENDING and held.id in decision.catalog.ending):  # it was taken away
+        failure = failures.taken_before_heard(command.query_id)
+        decision.cause(LoadResolved(held or _unknown(command.query_id), failure))
     elif held.hold is PENDING:
         request(decision, held.registrar, load_of(decision, held))
     elif held.hold is HELD:
@@ -126,12 +108,8 @@ def send_again(decision: Decision, command: SendAgain) -> None:
         request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
-def _end_unknown(decision: Decision, query_id: str, failure: Failure) -> None:
-    """Fail a load whose query was taken away, and whose row went when its holders had heard of that."""
-    decision.cause(LoadResolved(_unknown(query_id), failure))
-
-
 def _unknown(query_id: str) -> Held:
+    """Return a row for a query that was taken away, and whose own row went when its holders had heard of that."""
     return Held(query_id, "", "", b"", None, "", "", 0, 0, PENDING, State.FATAL)
 
 
@@ -157,7 +135,7 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
         request(decision, provider, Unload(message.query_id, decision.catalog.name))
     elif held.hold is PENDING:
         response = message.response if held.response is None else held.response  # an UPDATE has come before it
-        held = _replace(held, hold=HELD, resource_id=message.resource_id, response=response)
+        held = replace(held, hold=HELD, resource_id=message.resource_id, response=response)
         decision.put_later(held)
         decision.cause(LoadResolved(held, None))
 
@@ -193,7 +171,7 @@ def give_up(decision: Decision, command: GiveUp) -> None:
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
-        _end_unknown(decision, command.query_id, command.failure)
+        decision.cause(LoadResolved(_unknown(command.query_id), command.failure))
     elif held.hold is PENDING or (command.unheard and held.hold is HELD):
         withdraw(decision, held, command.failure)
 
@@ -225,7 +203,7 @@ def owed(catalog: Catalog, query_id: str) -> Held | None:
         return None
     if query_id in catalog.kept or query_id in catalog.ending:
         return None
-    return _replace(held, hold=OWED)
+    return replace(held, hold=OWED)
 
 
 def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
@@ -315,8 +293,8 @@ def unload_refused(decision: Decision, message: UnloadRefused) -> None:
     parent = catalog.resources.get(held.parent)
     wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
     if wanted and held.resource_id:
-        decision.note(decision.catalog.kept, held.id, True)
-        decision.put(_replace(held, hold=HELD))
+        decision.note(catalog.kept, held.id, True)
+        decision.put(replace(held, hold=HELD))
     decision.cause(UnloadResolved(held.id, message.failure))
     released(decision, held.id)
 
@@ -345,4 +323,4 @@ def begin_again(decision: Decision) -> None:
         if held.hold is PENDING:
             decision.drop_later(held)  # if the provider has the query, reconciling takes it back or releases it
         elif held.hold is HELD and held.parent and (parent is None or parent.phase is Phase.LOADING):
-            decision.put(_replace(held, hold=OWED))
+            decision.put(replace(held, hold=OWED))

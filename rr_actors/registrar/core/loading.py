@@ -14,7 +14,7 @@ A Load may come twice, by two ways. If the first was refused, the second is refu
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import end_limit, limit_load, running, start_load
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
@@ -28,7 +28,6 @@ from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.registrar.model.rows import LOADED, LOADING, OK, PENDING, QUEUED, Query, Resource
 
-_replace = msgspec.structs.replace
 _NONE: dict[bytes, str] = {}
 _WAITS = (LOADING, QUEUED)
 
@@ -139,7 +138,7 @@ def load_done(decision: Decision, done: LoadDone) -> None:
     resource = running(catalog, done.resource_id, LOADING, done.attempt)
     if resource is None:
         return
-    resource = _replace(resource, phase=LOADED, response=done.response)
+    resource = replace(resource, phase=LOADED, response=done.response)
     decision.put(resource)
     decision.cause(Happened("loaded", resource.id, resource.server, ""))
     end_limit(decision, resource)
@@ -150,10 +149,10 @@ def load_done(decision: Decision, done: LoadDone) -> None:
         return
     for query_id in holders:
         if decision.forget(catalog.waiting, query_id) is not None:
-            reply = Loaded(query_id, resource.id, done.response)
-            decision.cause(Reply(catalog.queries[query_id].origin, reply))
-    for answer in answers_to_owners(decision, resource, None):
-        decision.cause(answer)  # the owner unloaded it while it was loading; its present holders came after that
+            origin = catalog.queries[query_id].origin
+            decision.cause(Reply(origin, Loaded(query_id, resource.id, done.response)))
+    # The owner may have unloaded it while it was loading; its present holders came after that.
+    decision.effects += answers_to_owners(decision, resource, None)
     start_deferred(decision, resource.id)
 
 
@@ -175,8 +174,7 @@ def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
     """Refuse all consumers that wait. The callback goes on; the resource is unloaded when it returns."""
     resource = running(decision.catalog, overdue.resource_id, LOADING, overdue.attempt)
     if resource is not None:
-        for reply in refuse_all(decision, resource, overdue.failure):
-            decision.cause(reply)
+        decision.effects += refuse_all(decision, resource, overdue.failure)
 
 
 # Probing finds rings of loads that wait for one another, by edge chasing (Chandy, Misra and Haas 1983).
@@ -201,7 +199,7 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     """Pass a probe on from this resource to all that it waits for."""
     catalog = decision.catalog
     ring = [*message.ring, catalog.origin_of(resource)]
-    waits = resource.phase in (LOADING, QUEUED) or resource.id in catalog.recovering
+    waits = resource.phase in _WAITS or resource.id in catalog.recovering
     if not waits or len(ring) > _RING_LIMIT:
         return
     if resource.id == message.waiter:

@@ -4,32 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msgspec.structs import replace
+
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Failure, Load, LoadRefused, Noticed, NoticesHandled, Unload
-from rr_actors.registrar.model.rows import Notice, Query, Resource, State, is_own
+from rr_actors.registrar.model.rows import Notice, Query, Resource, is_own
 
 # Notices: statuses on their way to the holders of queries. A notice is a row until its holder has dealt with it.
 
 
-def notify(
-    decision: Decision,
-    query: Query,
-    event: str,
-    state: State,
-    message: str,
-    source: str,
-    *,
-    released: bool = False,
-    response: bytes | None = None,
-    repeated: bool = False,
-) -> None:
-    """Add a notice of a status for the query's holder, and send it."""
-    id = f"{event}:{query.id}"
-    notice = Notice(id, query.id, query.origin, query.resource_id, event, state, message, source, released, response)
+def notify(decision: Decision, query: Query, said: Notice, *, repeated: bool = False) -> None:
+    """Add a notice for the query's holder with what `said` says of the resource, and send it."""
+    notice = replace(said, id=f"{said.event}:{query.id}", query_id=query.id, origin=query.origin)
     decision.put(notice)
     if repeated:  # the holder may have got this status before a crash
-        decision.note(decision.catalog.told, id, True)
+        decision.note(decision.catalog.told, notice.id, True)
     send_notice(decision, notice)
 
 

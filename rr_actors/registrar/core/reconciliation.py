@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import msgspec
+from itertools import groupby
+from operator import attrgetter
+
+from msgspec.structs import replace
 
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import end_release, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, request
-from rr_actors.registrar.model.catalog import Catalog, Decision
+from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
-from rr_actors.registrar.model.rows import Held, Hold, Query, State
+from rr_actors.registrar.model.rows import Held, Hold, State
 
-# The decisions of a consumer when its link to a provider opens and breaks.
+# -- as a consumer -------------------------------------------------------------------------------------------------
 #
 # The provider's list says which of our queries it has. Our own rows of this incarnation say which of these we want: we
 # may have released some since.
-
-_replace = msgspec.structs.replace
 
 
 def reconcile(decision: Decision, command: Reconcile) -> None:
@@ -29,32 +30,42 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     decision.note(catalog.up, command.registrar, command.link)
     theirs = {query.query_id for query in command.queries}
     for held in catalog.unsettled_at(command.registrar):
-        _forget_what_was_heard(decision, held)
+        if held.hold is Hold.PENDING and (held.response is not None or held.state is not State.OK):
+            # An earlier link brought this. It may have lost the news that the query was taken away. The list is newer:
+            # if it does not have the query, the query is loaded anew.
+            decision.put_here(replace(held, response=None, state=State.OK))
     for query in command.queries:
         _agree(decision, command.registrar, query)
     if command.registrar in catalog.outbound:  # perhaps the list has brought the first row at this provider
         look_there(decision, command.registrar)
-    owed: list[Held] = []
-    agreed, others = digests.split(catalog, command.registrar, command.same)
+    agreed, differing = digests.split(catalog, command.registrar, command.same)
     for held in agreed:
-        _is_agreed(decision, held)
-    for held in others:
-        if held.hold is Hold.PENDING:
-            request(decision, held.registrar, load_of(decision, held))
-        elif held.hold is Hold.OWED:
-            owed.append(held)
-        elif held.id not in theirs and held.id not in catalog.fresh:
+        decision.forget(catalog.kept, held.id)
+    for held in differing:
+        if held.id not in theirs and held.id not in catalog.fresh:
             kept = held.id in catalog.kept  # the answer to the second try was lost
             why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
             lose(decision, held, command.event, why)
-            decision.note(
-                catalog.acked, command.registrar, True
-            )  # a notice may follow; if this link is lost, over the next
+            # a notice may follow; if this link is lost, it comes over the next
+            decision.note(catalog.acked, command.registrar, True)
     for id in list(catalog.fresh):
         if id not in catalog.held or catalog.held[id].registrar == command.registrar:
             decision.forget(catalog.fresh, id)
-    for held in reversed(owed):
-        request(decision, held.registrar, Unload(held.id, catalog.name))
+    _send_open(decision, command.registrar)
+
+
+def _send_open(decision: Decision, provider: str) -> None:
+    """Send open Loads and Unloads in the order of the calls; among Unloads in a row, that of the newest query first.
+
+    A load may need what was released before it, and a resource stays loaded if it was asked for again before that.
+    """
+    for hold, rows in groupby(decision.catalog.unsettled_at(provider), attrgetter("hold")):
+        if hold is Hold.PENDING:
+            for held in rows:
+                request(decision, provider, load_of(decision, held))
+        else:
+            for held in sorted(rows, key=attrgetter("seq"), reverse=True):
+                request(decision, provider, Unload(held.id, decision.catalog.name))
 
 
 def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
@@ -63,28 +74,13 @@ def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     if held is None:
         _take_back(decision, registrar, query)
     elif held.hold is Hold.PENDING and query.response is not None:
-        decision.put_here(_replace(held, state=State(query.state)))
+        decision.put_here(replace(held, state=State(query.state)))
         loaded(decision, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
-        now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
-        _is_agreed(decision, held)
+        now = replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
+        decision.forget(decision.catalog.kept, held.id)
         if now != held:  # a crash came after a status was acknowledged, and before the row was written
             decision.put_later(now)
-
-
-def _forget_what_was_heard(decision: Decision, held: Held) -> None:
-    """Forget a response or status that an earlier link brought for a pending query.
-
-    That link may have lost the news that the query was taken away. The list is newer: if it does not have the query,
-    the query is loaded anew.
-    """
-    if held.hold is Hold.PENDING and (held.response is not None or held.state is not State.OK):
-        decision.put_here(_replace(held, response=None, state=State.OK))
-
-
-def _is_agreed(decision: Decision, held: Held) -> None:
-    """Note that provider and consumer agree on a query: nothing of an earlier link is open."""
-    decision.forget(decision.catalog.kept, held.id)
 
 
 def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
@@ -101,9 +97,8 @@ def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     wanted = kept and query.response is not None and query.seq <= catalog.since
     hold, resource_id = (Hold.HELD, query.resource_id) if wanted else (Hold.OWED, "")  # as though withdrawn
     place = (registrar, query.server, query.request, query.response, resource_id)
-    decision.put_later(
-        Held(query.query_id, *place, query.parent, query.attempt, query.seq, hold, State(query.state)),
-    )
+    numbers = (query.attempt, query.seq)
+    decision.put_later(Held(query.query_id, *place, query.parent, *numbers, hold, State(query.state)))
 
 
 def link_lost(decision: Decision, command: LinkLost) -> None:
@@ -138,7 +133,7 @@ def peer_gone(decision: Decision, command: PeerGone) -> None:
             if command.final:
                 decision.drop_later(held)
             else:
-                decision.put(_replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
+                decision.put(replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
         elif not command.final:
             continue
         elif held.hold is Hold.OWED:
@@ -151,7 +146,7 @@ def peer_gone(decision: Decision, command: PeerGone) -> None:
         decision.drop(catalog.peers[command.registrar])
 
 
-# The decisions of a provider when a consumer's link opens and breaks.
+# -- as a provider -------------------------------------------------------------------------------------------------
 
 _CHUNK = 500
 _CHUNK_BYTES = 2**16  # requests and responses of one message: a frame must not be too long, however much is held
@@ -167,8 +162,11 @@ def fetch(decision: Decision, message: Fetch) -> None:
     rows: list[FetchedQuery] = []
     size = 0
     for query in queries:
-        row = _fetched(catalog, query)
-        more = len(row.request) + len(row.response or b"")
+        resource = catalog.resources[query.resource_id]
+        response = None if resource.id in catalog.moving else resource.response or b""
+        place = (query.parent, query.attempt, query.seq, str(resource.state))
+        row = FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
+        more = len(row.request) + len(response or b"")
         if rows and (len(rows) == _CHUNK or size + more > _CHUNK_BYTES):
             decision.cause(Reply(message.origin, Fetched(rows, True, message.number, same)))
             rows, size = [], 0
@@ -184,13 +182,6 @@ def fetch(decision: Decision, message: Fetch) -> None:
         decision.note(catalog.consumers, message.origin, True)
         for notice_id in list(catalog.notices_to.get(message.origin, ())):
             send_notice(decision, catalog.notices[notice_id])
-
-
-def _fetched(catalog: Catalog, query: Query) -> FetchedQuery:
-    resource = catalog.resources[query.resource_id]
-    place = (query.parent, query.attempt, query.seq, str(resource.state))
-    response = digests.response_of(catalog, query)
-    return FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
 
 
 def consumer_lost(decision: Decision, command: ConsumerLost) -> None:

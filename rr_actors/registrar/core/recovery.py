@@ -9,10 +9,10 @@ An interrupted load whose resource nobody holds any more does not run again. Its
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core import holding
-from rr_actors.registrar.core.callback_runs import load_again, start_load, start_queued, start_unload
+from rr_actors.registrar.core.callback_runs import start_load, start_queued, start_unload
 from rr_actors.registrar.core.loading import load
 from rr_actors.registrar.core.notices import refuse_all
 from rr_actors.registrar.core.releasing import release_parts
@@ -23,11 +23,8 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.commands import RecoverDone, RecoverErred, Register
 from rr_actors.registrar.model.effects import StartRecover
-from rr_actors.registrar.model.messages import Load, Unload
+from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import NOT_BEGUN, Phase, Resource, State
-
-_replace = msgspec.structs.replace
-
 
 ATTEMPTS = 3
 """How often a load begins whose process dies each time. With the default restart intensity, one more death would end
@@ -42,17 +39,14 @@ def begin_again(decision: Decision) -> None:
     holding.begin_again(decision)
     for id in list(decision.catalog.moving):
         resource = decision.catalog.resources[id]
-        if resource.phase is not Phase.LOADING:
-            continue
-        if resource.tries == NOT_BEGUN:  # its server was not registered: that was not an attempt
+        if resource.phase is not Phase.LOADING or resource.tries == NOT_BEGUN:  # no server was there to begin it
             continue
         if resource.attempt < ATTEMPTS:
-            decision.put(_replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
+            decision.put(replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
         else:
-            for reply in refuse_all(decision, resource, failures.interrupted(decision.catalog, resource)):
-                decision.cause(reply)
+            decision.effects += refuse_all(decision, resource, failures.interrupted(decision.catalog, resource))
             # A part or all of it may be loaded. With the next number, the parts of the last attempt are released.
-            decision.put(_replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
+            decision.put(replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
 
 
 def register(decision: Decision, command: Register) -> None:
@@ -80,7 +74,9 @@ def register(decision: Decision, command: Register) -> None:
 def _interrupted(decision: Decision, resource: Resource) -> None:
     """Run an interrupted load again if somebody holds its resource; otherwise clean up what it left."""
     if resource.id in decision.catalog.holders:
-        load_again(decision, resource)
+        resource = replace(resource, tries=0)
+        decision.put(resource)
+        start_load(decision, resource)
     else:
         unheld(decision, resource)
 
@@ -109,7 +105,7 @@ def _recover(decision: Decision, resource: Resource, has_recover: bool, policy: 
         decision.note(decision.catalog.recovering, resource.id, ())
         decision.cause(StartRecover(resource, reload=False))
     elif policy == "reload":
-        again = _replace(resource, attempt=resource.attempt + 1)
+        again = replace(resource, attempt=resource.attempt + 1)
         decision.put(again)
         decision.note(decision.catalog.recovering, resource.id, ())
         release_parts(decision, resource.id, (StartRecover(again, reload=True),), keep_attempt=again.attempt)
@@ -126,7 +122,7 @@ def recover_done(decision: Decision, done: RecoverDone) -> None:
     if done.response is not None and done.response != resource.response:
         source = decision.catalog.origin_of(resource)
         spread(decision, resource, done.event, State.UPDATE, "recovered with a new response", source, done.response)
-    _go_on(decision, resource.id, decision.forget(decision.catalog.recovering, resource.id))
+    _go_on(decision, resource.id)
 
 
 def recover_erred(decision: Decision, erred: RecoverErred) -> None:
@@ -136,7 +132,7 @@ def recover_erred(decision: Decision, erred: RecoverErred) -> None:
         return
     source = decision.catalog.origin_of(resource)
     spread(decision, resource, erred.event, State.FATAL, erred.failure.message, source)
-    _go_on(decision, resource.id, decision.forget(decision.catalog.recovering, resource.id))
+    _go_on(decision, resource.id)
 
 
 def _asked_after(decision: Decision, resource_id: str, attempt: int) -> Resource | None:
@@ -147,9 +143,11 @@ def _asked_after(decision: Decision, resource_id: str, attempt: int) -> Resource
     return resource if resource.attempt == attempt else None
 
 
-def _go_on(decision: Decision, resource_id: str, parked: tuple[Load | Unload, ...]) -> None:
+def _go_on(decision: Decision, resource_id: str) -> None:
     """Decide what waited for the recovery of a resource: its owner's unload first, then the parked messages."""
-    resource = decision.catalog.resources[resource_id]
+    catalog = decision.catalog
+    parked = decision.forget(catalog.recovering, resource_id)
+    resource = catalog.resources[resource_id]
     if condemned(decision, resource):
         begin_unload(decision, resource)
     for message in parked:
@@ -157,10 +155,7 @@ def _go_on(decision: Decision, resource_id: str, parked: tuple[Load | Unload, ..
             load(decision, message)
         else:
             unload(decision, message)
-    _unless_held(decision, decision.catalog.resources.get(resource_id))
+    left = catalog.resources.get(resource_id)
+    if left is not None and left.phase is Phase.LOADED and resource_id not in catalog.holders:
+        retire(decision, left)
     start_deferred(decision, resource_id)
-
-
-def _unless_held(decision: Decision, resource: Resource | None) -> None:
-    if resource is not None and resource.phase is Phase.LOADED and resource.id not in decision.catalog.holders:
-        retire(decision, resource)

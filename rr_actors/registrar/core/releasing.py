@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Closing, Decision
 from rr_actors.registrar.model.effects import Connect, Effect, LoadResolved, Request
 from rr_actors.registrar.model.messages import Failure, Message, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Peer
-
-_replace = msgspec.structs.replace
 
 
 def request(decision: Decision, registrar: str, message: Message) -> None:
@@ -66,14 +64,14 @@ def owe(decision: Decision, held: Held, why: str) -> None:
     if held.hold is Hold.PENDING:
         decision.forget(decision.catalog.direct, held.id)
         decision.cause(LoadResolved(held, failures.withdrawn(held, why)))
-    decision.put(_replace(held, hold=Hold.OWED))
+    decision.put(replace(held, hold=Hold.OWED))
 
 
 def withdraw(decision: Decision, held: Held, failure: Failure) -> None:
     """End a load that nobody waits for any longer. If it succeeds later, the provider releases it."""
     decision.forget(decision.catalog.direct, held.id)
     decision.cause(LoadResolved(held, failure))
-    decision.put(_replace(held, hold=Hold.OWED, resource_id=""))
+    decision.put(replace(held, hold=Hold.OWED, resource_id=""))
     request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
@@ -86,13 +84,12 @@ def release_parts(
     for id in ids:
         owe(decision, catalog.held[id], "withdrawn, what asked for it is gone")
     if not ids:
-        for effect in after:
-            decision.cause(effect)
+        decision.effects += after
         return
     catalog.closings_made += 1
     number = catalog.closings_made
     decision.note(catalog.closings, number, Closing(tuple(ids), tuple(after)))
-    _step(decision, number)
+    _step(decision, number, tuple(ids))
 
 
 def released(decision: Decision, held_id: str) -> None:
@@ -100,9 +97,7 @@ def released(decision: Decision, held_id: str) -> None:
     catalog = decision.catalog
     number = decision.forget(catalog.closing_of, held_id)
     if number is not None:
-        closing = catalog.closings[number]
-        decision.note(catalog.closings, number, _replace(closing, remaining=closing.remaining[1:]))
-        _step(decision, number)
+        _step(decision, number, catalog.closings[number].remaining[1:])
 
 
 def provider_lost(decision: Decision, registrar: str) -> None:
@@ -113,14 +108,13 @@ def provider_lost(decision: Decision, registrar: str) -> None:
         released(decision, id)
 
 
-def _step(decision: Decision, number: int) -> None:
+def _step(decision: Decision, number: int, remaining: tuple[str, ...]) -> None:
     catalog = decision.catalog
     closing = catalog.closings[number]
-    remaining = closing.remaining
     while remaining:
         held = catalog.held.get(remaining[0])
         if held is not None and held.registrar in catalog.up:
-            decision.note(catalog.closings, number, _replace(closing, remaining=remaining))
+            decision.note(catalog.closings, number, replace(closing, remaining=remaining))
             decision.note(catalog.closing_of, held.id, number)
             decision.cause(Request(held.registrar, Unload(held.id, catalog.name)))
             return
@@ -128,5 +122,4 @@ def _step(decision: Decision, number: int) -> None:
             decision.cause(Connect(held.registrar))
         remaining = remaining[1:]
     decision.forget(catalog.closings, number)
-    for effect in closing.after:
-        decision.cause(effect)
+    decision.effects += closing.after

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.notices import drop_notice, notify, own_notices
 from rr_actors.registrar.core.releasing import request
@@ -23,10 +23,7 @@ from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import SetResponse, SetStatus, Swap
 from rr_actors.registrar.model.effects import Answer, Happened, StartStatus
 from rr_actors.registrar.model.messages import Unload
-from rr_actors.registrar.model.rows import Hold, Notice, Phase, Resource, State
-
-_replace = msgspec.structs.replace
-
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, State
 
 # -- to the holders ------------------------------------------------------------------------------------------------
 
@@ -43,28 +40,22 @@ def spread(
     repeated: bool = False,
 ) -> None:
     """Note a status on the resource, and send it once to every holder."""
-    resource = _note(decision, resource, state, message, response)
     said = Notice(event, "", "", resource.id, event, state, message, source, False, response)
-    _tell_holders(decision, resource, said, repeated=repeated)
+    _tell_holders(decision, _note(decision, resource, said), said, repeated=repeated)
 
 
-def _note(decision: Decision, resource: Resource, state: State, message: str, response: bytes | None) -> Resource:
-    lasting = State.FATAL if resource.state is State.FATAL else state
-    resource = _replace(
-        resource,
-        state=lasting,
-        message=message,
-        response=resource.response if response is None else response,
-    )
+def _note(decision: Decision, resource: Resource, said: Notice) -> Resource:
+    lasting = State.FATAL if resource.state is State.FATAL else said.state
+    response = resource.response if said.response is None else said.response
+    resource = replace(resource, state=lasting, message=said.message, response=response)
     decision.put(resource)
-    decision.cause(Happened("status", resource.id, resource.server, f"{state} {message}".rstrip()))
+    decision.cause(Happened("status", resource.id, resource.server, f"{said.state} {said.message}".rstrip()))
     return resource
 
 
 def _tell_holders(decision: Decision, resource: Resource, said: Notice, *, repeated: bool = False) -> None:
-    what = (said.event, said.state, said.message, said.source)
     for query in decision.catalog.queries_of(resource.id):
-        notify(decision, query, *what, response=said.response, repeated=repeated)
+        notify(decision, query, said, repeated=repeated)
     _end_if_unwanted(decision, resource)
 
 
@@ -84,7 +75,7 @@ def start_status(decision: Decision, start: StartStatus) -> None:
         deferred = decision.catalog.deferred
         decision.note(deferred, resource.id, (*deferred.get(resource.id, ()), start))
     else:
-        decision.cause(_replace(start, resource=resource))
+        decision.cause(replace(start, resource=resource))
 
 
 def is_busy(catalog: Catalog, resource: Resource) -> bool:
@@ -104,7 +95,7 @@ def start_own(decision: Decision, server: str) -> None:
         if resource.server == server:
             for notice in own_notices(decision, resource_id):
                 if decision.forget(catalog.told, notice.id):
-                    start_status(decision, StartStatus(resource, notice, "", repeated=True))
+                    start_status(decision, StartStatus(resource, notice, repeated=True))
 
 
 def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
@@ -120,7 +111,7 @@ def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
         _end_if_unwanted(decision, resource)
     else:
         newest = None if notice.response is None else resource.response
-        _tell_holders(decision, resource, _replace(notice, response=newest))
+        _tell_holders(decision, resource, replace(notice, response=newest))
 
 
 # -- calls of the owner --------------------------------------------------------------------------------------------
@@ -152,9 +143,8 @@ def swap(decision: Decision, command: Swap) -> None:
     """Put a spare in the place of a part: one commit has the spare held, the part owed, and the new response."""
     catalog = decision.catalog
     resource = catalog.resources.get(command.resource_id)
-    spare = catalog.held.get(command.spare)
-    is_loaded = resource is not None and resource.phase is Phase.LOADED
-    if resource is None or spare is None or not (is_loaded and _are_parts(catalog, command)):
+    part, spare = (_part(catalog, command.resource_id, id) for id in (command.part, command.spare))
+    if resource is None or resource.phase is not Phase.LOADED or part is None or spare is None:
         _release(decision, command.resource_id, (command.spare,))
         failure = failures.not_swapped(catalog, command.resource_id, command.part)
         decision.cause(Answer(command.ticket, failure))
@@ -167,17 +157,16 @@ def swap(decision: Decision, command: Swap) -> None:
     decision.cause(Answer(command.ticket, None))
 
 
-def _are_parts(catalog: Catalog, command: Swap) -> bool:
-    rows = (catalog.held.get(command.part), catalog.held.get(command.spare))
-    return all(row is not None and row.hold is Hold.HELD and row.parent == command.resource_id for row in rows)
+def _part(catalog: Catalog, resource_id: str, query_id: str) -> Held | None:
+    held = catalog.held.get(query_id)
+    return held if held is not None and held.hold is Hold.HELD and held.parent == resource_id else None
 
 
 def _release(decision: Decision, resource_id: str, ids: Iterable[str]) -> None:
     """Release parts so that they are not held again, even if their unload callback raises."""
     for id in ids:
-        held = decision.catalog.held.get(id)
-        if held is not None and held.hold is Hold.HELD and held.parent == resource_id:
-            decision.put(_replace(held, hold=Hold.OWED, resource_id=""))
+        if (held := _part(decision.catalog, resource_id, id)) is not None:
+            decision.put(replace(held, hold=Hold.OWED, resource_id=""))
             request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
@@ -186,11 +175,11 @@ def _say(
 ) -> None:
     source = decision.catalog.origin_of(resource)
     event, message = command.event, command.message
-    resource = _note(decision, resource, state, message, response)
     said = Notice(f"{event}:", "", "", resource.id, event, state, message, source, False, response)
+    resource = _note(decision, resource, said)
     server = decision.catalog.servers.get(resource.server)
     if server is None or not server.has_status or command.callback_of == resource.id:
         _tell_holders(decision, resource, said)
     else:
         decision.put(said)
-        start_status(decision, StartStatus(resource, said, "", repeated=False))
+        start_status(decision, StartStatus(resource, said, repeated=False))

@@ -8,7 +8,7 @@ a crash comes before that, the provider sends it again, marked as repeated.
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.holding import end_direct, end_release
 from rr_actors.registrar.core.releasing import add_in_flight, request
@@ -20,7 +20,6 @@ from rr_actors.registrar.model.effects import Hear, LoadResolved, StartStatus
 from rr_actors.registrar.model.messages import Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Notice, State, is_own
 
-_replace = msgspec.structs.replace
 _REMEMBERED = 20_000
 _SWEPT_EVERY = 1024
 
@@ -29,78 +28,65 @@ Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 
 def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     """Decide about a status of one of this registrar's queries: pass it on, pass it over, or end the query."""
-    notice = message.notice
+    catalog, notice = decision.catalog, message.notice
     add_in_flight(decision, notice.query_id)
-    held = decision.catalog.held.get(notice.query_id)
+    held = catalog.held.get(notice.query_id)
     if held is None:
         _acknowledge(decision, provider, notice.id)
     elif held.resource_id and held.resource_id != notice.resource_id:
-        _acknowledge(
-            decision, provider, notice.id
-        )  # about an earlier resource of the query; the notice was held back until on_start returned
+        # It is about an earlier resource of the query, and was held back until on_start returned.
+        _acknowledge(decision, provider, notice.id)
     elif held.hold is Hold.OWED:
         if notice.released:
             if held.resource_id:
                 end_release(decision, held)
             else:  # withdrawn: its Load may have been sent again since, so only the provider's answer can end it
-                request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+                request(decision, held.registrar, Unload(held.id, catalog.name))
             _acknowledge(decision, provider, notice.id)
         # else the provider drops the notice with the query, or sends it again if the unload fails
-    elif held.hold is Hold.PENDING and notice.released and held.id not in decision.catalog.direct:
+    elif held.hold is Hold.PENDING and notice.released and held.id not in catalog.direct:
         # its Load was sent again since, and gets an answer of its own; this notice is about the time before
-        decision.put_here(_replace(held, state=State.OK, response=None))
+        decision.put_here(replace(held, state=State.OK, response=None))
         _acknowledge(decision, provider, notice.id)
-    elif notice.id in decision.catalog.hearing:
+    elif notice.id in catalog.hearing:
         pass  # a second sending; the notice is acknowledged when its receivers have dealt with it
-    elif held.id in decision.catalog.ending:
+    elif held.id in catalog.ending:
         _acknowledge(decision, provider, notice.id)  # its holders know that they have lost it
     else:
         _hear(decision, held, notice, provider, message.repeated)
 
 
 def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
+    catalog = decision.catalog
     receivers = 0
-    heard_all = held.hold is Hold.HELD and held.id not in decision.catalog.kept
+    heard_all = held.hold is Hold.HELD and held.id not in catalog.kept
     if repeated and notice.response is not None and heard_all:
-        notice = _replace(notice, response=held.response)  # reconciling has brought the newest
+        notice = replace(notice, response=held.response)  # reconciling has brought the newest
     place = ("query", held.id, notice.event)
     listened = False
-    if place not in decision.catalog.heard:
+    if place not in catalog.heard:
         receivers += 1
-        listened = is_listened(decision.catalog, held)
-        _note(decision, held, notice)
-        decision.note(decision.catalog.heard, place, (notice.id,))
+        listened = is_listened(catalog, held)
+        response = held.response if notice.response is None else notice.response
+        put = decision.put_here if held.hold is Hold.PENDING else decision.put_later
+        put(replace(held, state=notice.state, response=response))
+        if notice.released:
+            decision.note(catalog.ending, held.id, True)
+        decision.note(catalog.heard, place, (notice.id,))
         decision.cause(Hear(held, notice, repeated))
-    resource = decision.catalog.resources.get(held.parent)
-    if resource is not None and _concerns(
-        decision, StartStatus(resource, notice, provider, repeated), listened=listened
-    ):
-        receivers += 1
+    resource = catalog.resources.get(held.parent)
+    if resource is not None:
+        receivers += _concerns(decision, StartStatus(resource, notice, repeated), listened=listened)
+    ends = held.id if notice.released else ""
     if receivers:
-        ends = held.id if notice.released else ""
-        decision.note(decision.catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
+        decision.note(catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
     else:
-        _end(decision, held.id if notice.released else "")
+        _end(decision, ends)
         _acknowledge(decision, provider, notice.id)
 
 
-def _note(decision: Decision, held: Held, notice: Notice) -> None:
-    response = held.response if notice.response is None else notice.response
-    told = _replace(held, state=notice.state, response=response)
-    if held.hold is Hold.PENDING:
-        decision.put_here(told)
-    else:
-        decision.put_later(told)
-    if notice.released:
-        decision.note(decision.catalog.ending, held.id, True)
-
-
 def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool:
-    """Have the resource hear the status once for each event; return whether the notice has to wait for it.
-
-    Args:
-        listened: whether listeners of the query are hearing the status now; the resource hears it after them.
-    """
+    """Have the resource hear each event once, after listeners that hear it now; return whether the notice waits."""
     catalog, resource, notice = decision.catalog, start.resource, start.notice
     place = ("resource", resource.id, notice.event)
     waiting = catalog.heard.get(place)
@@ -146,7 +132,7 @@ def start_deferred(decision: Decision, resource_id: str) -> None:
         resource = catalog.resources.get(resource_id)
         server = None if resource is None else catalog.servers.get(resource.server)
         if resource is None or server is None:
-            status_done(decision, StatusDone(resource_id, start.notice, start.provider, handled=False))
+            status_done(decision, StatusDone(resource_id, start.notice, handled=False))
         else:
             start_status(decision, start)
 
@@ -175,7 +161,7 @@ def _dealt_with(decision: Decision, place: Place) -> None:
         if hearing is None:
             continue
         if hearing.receivers > 1:
-            decision.note(catalog.hearing, notice_id, _replace(hearing, receivers=hearing.receivers - 1))
+            decision.note(catalog.hearing, notice_id, replace(hearing, receivers=hearing.receivers - 1))
         else:
             decision.forget(catalog.hearing, notice_id)
             _end(decision, hearing.ends)
@@ -184,36 +170,31 @@ def _dealt_with(decision: Decision, place: Place) -> None:
 
 def _end(decision: Decision, held_id: str) -> None:
     """Remove a query that was taken away, when its holders know; on disk before the notice is acknowledged."""
-    decision.forget(decision.catalog.ending, held_id)
-    held = decision.catalog.held.get(held_id)
+    catalog = decision.catalog
+    decision.forget(catalog.ending, held_id)
+    held = catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
-        if (
-            held.hold is Hold.PENDING and held_id not in decision.catalog.direct
-        ):  # its thread's line broke, and the load waits for the link
-            decision.cause(
-                LoadResolved(held, failures.withdrawn(held, "taken away before the answer to its load came"))
-            )
+        if held.hold is Hold.PENDING and held_id not in catalog.direct:
+            # Its thread's line broke, and the load waits for the link.
+            failure = failures.withdrawn(held, "taken away before the answer to its load came")
+            decision.cause(LoadResolved(held, failure))
         end_direct(decision, held_id)
-        decision.forget(decision.catalog.kept, held_id)
+        decision.forget(catalog.kept, held_id)
         decision.drop(held)
 
 
 def _remember(decision: Decision, place: Place) -> None:
-    heard = decision.catalog.heard
+    catalog, heard = decision.catalog, decision.catalog.heard
     decision.note(heard, place, ())
     if len(heard) % _SWEPT_EVERY == 0:
-        for old in [old for old, pending in heard.items() if not pending and not _is_there(decision, old)]:
-            decision.forget(heard, old)
+        for old, pending in list(heard.items()):
+            kind, id, _ = old
+            if not pending and id not in (catalog.held if kind == "query" else catalog.resources):
+                decision.forget(heard, old)
     if len(heard) > _REMEMBERED:
         for old in list(heard)[: _REMEMBERED // 2]:
             if not heard[old]:
                 decision.forget(heard, old)  # so old that its notice was acknowledged long ago
-
-
-def _is_there(decision: Decision, place: Place) -> bool:
-    """Return whether the query or resource of the place still exists."""
-    kind, id, _ = place
-    return id in (decision.catalog.held if kind == "query" else decision.catalog.resources)
 
 
 def _acknowledge(decision: Decision, provider: str, notice_id: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import running, start_queued, start_unload
 from rr_actors.registrar.core.notices import (
@@ -29,13 +29,12 @@ from rr_actors.registrar.model.rows import (
     QUEUED,
     UNLOAD_FAILED,
     UNLOADING,
+    Notice,
     Phase,
     Query,
     Resource,
     State,
 )
-
-_replace = msgspec.structs.replace
 
 
 def unload(decision: Decision, message: Unload) -> None:
@@ -76,16 +75,14 @@ def _release(decision: Decision, query: Query) -> None:
 def unheld(decision: Decision, resource: Resource) -> None:
     """Decide about a resource that nobody holds any more: drop, keep warm or unload it, by its phase."""
     if resource.phase is QUEUED:
-        for answer in answers_to_owners(decision, resource, None):
-            decision.cause(answer)
+        decision.effects += answers_to_owners(decision, resource, None)
         drop_resource(decision, resource)
         settle(decision, resource.server)
     elif resource.phase in (LOADED, UNLOAD_FAILED):
         retire(decision, resource)
     elif resource.tries == NOT_BEGUN and resource.server in decision.catalog.servers:
-        begin_unload(
-            decision, _replace(resource, tries=0)
-        )  # the load does not run again; the unload callback cleans up after the interrupted run
+        # The load does not run again; the unload callback cleans up after the interrupted run.
+        begin_unload(decision, replace(resource, tries=0))
 
 
 def _lingers(decision: Decision, resource: Resource) -> bool:
@@ -143,14 +140,13 @@ def unload_erred(decision: Decision, erred: UnloadErred) -> None:
     resource = running(decision.catalog, erred.resource_id, UNLOADING, erred.tries)
     if resource is None:
         return
-    decision.put(_replace(resource, phase=UNLOAD_FAILED, message=erred.failure.message))
+    decision.put(replace(resource, phase=UNLOAD_FAILED, message=erred.failure.message))
     decision.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try
             decision.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
         send_notices(decision, query)  # the holder passed them over while it was releasing the query
-    for answer in answers_to_owners(decision, resource, erred.failure):
-        decision.cause(answer)
+    decision.effects += answers_to_owners(decision, resource, erred.failure)
     _next_in_queue(decision, resource)
     settle(decision, resource.server, erred.failure)
 
@@ -212,14 +208,16 @@ def unregister(decision: Decision, command: Unregister) -> None:
 def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None:
     match resource.phase:
         case Phase.QUEUED | Phase.LOADING:
-            _refuse_holders(decision, resource, why)
+            decision.effects += refuse_all(decision, resource, failures.load_failed(decision.catalog, resource, why))
+            unheld(decision, resource)  # a running load goes on; the resource is unloaded when it returns
         case Phase.LOADED | Phase.UNLOAD_FAILED:
             source = decision.catalog.origin_of(resource)
-            failure = failures.evicted(decision.catalog, resource, why)
+            said = Notice(event, "", "", resource.id, event, State.FATAL, why, source, released=True)
+            failure = failures.load_failed(decision.catalog, resource, why)
             for query in decision.catalog.queries_of(resource.id):
                 decision.drop(query)
                 remember(decision, query.id, failure)
-                notify(decision, query, event, State.FATAL, why, source, released=True)
+                notify(decision, query, said)
             if resource.id not in decision.catalog.recovering:  # else the end of its recovery unloads it
                 begin_unload(decision, resource)
         case Phase.UNLOADING:
@@ -228,23 +226,15 @@ def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None
                 decision.cause(Reply(query.origin, Unloaded(query.id)))
 
 
-def _refuse_holders(decision: Decision, resource: Resource, why: str) -> None:
-    """Refuse all that wait for a resource. A running load goes on; the resource is unloaded when it returns."""
-    for reply in refuse_all(decision, resource, failures.evicted(decision.catalog, resource, why)):
-        decision.cause(reply)
-    unheld(decision, resource)
-
-
 def gone(decision: Decision, message: Gone) -> None:
     """Release every query of a registrar that does not come back."""
     catalog = decision.catalog
     drop_parked(decision, lambda parked: parked.origin == message.origin)
     for query_id in list(catalog.by_origin.get(message.origin, ())):
-        query = catalog.queries.get(query_id)
-        if query is not None:
-            resource = catalog.resources[query.resource_id]
-            drop_query(decision, query)
-            if resource.id not in catalog.holders and resource.id not in catalog.recovering:
-                unheld(decision, resource)
+        query = catalog.queries[query_id]
+        resource = catalog.resources[query.resource_id]
+        drop_query(decision, query)
+        if resource.id not in catalog.holders and resource.id not in catalog.recovering:
+            unheld(decision, resource)
     for notice_id in list(catalog.notices_to.get(message.origin, ())):
         drop_notice(decision, catalog.notices[notice_id])

@@ -920,9 +920,9 @@ class EffectRunner:
     def _start_status(self, effect: e.StartStatus) -> None:
         server = self._registrar.servers.get(effect.resource.server)
         if server is None or server.spec.status is None:
-            self._registrar.post(c.StatusDone(effect.resource.id, effect.notice, effect.provider, handled=False))
+            self._registrar.post(c.StatusDone(effect.resource.id, effect.notice, handled=False))
         else:
-            server.start_status(effect.resource, effect.notice, effect.provider, repeated=effect.repeated)
+            server.start_status(effect.resource, effect.notice, repeated=effect.repeated)
 
     # -- timers --------------------------------------------------------------------------------------------------
 

@@ -366,7 +366,7 @@ class ServerActor:
 
     # -- status --------------------------------------------------------------------------------------------------
 
-    def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
+    def start_status(self, resource: Resource, notice: Notice, *, repeated: bool) -> None:
         """Run the status callback for a status of the resource, or of one of its parts."""
         status = status_of(notice, repeated=repeated)
 
@@ -374,7 +374,7 @@ class ServerActor:
             if error is not None:
                 self.registrar.callback_failures += 1
                 log_raised(logger, error, "%s: the status callback raised; the status goes on", self.origin)
-            self.registrar.post(c.StatusDone(resource.id, notice, provider, status.is_handled))
+            self.registrar.post(c.StatusDone(resource.id, notice, status.is_handled))
 
         self._submit(self._status, resource, resource.attempt, done, status, in_order=True)
 

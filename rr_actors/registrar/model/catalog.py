@@ -136,20 +136,7 @@ class Catalog:
         self.peers: dict[str, Peer] = self.tables["peers"]
         self.stored_servers: dict[str, StoredServer] = self.tables["stored_servers"]
         self.server_types: dict[str, ServerType] = self.tables["server_types"]
-        # indexes
-        self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> resource to join
-        self.unloading: dict[RequestKey, Ids] = {}
-        self.queued: dict[RequestKey, Ids] = {}
-        self.moving: dict[str, bool] = {}  # resources that are loading, queued, or being unloaded
-        self.by_server: dict[str, Ids] = {}
-        self.holders: dict[str, Ids] = {}  # resource -> queries
-        self.by_origin: dict[str, Ids] = {}  # origin -> queries
-        self.notices_to: dict[str, Ids] = {}  # origin -> notices
-        self.notices_on: dict[str, Ids] = {}  # query -> notices
-        self.own_notices: dict[str, Ids] = {}  # resource -> notices that its own server has to hear first
-        self.parts: dict[str, Ids] = {}  # resource -> held, without owed ones
-        self.outbound: dict[str, Ids] = {}  # provider -> held
-        self.unsettled: dict[str, str] = {}  # held that is pending or owed -> provider
+        self._fill_indexes()
         self._index: dict[Table, Callable[[Any, Any], None]] = {
             "resources": self._index_resource,
             "queries": self._index_query,
@@ -167,7 +154,7 @@ class Catalog:
         self.closings: dict[int, Closing] = {}
         self.closing_of: dict[str, int] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}
-        self.told: dict[str, bool] = {}
+        self.told: dict[str, bool] = dict.fromkeys(self.notices, True)
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.hearing: dict[str, Hearing] = {}
         self.deferred: dict[str, tuple[StartStatus, ...]] = {}
@@ -182,36 +169,35 @@ class Catalog:
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
-        self.seq = 0
         self.unfinished: Undo | None = None  # how to undo the decision that is being applied; None between decisions
-        self._fill_indexes()
-        self.told.update(dict.fromkeys(self.notices, True))
         self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
         self.since = self.seq  # this Catalog asked for all queries with a greater number, and knows all about them
 
     def _fill_indexes(self) -> None:
         """Build the indexes that set() keeps for each row; one index at a time, as there may be a million rows."""
-        self._fill_by_phase()
-        self.by_server = built(map(_server, self.resources.values()), self.resources)
-        self.holders = built(map(_resource_id, self.queries.values()), self.queries)
-        self.by_origin = built(map(_origin, self.queries.values()), self.queries)
-        self.outbound = built(map(_registrar, self.held.values()), self.held)
-        parts = {id: row for id, row in self.held.items() if row.parent and row.hold is not OWED}
-        self.parts = built(map(_parent, parts.values()), parts)
-        self.unsettled = {id: row.registrar for id, row in self.held.items() if row.hold is not HELD}
-        own = {id: row for id, row in self.notices.items() if is_own(row)}
-        sent = {id: row for id, row in self.notices.items() if id not in own} if own else self.notices
-        self.own_notices = built(map(_resource_id, own.values()), own)
-        self.notices_to = built(map(_origin, sent.values()), sent)
-        self.notices_on = built(map(_query_id, sent.values()), sent)
-
-    def _fill_by_phase(self) -> None:
+        self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> resource to join
+        self.unloading: dict[RequestKey, Ids] = {}
+        self.queued: dict[RequestKey, Ids] = {}
+        self.moving: dict[str, bool] = {}  # resources that are loading, queued, or being unloaded
         loaded, fatal, by_request = LOADED, State.FATAL, self.by_request
         for row in self.resources.values():
             if row.phase is not loaded:
                 self._index_phase(None, row)
             elif row.state is not fatal:
                 by_request[row.server][row.request] = row.id
+        self.by_server = built(map(_server, self.resources.values()), self.resources)
+        self.holders = built(map(_resource_id, self.queries.values()), self.queries)  # resource -> queries
+        self.by_origin = built(map(_origin, self.queries.values()), self.queries)  # origin -> queries
+        self.outbound = built(map(_registrar, self.held.values()), self.held)  # provider -> held
+        parts = {id: row for id, row in self.held.items() if row.parent and row.hold is not OWED}
+        self.parts = built(map(_parent, parts.values()), parts)  # resource -> held, without owed ones
+        # held that is pending or owed -> provider; in the order of the calls that made it so
+        self.unsettled = {id: row.registrar for id, row in self.held.items() if row.hold is not HELD}
+        own = {id: row for id, row in self.notices.items() if is_own(row)}
+        sent = {id: row for id, row in self.notices.items() if id not in own} if own else self.notices
+        self.own_notices = built(map(_resource_id, own.values()), own)  # resource -> those its own server hears first
+        self.notices_to = built(map(_origin, sent.values()), sent)  # origin -> notices
+        self.notices_on = built(map(_query_id, sent.values()), sent)  # query -> notices
 
     def roll_back(self) -> list[tuple[Table, str]]:
         """Undo the decision that was interrupted, and return the rows that it had begun to change.
@@ -220,18 +206,13 @@ class Catalog:
         """
         rows: list[tuple[Table, str]] = []
         for where, key, old in reversed(self.unfinished or ()):
-            entries: dict[Any, Any]
             if isinstance(where, str):
                 rows.append((where, key))
-                entries = self.tables[where]
-            else:
-                entries = where
+            entries: dict[Any, Any] = self.tables[where] if isinstance(where, str) else where
             if old is ABSENT:
                 entries.pop(key, None)
             else:
                 entries[key] = old
-        for index in (self.by_request, self.unloading, self.queued, self.moving):
-            index.clear()
         self._fill_indexes()
         return rows
 
@@ -248,9 +229,8 @@ class Catalog:
         one had loaded must not be taken for the second's, not even after a crash in between. Therefore the id has the
         epoch in it.
         """
-        id = query_id if self.epoch <= 1 else f"{query_id}.{self.epoch}"
+        id = free = query_id if self.epoch <= 1 else f"{query_id}.{self.epoch}"
         number = 1
-        free = id
         while free in self.resources:
             number += 1
             free = f"{id}+{number}"
@@ -264,9 +244,8 @@ class Catalog:
     def find(self, target: str) -> Resource | None:
         """Return the resource with this id, or the resource of the query with this id."""
         resource = self.resources.get(target)
-        if resource is None:
-            query = self.queries.get(target)
-            resource = self.resources[query.resource_id] if query is not None else None
+        if resource is None and (query := self.queries.get(target)) is not None:
+            resource = self.resources[query.resource_id]
         return resource
 
     def queries_of(self, resource_id: str) -> list[Query]:

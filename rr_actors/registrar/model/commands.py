@@ -239,12 +239,11 @@ class Heard(Command, frozen=True, gc=False):
 class StatusDone(Command, frozen=True):
     """A server's status callback has run for a notice, or did not have to. `handled`: it has dealt with the notice.
 
-    The notice is about a part that `provider` serves, or about the resource itself (rows.is_own).
+    The notice is about a part, or about the resource itself (rows.is_own).
     """
 
     resource_id: str
     notice: Notice
-    provider: str
     handled: bool
 
 

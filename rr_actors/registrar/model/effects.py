@@ -65,7 +65,6 @@ class StartStatus(Effect, frozen=True):
 
     resource: Resource
     notice: Notice
-    provider: str
     repeated: bool
 
 

@@ -8,7 +8,7 @@ from rr_actors.base.errors import did_you_mean, shortened, shown
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Failure
-from rr_actors.registrar.model.rows import Held, Resource
+from rr_actors.registrar.model.rows import Held, Hold, Resource
 
 
 def unknown_server(catalog: Catalog, server: str) -> Failure:
@@ -23,6 +23,11 @@ def unknown_server(catalog: Catalog, server: str) -> Failure:
 def unknown_target(catalog: Catalog, target: str) -> Failure:
     """Return the failure of a call for an id that is neither a resource nor a query served here."""
     what = "serves no resource and no query of this id (never did, or unloaded already)"
+    for held in catalog.held.values():
+        if held.hold is Hold.HELD and target in (held.id, held.resource_id) and held.registrar != catalog.name:
+            owner = held.registrar
+            what = f"holds it, and does not serve it: call {owner!r}, which serves it as {owner}/{held.server}"
+            break
     text = f"{shortened(target)}: {catalog.name!r} {what}"
     return Failure("UnknownQuery", text, {"query_id": target})
 
@@ -54,23 +59,21 @@ def not_swapped(catalog: Catalog, resource_id: str, part: str) -> Failure:
 
 def overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
     """Return the failure of a load whose callback takes too long."""
-    name = catalog.origin_of(resource)
-    text = f"{name}: the load callback took longer than load_timeout_s={limit_s:g} s"
-    return Failure("LoadFailed", text, {"server": name, "timeout_s": limit_s}, [(name, text)])
+    why = f"the load callback took longer than load_timeout_s={limit_s:g} s"
+    return load_failed(catalog, resource, why, timeout_s=limit_s)
 
 
 def interrupted(catalog: Catalog, resource: Resource) -> Failure:
     """Return the failure of a load in each of whose attempts the process died."""
-    origin = catalog.origin_of(resource)
     how = f" (it died of: {catalog.deaths})" if catalog.deaths else ""
-    text = f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again"
-    return Failure("LoadFailed", f"{origin}: {text}", {"server": origin}, [(origin, text)])
+    why = f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again"
+    return load_failed(catalog, resource, why)
 
 
-def evicted(catalog: Catalog, resource: Resource, why: str) -> Failure:
-    """Return the failure of a load whose resource was taken away."""
+def load_failed(catalog: Catalog, resource: Resource, why: str, **details: float) -> Failure:
+    """Return the failure of a load of this resource for a reason that its callback has not raised."""
     origin = catalog.origin_of(resource)
-    return Failure("LoadFailed", f"{origin}: {why}", {"server": origin}, [(origin, why)])
+    return Failure("LoadFailed", f"{origin}: {why}", {"server": origin, **details}, [(origin, why)])
 
 
 def left_behind(catalog: Catalog, resources: Sequence[Resource]) -> Failure:

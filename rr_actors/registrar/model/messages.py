@@ -214,7 +214,6 @@ def failure_of(error: BaseException, origin: str | None = None) -> Failure:
     """
     text = readable(errors.text_of(error))
     frames = [] if origin is None else [(origin, text)]
-    plain = Failure("RrError", text, {}, frames)
     try:
         trace = [] if origin is None else _trace_of(error)
         if not isinstance(error, errors.RrError):
@@ -223,7 +222,7 @@ def failure_of(error: BaseException, origin: str | None = None) -> Failure:
         details = {k: _readable(v) for k, v in error.details.items() if k != "trace" and _is_plain(v)}
         return Failure(type(error).__name__, readable(error.message), details, _first_of(trace + frames))
     except Exception:
-        return plain
+        return Failure("RrError", text, {}, frames)
 
 
 def _first_of(frames: list[tuple[str, str]]) -> list[tuple[str, str]]:

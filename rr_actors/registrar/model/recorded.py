@@ -12,19 +12,8 @@ import msgspec
 
 from rr_actors.base.errors import shortened
 from rr_actors.base.values.canonical import shown_plain
-from rr_actors.registrar.model.messages import (
-    Gone,
-    Load,
-    Loaded,
-    LoadRefused,
-    Message,
-    Noticed,
-    Probe,
-    Unload,
-    Unloaded,
-    UnloadRefused,
-    readable,
-)
+from rr_actors.registrar.model import messages as m
+from rr_actors.registrar.model.messages import Message
 
 _LONG = 1000  # the bytes of a request that is shown, at most
 
@@ -67,27 +56,24 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
     """Return the entry of a message that `registrar` has sent to `peer`, or received from it."""
     where = (at, event, 0, process, pid, registrar, peer, type(message).__name__)
     match message:
-        case Load():
+        case m.Load():
             provider = peer if event == "sent" else registrar
-            request = _shown(message.request)
+            size = len(message.request)
+            request = shortened(repr(shown_plain(message.request))) if size <= _LONG else f"<{size} bytes>"
             return Entry(*where, message.query_id, "", message.parent, f"{provider}/{message.server}", request)
-        case Loaded():
+        case m.Loaded():
             return Entry(*where, message.query_id, message.resource_id)
-        case LoadRefused() | UnloadRefused():
+        case m.LoadRefused() | m.UnloadRefused():
             return Entry(*where, message.query_id, detail=shortened(message.failure.message))
-        case Unload() | Unloaded():
+        case m.Unload() | m.Unloaded():
             return Entry(*where, message.query_id)
-        case Noticed():
+        case m.Noticed():
             notice = message.notice
             text = f"{notice.state} {notice.message}".rstrip()
-            return Entry(*where, notice.query_id, notice.resource_id, detail=readable(shortened(text)))
-        case Probe():
+            return Entry(*where, notice.query_id, notice.resource_id, detail=m.readable(shortened(text)))
+        case m.Probe():
             return Entry(*where, message.query_id, detail=shortened(" > ".join(message.ring)))
-        case Gone():
+        case m.Gone():
             return Entry(*where, detail=message.origin)
         case _:
             return Entry(*where)
-
-
-def _shown(request: bytes) -> str:
-    return shortened(repr(shown_plain(request))) if len(request) <= _LONG else f"<{len(request)} bytes>"
