@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+import threading
 
 import rr_actors as rr
 
@@ -22,16 +23,13 @@ class Printers(rr.Manager):
 
     @rr.server("printer")
     def load_printer(self, request: str) -> str:
-        return self.connect(request)
+        self.open[request] = f"connection of process {os.getpid()}"
+        return f"queue of {request}"
 
     @load_printer.recover
     def recover_printer(self, request: str, response: str) -> str:
-        self.connect(request)
+        self.load_printer(request)
         return response
-
-    def connect(self, name: str) -> str:
-        self.open[name] = f"connection of process {os.getpid()}"
-        return f"queue of {name}"
 
     def on_receive(self, message: object) -> tuple[int, list[str]]:
         self.pages += 1
@@ -44,11 +42,14 @@ def main() -> None:
         app, printers = system.open_registrar("app"), system.ref("printers")
         laser = app.load("printers/printer", "laser")
         app.load("printers/printer", "plotter")
+        restarted = threading.Event()
+        system.subscribe(lambda event: restarted.set() if event["event"] == "restarted" else None)
         printers.ask("print")
         print("before: pages, open printers:", *printers.ask("print"), flush=True)
 
         os.kill(system.supervisor().which_children()[0].pid or 0, signal.SIGKILL)
-        again = app.load("printers/printer", "laser")  # waits until the manager is back
+        again = app.load("printers/printer", "laser")  # waits until the manager serves again
+        restarted.wait(10)  # its on_start has returned: from now on it takes messages, too
 
         print("after:  pages, open printers:", *printers.ask("print"), flush=True)
         print("the same resource, not another one:", again.resource_id == laser.resource_id, flush=True)
