@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import struct
@@ -22,7 +23,7 @@ from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
 from rr_actors.tools import console_verbs
 from rr_actors.tools.explanations import ago
-from support import Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
+from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
 from support_cli import run_cli
 from support_managers import Order, Shop
 
@@ -220,6 +221,21 @@ def test_why_says_who_holds_it_for_whom_and_since_when(app: rr.Registrar, shop: 
     assert "for shop/thing" in below
     assert "\n  app holds it since" in below
     assert said("why", query.id[:-1]).split(" since ")[0] == whole.split(" since ")[0]
+
+
+def test_why_prints_what_its_page_shows(system: rr.System) -> None:
+    app, maps, cameras = map(system.open_registrar, ("app", "maps", "cameras"))
+    serve(cameras, "camera")
+    serve(maps, "map", load=lambda request: maps.load("cameras/camera", f"/dev/{request}").id)
+    camera = app.load("maps/map", "kitchen").response
+    page = (REPOSITORY / "docs" / "console.md").read_text()
+    _, shown, _ = re.split(r"^\$ rr-actors why \w+\n|```\n(?=\n## Live in)", page, flags=re.MULTILINE)
+
+    assert _without_ids_and_times(said("why", camera)) == _without_ids_and_times(shown)
+
+
+def _without_ids_and_times(text: str) -> str:
+    return re.sub(r"[0-9a-f]{32}", "ID", re.sub(r"since [\d:]+ \(\d+ s\)", "since TIME", text))
 
 
 def test_why_says_what_a_load_waits_for(system: rr.System, gate: Gate) -> None:
