@@ -10,6 +10,7 @@ import asyncio
 import functools
 import logging
 import os
+import select
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -56,6 +57,8 @@ FRAME_S = 5.0
 """Seconds that a client may take for its first message, and for the rest of a message that it has begun."""
 STALLED_S = 30.0
 """Seconds that a client may leave an answer unread."""
+LOOK_S = 5.0
+"""Seconds after which the server looks again whether a client has left whose requests it does not read yet."""
 _AGAIN_S = 0.1
 
 
@@ -148,7 +151,8 @@ class Console:
         """Return the frame that answers a request, and the id of the query that it loaded for a client. In a worker."""
         try:
             answer = self._answer(request, is_gone, connection)
-            return framed(answer, ANSWER_LIMIT_BYTES), answer.query_id if isinstance(answer, Holding) else ""
+            frame = framed(answer, ANSWER_LIMIT_BYTES, "the longest answer of a console")
+            return frame, answer.query_id if isinstance(answer, Holding) else ""
         except Exception as error:
             if not isinstance(error, RrError):
                 logger.exception("console: %s failed", type(request).__name__)
@@ -186,6 +190,7 @@ class Connection(asyncio.Protocol):
         self._busy = False
         self._blocked = False
         self._ended = False
+        self._looks = False  # whether the loop will look for the client
         self._reader: Reader | None = None
         self._has_registrars = False
         self._key = ("console", id(self))
@@ -211,18 +216,37 @@ class Connection(asyncio.Protocol):
         if self._ended:
             return
         self._requests += self._frames.feed(data)
-        if self._frames.error is not None:
+        if self._frames.error is not None or self._frames.ended:
             self._requests.clear()
-            self._leave(self._frames.error)
+            self._leave(self._frames.error or UsageError("expected a request, got a frame of 0 bytes"))
         elif self._reader is not None:
             self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
         else:
             self._next()
             if self._requests:  # otherwise read on, to notice a client that leaves
                 self._transport.pause_reading()
+                if not self._looks:
+                    self._look_later()
+
+    def _look_later(self) -> None:
+        self._looks = True
+        asyncio.get_running_loop().call_later(LOOK_S, self._look_for_client)
+
+    def _look_for_client(self) -> None:
+        """Abort the connection if the client has left: while nothing is read, the transport does not notice that."""
+        self._looks = False
+        if self._ended or self._transport.is_reading():
+            return
+        poll = select.poll()
+        poll.register(self._transport.get_extra_info("socket"), select.POLLRDHUP)
+        if poll.poll(0):
+            self._transport.abort()
+        else:
+            self._look_later()
 
     def eof_received(self) -> bool:
-        """Have the connection closed: the client sends no more, and its last request is not answered either."""
+        """Close the connection: the client sends no more, and its last request is not answered either."""
+        self.end()
         return False
 
     def pause_writing(self) -> None:
@@ -352,12 +376,12 @@ class Connection(asyncio.Protocol):
     def end(self) -> None:
         """Send what is written, and close the connection; at once, if the client does not read."""
         self._ended = True
-        self._stop_timer()
         if self._reader is not None:
             self._console.feed.remove(self._reader)
         if self._blocked:
             self._transport.abort()
         else:
+            self._set_timer(STALLED_S)  # the client may never read the rest
             self._transport.close()
 
     def _leave(self, error: BaseException) -> None:
