@@ -176,6 +176,8 @@ def test_errors_are_those_of_the_system(client: rr.Client, provider: rr.Registra
         client.open_registrar("worker")
     with pytest.raises(RrError, match="expected 1 to 64"):
         client.open_registrar("no name")
+    with pytest.raises(InvalidName, match="expected 1 to 64"):
+        client.open_registrar("n" * 60)  # too long with "client." before it
     assert worker.load("provider/camera", "x").response
 
 

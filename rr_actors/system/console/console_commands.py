@@ -21,6 +21,7 @@ from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console.client_registrars import ClientRegistrars, ask
 from rr_actors.system.console.console_messages import (
+    RESPONSE_LIMIT_BYTES,
     Answer,
     AskActor,
     Command,
@@ -268,11 +269,13 @@ def _json(text: str) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value in the form that JSON gives it, or its text if JSON cannot hold it."""
+    """Return a value in the form that JSON gives it, or its text if JSON or an answer cannot hold it."""
     try:
-        return msgspec.json.decode(msgspec.json.encode(value, enc_hook=repr))
+        plain = msgspec.json.decode(msgspec.json.encode(value, enc_hook=repr))
+        fits = len(msgspec.msgpack.encode(plain)) <= RESPONSE_LIMIT_BYTES
     except Exception:  # a user's value: keys that are no text, numbers that are too long
         return shown(value)
+    return plain if fits else shown(value)
 
 
 def _signal_name(number: int) -> str:

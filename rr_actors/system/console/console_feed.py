@@ -38,6 +38,7 @@ KEPT_OF_RECORDING = 50_000
 BATCH_S = 0.05
 """Seconds that an event waits for others, to be sent with them."""
 _BATCH = 500
+_SHORT = 1000  # characters of a text, so that a batch of them fits into a frame
 
 
 class Reader:
@@ -186,7 +187,7 @@ def _entries(entries: list[Any], dropped: int) -> bytes:
     try:
         return framed(Entries(entries, dropped), ANSWER_LIMIT_BYTES)
     except NotSerializable:  # half a character in a file's name, or very long texts
-        bare = [msgspec.structs.replace(entry, detail=readable(entry.detail), facts={}) for entry in entries]
+        bare = [msgspec.structs.replace(one, detail=readable(one.detail[:_SHORT]), facts={}) for one in entries]
         return framed(Entries(bare, dropped), ANSWER_LIMIT_BYTES)
 
 

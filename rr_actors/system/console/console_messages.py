@@ -23,6 +23,8 @@ SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request. The longest part of any is a resource's request as JSON."""
 ANSWER_LIMIT_BYTES = 4 * 2**20
+RESPONSE_LIMIT_BYTES = ANSWER_LIMIT_BYTES - 1024
+"""The longest response of a resource: an answer has other texts, too."""
 PAGE_LIMIT = 500
 """The most rows of a page."""
 
