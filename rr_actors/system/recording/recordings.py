@@ -67,7 +67,7 @@ class Recordings:
         self._counters = counters
         self._record = record
         self._unrecord: Callable[[], None] | None = None
-        self._sinks: dict[Sink, Callable[[], object]] = {}
+        self._sinks: dict[Sink, Callable[[], object] | None] = {}
         self._lock = threading.Lock()
 
     def begin(self, sink: Sink, closed: Callable[[], object] | None = None) -> Callable[[], None]:
@@ -80,7 +80,7 @@ class Recordings:
             A function that removes the sink. A second call does nothing.
         """
         with self._lock:
-            self._sinks = {**self._sinks, sink: closed or _nothing}
+            self._sinks = {**self._sinks, sink: closed}
             if self._unrecord is None:
                 self._unrecord = self._record(self._heard)
         return functools.partial(self._end, sink)
@@ -101,7 +101,8 @@ class Recordings:
         steps = Steps()
         for sink, closed in self._sinks.items():
             self._end(sink)
-            steps.take("ending a recording", closed)
+            if closed is not None:
+                steps.take("ending a recording", closed)
         steps.end("not all recordings have ended in order")
 
     def leave_to_parent(self) -> None:
@@ -127,10 +128,6 @@ class Recordings:
         self._counters.take(numbered)
         for sink in self._sinks:
             sink(numbered, dropped)
-
-
-def _nothing() -> None:
-    """Do nothing, at the end of a sink that gave no function for it."""
 
 
 def _entry_of(event: dict[str, Any]) -> Entry:
@@ -221,7 +218,7 @@ class Recording:
         if self.path is not None:
             return read_recording(self.path).entries()
         with self._lock:
-            return sorted(self._entries, key=_when)
+            return sorted(self._entries, key=lambda entry: (entry.at, entry.seq))
 
     def trace(self, what: Query[Any] | ResourceInfo | str) -> Trace:
         """Return the trace of one load: its messages and answers, its callbacks, and the loads that these made.
@@ -274,10 +271,6 @@ def begin(recording: Recording, recordings: Recordings) -> Recording:
 def add(recording: Recording, entries: list[Entry], dropped: int = 0) -> None:
     """Add entries to a recording that is not connected to a running system."""
     recording._take(entries, dropped)  # pyright: ignore[reportPrivateUsage]  # same file
-
-
-def _when(entry: Entry) -> tuple[float, int]:
-    return entry.at, entry.seq
 
 
 class RecordingFile:
