@@ -13,9 +13,8 @@ import msgspec
 import typer
 
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console, take_parts
-from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, read_recording
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, add, read_recording
 from rr_actors.tools.cli_commands import StateOption
 from rr_actors.tools.console_verbs import JsonOption, app
 
@@ -37,10 +36,6 @@ def record(
         try:
             with _ending(client, seconds), suppress(KeyboardInterrupt):
                 for part in client.record():
-                    if isinstance(part, c.Missed):
-                        missed += part.count
-                        sink.write((), part.count)
-                        continue
                     missed += part.dropped
                     count += len(part.entries)
                     sink.write(part.entries, part.dropped)
@@ -74,7 +69,8 @@ def _recorded(state: Path | None, seconds: float) -> Recording:
     with ConsoleClient(find_console(state)) as client:
         recording = Recording(client.welcome.system)
         with _ending(client, seconds), suppress(KeyboardInterrupt):
-            take_parts(recording, client.record())
+            for part in client.record():
+                add(recording, part.entries, part.dropped)
     return recording
 
 

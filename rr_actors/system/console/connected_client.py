@@ -7,14 +7,13 @@ application's process hold its queries. Each registrar has a connection of its o
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
 import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from rr_actors.base.errors import RrError, Unavailable, UnknownQuery
 from rr_actors.base.names import parse_server_id
@@ -41,8 +40,6 @@ logger = logging.getLogger("rr_actors")
 
 _ANSWER_S = 60.0  # for a request that has no time limit of its own
 _GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
-
-_A = TypeVar("_A")
 
 
 class Client:
@@ -153,9 +150,7 @@ class ClientRegistrar:
         self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
     ) -> ClientQuery:
         """Load as load() does, from any event loop. If cancelled, release the query when the load has ended."""
-        return await _awaited(
-            lambda: self.load(server, request, response_type=response_type, timeout_s=timeout_s), ClientQuery.unload
-        )
+        return await _awaited(lambda: self.load(server, request, response_type=response_type, timeout_s=timeout_s))
 
     def unload(self, query_or_id: ClientQuery | str, *, timeout_s: float | None = 30.0) -> None:
         """Release a query.
@@ -274,34 +269,34 @@ def _id_of(query_or_id: ClientQuery | str) -> str:
     return query_or_id if isinstance(query_or_id, str) else query_or_id.id
 
 
-async def _awaited(call: Callable[[], _A], undo: Callable[[_A], object]) -> _A:
-    """Await a call that a thread makes; if cancelled, undo its result later, even if the loop has ended by then."""
-    made: Future[_A] = Future()
+async def _awaited(load: Callable[[], ClientQuery]) -> ClientQuery:
+    """Await a load that a thread makes; if cancelled, release its query later, even if the loop has ended by then."""
+    loaded: Future[ClientQuery] = Future()
 
     def make() -> None:
         try:
-            made.set_result(call())
+            loaded.set_result(load())
         except BaseException as error:
-            made.set_exception(error)
+            loaded.set_exception(error)
 
     asyncio.get_running_loop().run_in_executor(None, make)
     try:
-        return await asyncio.shield(asyncio.wrap_future(made))
+        return await asyncio.shield(asyncio.wrap_future(loaded))
     except asyncio.CancelledError:
-        made.add_done_callback(functools.partial(_undo, undo))
+        loaded.add_done_callback(_release_later)
         raise
 
 
-def _undo(undo: Callable[[_A], object], made: Future[_A]) -> None:
-    """Undo the result of a call, in a thread of its own: the loop and its threads may be ending."""
-    if made.exception() is None:
-        threading.Thread(target=_undone, args=(undo, made.result()), name="rr-undo").start()
+def _release_later(loaded: Future[ClientQuery]) -> None:
+    """Release a query in a thread of its own: the loop and its threads may be ending."""
+    if loaded.exception() is None:
+        threading.Thread(target=_release, args=(loaded.result(),), name="rr-undo").start()
 
 
-def _undone(undo: Callable[[_A], object], result: _A) -> None:
+def _release(query: ClientQuery) -> None:
     try:
-        undo(result)
+        query.unload()
     except NotRunning:
-        logger.debug("%r: its system has ended, or its client is closed, and it is released", result)
+        logger.debug("%r: its system has ended, or its client is closed, and it is released", query)
     except RrError:
-        logger.exception("%r: its load was cancelled, and it is not released", result)
+        logger.exception("%r: its load was cancelled, and it is not released", query)

@@ -7,7 +7,7 @@ import os
 import socket
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -43,7 +43,6 @@ from rr_actors.system.console.console_messages import (
     Welcome,
 )
 from rr_actors.system.console.running_systems import consoles_in, running_systems
-from rr_actors.system.recording.recordings import Recording, add
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_at
 
@@ -139,13 +138,14 @@ class ConsoleClient:
         """
         return self._parts(follow, Events | Missed)
 
-    def record(self) -> Iterator[Entries | Missed]:
-        """Yield the recorded entries from now on, until the system ends. The connection has no other use after that.
+    def record(self) -> Iterator[Entries]:
+        """Yield the recorded entries from now on, as follow() does. `dropped` has those that this reader missed, too.
 
         Raises:
             RrError: the system refused the request.
         """
-        return self._parts(BeginRecording(), Entries | Missed)
+        parts = self._parts(BeginRecording(), Entries | Missed)
+        return (Entries([], part.count) if isinstance(part, Missed) else part for part in parts)
 
     def _parts(self, request: Follow | BeginRecording, kinds: Any) -> Iterator[Any]:
         self._send(request)
@@ -243,19 +243,6 @@ def _connected(run_dir: Path) -> socket.socket:
         connected.close()
         raise Unavailable(f"{run_dir / SOCKET}: expected a system of user {os.geteuid()}, got one of user {peer.uid}")
     return connected
-
-
-def take_parts(recording: Recording, parts: Iterable[Entries | Missed]) -> None:
-    """Add to a recording the parts that ConsoleClient.record() yields, until they end.
-
-    Raises:
-        RrError: the system refused the request.
-    """
-    for part in parts:
-        if isinstance(part, Missed):
-            add(recording, [], part.count)
-        else:
-            add(recording, part.entries, part.dropped)
 
 
 def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:

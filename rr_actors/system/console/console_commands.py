@@ -178,9 +178,9 @@ class Commands:
         path, supervisor, child = self._child(command.child)
         if child.pid is None:
             raise ActorUnavailable(f"{path}: it is {child.state}, and has no process to be killed", id=path)
-        if child.pid == self._pid_of(supervisor.path):
-            text = f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead"
-            raise UsageError(text)
+        above, _, id = supervisor.path.rpartition("/")
+        if child.pid == (SupervisorRef(above).which_child(id).pid if above else os.getpid()):
+            raise UsageError(f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead")
         name = _signal_name(command.signal)
         facts = {"path": path, "pid": child.pid, "signal": name}
         if command.dry_run:
@@ -192,11 +192,6 @@ class Commands:
         if not sent:
             raise ActorUnavailable(f"{path}: its process {child.pid} has ended", id=path)
         return Done(f"sent {name} to {path} (pid {child.pid})", facts)
-
-    def _pid_of(self, path: str) -> int | None:
-        """Return the id of the process that a supervisor runs in."""
-        above, _, id = path.rpartition("/")
-        return SupervisorRef(above).which_child(id).pid if above else os.getpid()
 
     def _terminate(self, command: Terminate) -> Done:
         path, supervisor, child = self._child(command.child)

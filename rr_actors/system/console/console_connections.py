@@ -59,11 +59,16 @@ class Connections:
         Raises:
             NotRunning, Unavailable: as open().
         """
-        client = self._kept() or self.open()
+        with self._lock:
+            kept = self._idle.pop() if self._idle else None
+        client = kept or self.open()
         try:
             yield client
-        except NotRunning:
-            self._forget_idle()
+        except NotRunning:  # the system has ended, and the idle connections with it
+            with self._lock:
+                idle, self._idle = self._idle, []
+            for other in idle:
+                other.close()
             raise
         finally:
             self._give_back(client)
@@ -104,23 +109,12 @@ class Connections:
         for client in list(self._all):
             client.drop()
 
-    def _kept(self) -> ConsoleClient | None:
-        with self._lock:
-            return self._idle.pop() if self._idle else None
-
     def _give_back(self, client: ConsoleClient) -> None:
         with self._lock:
             kept = not client.is_broken and not self._closed and len(self._idle) < _IDLE
             if kept:
                 self._idle.append(client)
         if not kept:
-            client.close()
-
-    def _forget_idle(self) -> None:
-        """Close the idle connections: their system has ended."""
-        with self._lock:
-            idle, self._idle = self._idle, []
-        for client in idle:
             client.close()
 
 

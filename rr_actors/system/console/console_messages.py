@@ -422,22 +422,6 @@ class Missed(_Message, frozen=True):
     tree: Children
 
 
-Answer = (
-    Welcome
-    | Children
-    | Registrars
-    | Resources
-    | Queries
-    | Found
-    | Happenings
-    | Letters
-    | Figures
-    | Done
-    | Holding
-    | Replied
-    | Refused
-    | Following
-    | Events
-    | Entries
-    | Missed
-)
+OfQuestion = Children | Registrars | Resources | Queries | Found | Happenings | Letters | Figures
+OfCommand = Done | Holding | Replied
+Answer = Welcome | OfQuestion | OfCommand | Refused | Following | Events | Entries | Missed

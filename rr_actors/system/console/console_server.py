@@ -27,7 +27,6 @@ from rr_actors.system.console.console_messages import (
     REQUEST_LIMIT_BYTES,
     SOCKET,
     VERSION,
-    Answer,
     BeginRecording,
     Command,
     Follow,
@@ -85,7 +84,7 @@ class Console:
         self.feed = Feed(subscribers, recordings)
         self.welcome = Welcome(VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()
-        self.stopping = False
+        self.stopping = False  # then commands are refused; the feed goes on
         self._sockets = SocketDir(Path(node.info.run_dir))
         self._server: asyncio.AbstractServer | None = None
         self._making: asyncio.Task[None] | None = None
@@ -120,10 +119,6 @@ class Console:
         if self._server is not None and not self._sockets.has(SOCKET):
             self._making = asyncio.get_running_loop().create_task(self._serve())
 
-    def refuse_commands(self) -> None:
-        """Refuse commands from now on, because the system stops. The feed goes on."""
-        self.stopping = True
-
     async def close(self) -> None:
         """Stop listening, and close every connection. Try each step. A second close does nothing."""
         server, self._server = self._server, None
@@ -150,22 +145,20 @@ class Console:
     def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> tuple[bytes, str]:
         """Return the frame that answers a request, and the id of the query that it loaded for a client. In a worker."""
         try:
-            answer = self._answer(request, is_gone, connection)
+            if isinstance(request, Hello | Follow | BeginRecording):
+                raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
+            if not isinstance(request, Command):
+                answer = self.view.answer(request)
+            elif self.stopping:
+                raise Unavailable(f"system {self.node.info.name!r} is stopping")
+            else:
+                answer = self.commands.carry_out(request, is_gone, connection)
             frame = framed(answer, ANSWER_LIMIT_BYTES, "the longest answer of a console")
             return frame, answer.query_id if isinstance(answer, Holding) else ""
         except Exception as error:
             if not isinstance(error, RrError):
                 logger.exception("console: %s failed", type(request).__name__)
             return refusal(error), ""
-
-    def _answer(self, request: Request, is_gone: Callable[[], bool], connection: object) -> Answer:
-        if isinstance(request, Hello | Follow | BeginRecording):
-            raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
-        if isinstance(request, Command):
-            if self.stopping:
-                raise Unavailable(f"system {self.node.info.name!r} is stopping")
-            return self.commands.carry_out(request, is_gone, connection)
-        return self.view.answer(request)
 
     def missed(self, count: int, seq: int) -> bytes:
         """Return the frame for a reader that was too slow. In a worker."""
