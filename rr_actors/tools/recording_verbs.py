@@ -26,7 +26,9 @@ _LISTEN_S = 10.0
 @app.command(epilog="Example: rr-actors record crash.jsonl --seconds 30")
 def record(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A new file, for `sequence` and rr.read_recording().")],
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after so many. Default: at Ctrl-C.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="End after so many. Default: at Ctrl-C.")
+    ] = None,
     state: StateOption = None,
 ) -> None:
     """Record the events, exits and callbacks of the system, and the messages between its registrars."""
@@ -49,7 +51,9 @@ def record(
 def sequence(
     id: Annotated[str, typer.Argument(metavar="QUERY-OR-RESOURCE", help="Its id, or the beginning of it.")],
     file: Annotated[Path | None, typer.Option(help="A recording. Default: record the running system now.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Without a file: for how long.")] = _LISTEN_S,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="Without a file: for how long.")
+    ] = _LISTEN_S,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:

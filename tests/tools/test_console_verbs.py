@@ -628,6 +628,19 @@ def test_a_time_limit_that_is_none_is_refused_by_its_option(shop: rr.System, sec
     assert "--timeout" in ran.stderr
 
 
+@pytest.mark.parametrize("number", ["²", "9" * 5000], ids=["a superscript", "a long number"])
+def test_a_signal_that_is_no_number_of_one_is_refused(shop: rr.System, number: str) -> None:
+    assert "expected a signal's name or number" in refused(2, "kill", "shop", "--signal", number)
+
+
+def test_a_recording_without_an_end_is_refused(shop: rr.System, tmp_path: Path) -> None:
+    ran = rr_actors("record", tmp_path / "new.jsonl", "--seconds", "inf")
+
+    assert ran.returncode == 2
+    assert "'--seconds'" in ran.stderr
+    assert not (tmp_path / "new.jsonl").exists()
+
+
 def test_a_closed_standard_output_is_said_in_one_line(shop: rr.System) -> None:
     shell = f"exec {sys.executable} -m rr_actors ps >&-"
     ran = subprocess.run(["sh", "-c", shell], stderr=subprocess.PIPE, text=True)
