@@ -29,7 +29,7 @@ from rr_actors.base.errors import (
     UsageError,
 )
 from rr_actors.base.values.canonical import encode
-from rr_actors.system.console import console_client, console_connections, console_questions
+from rr_actors.system.console import console_client, console_questions
 from rr_actors.system.console.client_registrars import ClientRegistrars
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
 from rr_actors.system.console.console_messages import Find, Hold, Holding
@@ -307,7 +307,7 @@ def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(
         except NotRunning as error:
             raised(str(error))
 
-    monkeypatch.setattr(console_connections, "ConsoleClient", Slow)
+    monkeypatch.setattr(console_client, "ConsoleClient", Slow)
     opening = threading.Thread(target=open_it)
     opening.start()
     gate.wait_arrived()

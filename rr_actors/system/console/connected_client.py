@@ -21,8 +21,7 @@ from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.arguments import state_path
 from rr_actors.registrar.pages import QueryRow
 from rr_actors.runtime.time_limits import time_limit
-from rr_actors.system.console.console_client import NotRunning, find_console
-from rr_actors.system.console.console_connections import Connections
+from rr_actors.system.console.console_client import Connections, NotRunning, find_console
 from rr_actors.system.console.console_messages import (
     TIMEOUT_LIMIT_S,
     AskActor,
@@ -53,7 +52,8 @@ class Client:
 
     def __init__(self, run_dir: Path) -> None:
         self._connections = Connections(lambda: run_dir, _ANSWER_S)
-        welcome = self._connections.welcome()
+        with self._connections.lent() as client:
+            welcome = client.welcome
         self.system = welcome.system
         self.state_dir = Path(welcome.state_dir)
         self.pid = welcome.pid
