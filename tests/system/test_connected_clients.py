@@ -181,6 +181,19 @@ def test_errors_are_those_of_the_system(client: rr.Client, provider: rr.Registra
     assert worker.load("provider/camera", "x").response
 
 
+def test_what_is_too_long_is_refused_and_the_next_call_finds_the_system(
+    client: rr.Client, provider: rr.Registrar
+) -> None:
+    worker = client.open_registrar("worker")
+    with pytest.raises(NotSerializable, match="950005 bytes is over a client's limit of 900000"):
+        worker.load("provider/camera", b"x" * 950_000)
+    with pytest.raises(NotSerializable, match="over a client's limit"):
+        client.ask("planner", b"x" * 950_000)
+    with pytest.raises(RrError, match="length <= 1000"):
+        client.ask("a" * 2000, 1)
+    assert worker.load("provider/camera", "x").response
+
+
 class Echo(rr.Actor):
     """Answers with what it is asked; to "slow" when the test lets it."""
 

@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Self
 
-from rr_actors.base.errors import RrError, Unavailable, UnknownQuery
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownQuery
 from rr_actors.base.names import parse_server_id
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.arguments import state_path
@@ -24,6 +24,7 @@ from rr_actors.runtime.time_limits import time_limit
 from rr_actors.system.console.console_client import Connections, NotRunning, find_console
 from rr_actors.system.console.console_messages import (
     TIMEOUT_LIMIT_S,
+    VALUE_LIMIT_BYTES,
     AskActor,
     Done,
     Find,
@@ -79,11 +80,11 @@ class Client:
 
         Raises:
             NotFound: there is no such actor.
-            NotSerializable: the message or the answer is no plain data.
+            NotSerializable: the message or the answer is no plain data, or too long (as for load()).
             RrError: the actor did not answer, or its handler raised.
         """
         limit_s = _limit(timeout_s)
-        command = AskActor(actor, encode(message, f"message to {actor}"), limit_s)
+        command = AskActor(actor, _encoded(message, f"message to {actor}"), limit_s)
         return Codec(None, "answer").show(self._connections.ask(command, Replied, limit_s + _GRACE_S).answer)
 
     def close(self) -> None:
@@ -130,11 +131,11 @@ class ClientRegistrar:
 
         Raises:
             LoadError: as Registrar.load().
-            NotSerializable: the request is no plain data, or the response is longer than 4 MiB.
+            NotSerializable: the request is no plain data, or longer than 900,000 bytes; or the response than 4 MiB.
             NotRunning: the system has ended, or this client is closed.
         """
         limit_s, target = _limit(timeout_s), str(parse_server_id(server))
-        command = Hold(self.name, target, encode(request), limit_s)
+        command = Hold(self.name, target, _encoded(request, "request"), limit_s)
         held = self._connections.ask(command, Holding, limit_s + _GRACE_S)
         codec = Codec(response_type, f"{target}: response")
         try:
@@ -263,6 +264,14 @@ def connect(state_dir: str | os.PathLike[str] | None = None) -> Client:
 def _limit(timeout_s: float | None) -> float:
     limit_s = time_limit(timeout_s)
     return TIMEOUT_LIMIT_S if limit_s is None else min(limit_s, TIMEOUT_LIMIT_S)
+
+
+def _encoded(value: Any, what: str) -> bytes:
+    data = encode(value, what)
+    if len(data) > VALUE_LIMIT_BYTES:
+        text = f"{what}: {len(data)} bytes is over a client's limit of {VALUE_LIMIT_BYTES}"
+        raise NotSerializable(f"{text}; give the name of a file, say", path=what)
+    return data
 
 
 def _id_of(query_or_id: ClientQuery | str) -> str:

@@ -67,7 +67,8 @@ class ConsoleClient:
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
-        is_broken: whether an answer did not come: then the connection must not be used again.
+        is_broken: whether an answer did not come, or the console closes the connection after it: then the connection
+            must not be used again.
 
     Raises:
         NotRunning: no console answers in run_dir.
@@ -101,7 +102,7 @@ class ConsoleClient:
         self.is_broken = True
         self._send(request)
         answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
-        self.is_broken = False
+        self.is_broken = isinstance(answer, Refused) and not _is_valid(request)
         return _checked(answer, expected)
 
     def children(self, match: str = "") -> Children:
@@ -226,6 +227,15 @@ def _checked(answer: Answer, expected: type[_A]) -> _A:
     if not isinstance(answer, expected):
         raise Unavailable(f"console: expected {expected.__name__}, got {type(answer).__name__}")
     return answer
+
+
+def _is_valid(request: Request) -> bool:
+    """Return whether the console can read a request; it closes the connection after another one."""
+    try:
+        msgspec.msgpack.decode(msgspec.msgpack.encode(request), type=Request)
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 def _connected(run_dir: Path) -> socket.socket:
