@@ -19,9 +19,10 @@ from xml.etree import ElementTree
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
-from rr_actors.tools import console_verbs
+from rr_actors.tools import console_verbs, graphs
 from rr_actors.tools.explanations import ago
 from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
 from support_cli import run_cli
@@ -273,6 +274,17 @@ def test_a_graph_is_drawn_for_mermaid_and_graphviz(app: rr.Registrar, of: str) -
     assert dot.count("{") == dot.count("}") or of != "tree"
     assert ('"root" -> "root/shop"' in dot) == (of != "dependencies")
     assert ('"holder app" -> ' in dot) == (of != "tree")
+
+
+def test_registrars_with_names_alike_have_boxes_of_their_own() -> None:
+    rows = [ResourceRow(f"{number}", f"{name}/thing", "1", "", "loaded", "OK", "", 1, [], 0, [], 0)
+            for number, name in enumerate(("arm.left", "arm-left", "arm_left"))]  # fmt: skip
+
+    boxes = [
+        line.partition("[")[0] for line in graphs.mermaid([], rows, "dependencies").splitlines() if "subgraph" in line
+    ]
+
+    assert len(set(boxes)) == 3
 
 
 # -- driving ---------------------------------------------------------------------------------------------------------
