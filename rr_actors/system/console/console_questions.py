@@ -54,7 +54,7 @@ _TRACEBACK = 4000  # characters
 
 
 class Viewed(Protocol):
-    """The part of System that a console uses, which documents these methods."""
+    """The part of System that a console uses. System has the docstrings."""
 
     name: str
     config: SystemConfig

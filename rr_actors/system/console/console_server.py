@@ -186,7 +186,6 @@ class Connection(asyncio.Protocol):
         self._looks = False  # whether the loop will look for the client
         self._reader: Reader | None = None
         self._has_registrars = False
-        self._key = ("console", id(self))
 
     # -- called by asyncio -------------------------------------------------------------------------------------------
 
@@ -274,7 +273,7 @@ class Connection(asyncio.Protocol):
     def _clean_up(self, fn: Callable[..., None], *args: Any) -> None:
         """Have a worker release what the client has left, after an opening that may still be in progress."""
         try:
-            self._console.node.dispatcher.workers.serial(self._key, fn, *args)
+            self._console.node.dispatcher.workers.serial(self, fn, *args)
         except MailboxFull:
             asyncio.get_running_loop().call_later(_AGAIN_S, self._clean_up, fn, *args)
         except Unavailable:  # the process is closing, and with it all its registrars
@@ -321,7 +320,7 @@ class Connection(asyncio.Protocol):
         try:
             if isinstance(request, OpenRegistrar):
                 self._has_registrars = True
-                workers.serial(self._key, *answer, done=functools.partial(self._answered, request))
+                workers.serial(self, *answer, done=functools.partial(self._answered, request))
             else:
                 workers.submit(*answer, done=functools.partial(self._answered, request))
         except Unavailable as error:

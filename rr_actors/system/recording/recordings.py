@@ -121,10 +121,8 @@ class Recordings:
                 return
         else:
             entries = [_entry_of(event)]
-        numbered: list[Entry] = []
-        for entry in entries:
-            self.seq += 1
-            numbered.append(msgspec.structs.replace(entry, seq=self.seq))
+        numbered = [msgspec.structs.replace(entry, seq=seq) for seq, entry in enumerate(entries, self.seq + 1)]
+        self.seq += len(numbered)
         self._counters.take(numbered)
         for sink in self._sinks:
             sink(numbered, dropped)
