@@ -315,10 +315,14 @@ class RecordingFile:
 
     def _line(self, entry: Entry) -> bytes:
         try:
-            return self._encode(entry) + b"\n"
+            line = self._encode(entry) + b"\n"
+            if len(line) <= LINE_LIMIT:
+                return line
+            lost = f"a line of {len(line)} bytes, over the limit of {LINE_LIMIT}"
         except (UnicodeEncodeError, TypeError, ValueError) as error:  # for instance half a character in a file's name
-            bare = msgspec.structs.replace(entry, detail=readable(entry.detail), facts={"lost": readable(str(error))})
-            return self._encode(bare) + b"\n"
+            lost = str(error)
+        bare = msgspec.structs.replace(entry, detail=readable(entry.detail), facts={"lost": readable(lost)})
+        return self._encode(bare) + b"\n"
 
     def finish(self) -> None:
         """Close the file; close() raises the error of a failure. A second call does nothing."""
