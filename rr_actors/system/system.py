@@ -363,7 +363,7 @@ class System:
         steps = Steps()
         console, self._console = self._console, None
         if console is not None:
-            console.refuse_commands()
+            console.stopping = True
         try:
             await self._wind_up(node, limit_s, steps)
         except asyncio.CancelledError:  # the thread that stops the system was interrupted

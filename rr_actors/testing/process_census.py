@@ -71,10 +71,7 @@ class Mark:
 
     def is_on(self, pid: int) -> bool:
         """Return whether a process is of this run."""
-        try:
-            return self._mark in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-        except OSError:
-            return False
+        return self._mark in _variables(pid)
 
     def signal(self, pid: int, number: signal.Signals) -> bool:
         """Send a process a signal; return False if it has ended, or is not of this run."""
@@ -102,9 +99,13 @@ class Mark:
 
 def _owner_of(pid: int) -> int | None:
     """Return the pid of the manager that started this daemon; None if the process is no daemon."""
-    try:
-        variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    except OSError:
-        return None
     prefix = f"{OWNER}=".encode()
-    return next((int(variable.removeprefix(prefix)) for variable in variables if variable.startswith(prefix)), None)
+    return next((int(one.removeprefix(prefix)) for one in _variables(pid) if one.startswith(prefix)), None)
+
+
+def _variables(pid: int) -> list[bytes]:
+    """Return a process's environment; nothing if it has ended, or is another user's."""
+    try:
+        return Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    except OSError:
+        return []

@@ -418,7 +418,7 @@ def kill(
 
 def _signal_number(text: str) -> int:
     name = text.upper() if text.upper().startswith("SIG") else f"SIG{text.upper()}"
-    if text.isdigit() and 1 <= int(text) <= 64:
+    if text.isdecimal() and len(text) < 10 and 1 <= int(text) <= 64:
         return int(text)
     if name not in signal.Signals.__members__:
         raise UsageError(f"--signal: expected a signal's name or number (SIGTERM, 15), got {shown(text)}")

@@ -107,8 +107,8 @@ def _label(resource: ResourceRow) -> str:
 def _mermaid_dependencies(resources: list[ResourceRow]) -> list[str]:
     names = {resource.id: f"r{number}" for number, resource in enumerate(resources)}
     lines: list[str] = []
-    for registrar in sorted({resource.server.partition("/")[0] for resource in resources}):
-        lines.append(f"    subgraph g_{registrar.replace('.', '_').replace('-', '_')}[{mermaid_text(registrar)}]")
+    for number, registrar in enumerate(sorted({resource.server.partition("/")[0] for resource in resources})):
+        lines.append(f"    subgraph g{number}[{mermaid_text(registrar)}]")
         mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
         lines += [f"        {names[resource.id]}[{mermaid_text(_label(resource))}]" for resource in mine]
         lines.append("    end")

@@ -13,9 +13,8 @@ import msgspec
 import typer
 
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console, take_parts
-from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, read_recording
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, add, read_recording
 from rr_actors.tools.cli_commands import StateOption
 from rr_actors.tools.console_verbs import JsonOption, app
 
@@ -27,7 +26,9 @@ _LISTEN_S = 10.0
 @app.command(epilog="Example: rr-actors record crash.jsonl --seconds 30")
 def record(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A new file, for `sequence` and rr.read_recording().")],
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after so many. Default: at Ctrl-C.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="End after so many. Default: at Ctrl-C.")
+    ] = None,
     state: StateOption = None,
 ) -> None:
     """Record the events, exits and callbacks of the system, and the messages between its registrars."""
@@ -37,10 +38,6 @@ def record(
         try:
             with _ending(client, seconds), suppress(KeyboardInterrupt):
                 for part in client.record():
-                    if isinstance(part, c.Missed):
-                        missed += part.count
-                        sink.write((), part.count)
-                        continue
                     missed += part.dropped
                     count += len(part.entries)
                     sink.write(part.entries, part.dropped)
@@ -54,7 +51,9 @@ def record(
 def sequence(
     id: Annotated[str, typer.Argument(metavar="QUERY-OR-RESOURCE", help="Its id, or the beginning of it.")],
     file: Annotated[Path | None, typer.Option(help="A recording. Default: record the running system now.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Without a file: for how long.")] = _LISTEN_S,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="Without a file: for how long.")
+    ] = _LISTEN_S,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -74,7 +73,8 @@ def _recorded(state: Path | None, seconds: float) -> Recording:
     with ConsoleClient(find_console(state)) as client:
         recording = Recording(client.welcome.system)
         with _ending(client, seconds), suppress(KeyboardInterrupt):
-            take_parts(recording, client.record())
+            for part in client.record():
+                add(recording, part.entries, part.dropped)
     return recording
 
 

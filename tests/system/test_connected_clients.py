@@ -29,7 +29,7 @@ from rr_actors.base.errors import (
     UsageError,
 )
 from rr_actors.base.values.canonical import encode
-from rr_actors.system.console import console_client, console_connections, console_questions
+from rr_actors.system.console import console_client, console_questions
 from rr_actors.system.console.client_registrars import ClientRegistrars
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
 from rr_actors.system.console.console_messages import Find, Hold, Holding
@@ -176,6 +176,21 @@ def test_errors_are_those_of_the_system(client: rr.Client, provider: rr.Registra
         client.open_registrar("worker")
     with pytest.raises(RrError, match="expected 1 to 64"):
         client.open_registrar("no name")
+    with pytest.raises(InvalidName, match="expected 1 to 64"):
+        client.open_registrar("n" * 60)  # too long with "client." before it
+    assert worker.load("provider/camera", "x").response
+
+
+def test_what_is_too_long_is_refused_and_the_next_call_finds_the_system(
+    client: rr.Client, provider: rr.Registrar
+) -> None:
+    worker = client.open_registrar("worker")
+    with pytest.raises(NotSerializable, match="950005 bytes is over a client's limit of 900000"):
+        worker.load("provider/camera", b"x" * 950_000)
+    with pytest.raises(NotSerializable, match="over a client's limit"):
+        client.ask("planner", b"x" * 950_000)
+    with pytest.raises(RrError, match="length <= 1000"):
+        client.ask("a" * 2000, 1)
     assert worker.load("provider/camera", "x").response
 
 
@@ -305,7 +320,7 @@ def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(
         except NotRunning as error:
             raised(str(error))
 
-    monkeypatch.setattr(console_connections, "ConsoleClient", Slow)
+    monkeypatch.setattr(console_client, "ConsoleClient", Slow)
     opening = threading.Thread(target=open_it)
     opening.start()
     gate.wait_arrived()

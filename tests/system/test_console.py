@@ -21,6 +21,7 @@ from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import (
     Done,
+    Entries,
     Events,
     Find,
     Follow,
@@ -297,6 +298,17 @@ def test_what_is_loaded_is_let_go_again_unless_it_is_kept(
     assert provider.resources() == []
 
 
+def test_of_a_response_that_is_too_long_for_an_answer_the_beginning_is_shown_and_the_load_is_no_failure(
+    system: rr.System, provider: rr.Registrar, console: ConsoleClient
+) -> None:
+    serve(provider, "map", load=lambda request: "x" * 5_000_000)
+
+    kept = console.ask(Load("provider/map", "1", keep=True), Done)
+
+    assert kept.facts["response"].startswith("'xxx")
+    assert "released" in console.ask(Unload(kept.facts["query_id"]), Done).text
+
+
 def test_what_is_loaded_in_a_registrars_name_is_held_by_it(shop: rr.System, console: ConsoleClient) -> None:
     app = shop.open_registrar("app")
 
@@ -569,6 +581,34 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
                 assert [row.path for row in part.tree.rows] == ["inner", "inner/shop"]
 
     assert missed >= 100
+
+
+def test_many_long_texts_at_once_reach_a_console_that_records(system: rr.System, state_dir: Path) -> None:
+    console, heard = system._console, Calls()
+    assert console is not None
+    client = ConsoleClient(find_console(state_dir))
+    parts = client.record()
+
+    def read() -> None:
+        for part in parts:
+            assert isinstance(part, Entries)
+            for one in part.entries:
+                heard(one)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    eventually(lambda: bool(console.feed._recording))
+    try:
+        system._running().dispatcher.run(_publish_statuses(system, "x" * 10_000))
+        eventually(lambda: len(heard) == 500)
+    finally:
+        client.close()
+        thread.join()
+
+
+async def _publish_statuses(system: rr.System, text: str) -> None:
+    for _ in range(500):
+        system._publish({"event": "status", "registrar": "r", "server": "r/s", "resource_id": "1", "detail": text})
 
 
 async def _publish(system: rr.System, text: str) -> None:

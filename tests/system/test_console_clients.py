@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pickle
 import socket
 import struct
+import termios
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,13 +31,14 @@ from rr_actors.system.console.console_messages import (
     Hello,
     ListChildren,
     ListResources,
+    Load,
     Refused,
     Resources,
     Welcome,
 )
 from rr_actors.wire import unix_sockets
 from rr_actors.wire.frames import FrameReader, framed
-from support import Served, eventually
+from support import Gate, Served, eventually, serve
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
 
@@ -86,6 +89,7 @@ WORDS = {
     "nested too deeply": struct.pack(">I", 100_000) + b"\x91" * 100_000,
     "an unknown request": packed({"is": "explode"}),
     "an answer": framed(Welcome(1, "x", 1, "/", 0.0), 1000),
+    "an empty frame": bytes(4),
     "a list": packed([1, 2]),
     "a wrong type": packed({"is": "hello", "version": "one"}),
     "a negative page": packed({"is": "listchildren", "offset": -1}),
@@ -264,3 +268,72 @@ def test_no_answer_has_a_key_of_the_system(system: rr.System, dialled: Callable[
     assert len(heard) > 100
     assert state.key not in heard
     assert state.key.hex().encode() not in heard
+
+
+def leave_unread(system: rr.System, app: rr.Registrar, peer: socket.socket) -> Any:
+    """Ask until an answer waits in the server, but not yet so much that the server waits; return its connection."""
+    app.load_all([("provider/thing", "x" * 300 + str(number)) for number in range(30)])
+    peer.sendall(HELLO)
+    assert peer.recv(1000)
+    console = system._console
+    assert console is not None
+    (connection,) = console.connections
+    with ConsoleClient(find_console(system.state_dir)) as client:
+        length = len(framed(client.ask(ListResources(), Resources), ANSWER_LIMIT_BYTES))
+    for number in range(1, 1000):
+        peer.sendall(framed(ListResources(), 1000))
+        eventually(lambda number=number: _waiting(peer) + _unsent(connection) == number * length)
+        if _unsent(connection):
+            break
+    assert not connection._blocked
+    return connection
+
+
+def _waiting(peer: socket.socket) -> int:
+    return struct.unpack("i", fcntl.ioctl(peer, termios.FIONREAD, bytes(4)))[0]
+
+
+def _unsent(connection: Any) -> int:
+    return connection._transport.get_write_buffer_size()
+
+
+def break_the_rules(peer: socket.socket) -> None:
+    peer.sendall(b"\xff" * 8)
+
+
+def send_no_more(peer: socket.socket) -> None:
+    peer.shutdown(socket.SHUT_WR)
+
+
+@pytest.mark.parametrize("how", [break_the_rules, send_no_more])
+def test_a_client_that_is_to_leave_and_does_not_read_is_cut_off(
+    system: rr.System, app: rr.Registrar, served: Served, dialled: Callable[[], socket.socket],
+    monkeypatch: pytest.MonkeyPatch, how: Callable[[socket.socket], None],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(console_server, "STALLED_S", 0.3)
+    peer = dialled()
+    connection = leave_unread(system, app, peer)
+    console = system._console
+    assert console is not None
+
+    how(peer)
+
+    eventually(lambda: connection not in console.connections)
+
+
+def test_a_client_that_leaves_with_requests_unread_is_noticed_while_its_first_one_is_carried_out(
+    system: rr.System, provider: rr.Registrar, gate: Gate, dialled: Callable[[], socket.socket],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(console_server, "LOOK_S", 0.1)
+    serve(provider, "slow", load=gate)
+    console, peer = system._console, dialled()
+    assert console is not None
+    peer.sendall(HELLO + framed(Load("provider/slow", "1", keep=True), 1000) + framed(ListChildren(), 1000))
+    gate.wait_arrived()
+
+    peer.close()
+
+    eventually(lambda: not console.connections, timeout=5.0)  # the gate is shut
+    gate.open()
+    eventually(lambda: not provider.resources())

@@ -609,6 +609,19 @@ def test_a_file_is_read_to_its_last_whole_line_and_refused_where_it_is_damaged(t
         rr.read_recording(tmp_path / "missing")
 
 
+def test_of_an_entry_that_is_too_long_for_a_line_the_facts_are_left_out(tmp_path: Path) -> None:
+    whole = Recording("system")
+    long = Entry(1.0, "exited", detail="ValueError", facts={"traceback": "x" * recordings.LINE_LIMIT})
+    add(whole, [long, Entry(2.0, "restarted")])
+
+    whole.save(tmp_path / "long.jsonl")
+
+    exited, restarted = rr.read_recording(tmp_path / "long.jsonl").entries()
+    assert exited.detail == "ValueError"
+    assert "over the limit" in exited.facts["lost"]
+    assert restarted.event == "restarted"
+
+
 # -- from another process --------------------------------------------------------------------------------------------
 
 

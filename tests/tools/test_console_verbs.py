@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import struct
@@ -18,11 +19,12 @@ from xml.etree import ElementTree
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
-from rr_actors.tools import console_verbs
+from rr_actors.tools import console_verbs, graphs
 from rr_actors.tools.explanations import ago
-from support import Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
+from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
 from support_cli import run_cli
 from support_managers import Order, Shop
 
@@ -222,6 +224,21 @@ def test_why_says_who_holds_it_for_whom_and_since_when(app: rr.Registrar, shop: 
     assert said("why", query.id[:-1]).split(" since ")[0] == whole.split(" since ")[0]
 
 
+def test_why_prints_what_its_page_shows(system: rr.System) -> None:
+    app, maps, cameras = map(system.open_registrar, ("app", "maps", "cameras"))
+    serve(cameras, "camera")
+    serve(maps, "map", load=lambda request: maps.load("cameras/camera", f"/dev/{request}").id)
+    camera = app.load("maps/map", "kitchen").response
+    page = (REPOSITORY / "docs" / "console.md").read_text()
+    _, shown, _ = re.split(r"^\$ rr-actors why \w+\n|```\n(?=\n## Live in)", page, flags=re.MULTILINE)
+
+    assert _without_ids_and_times(said("why", camera)) == _without_ids_and_times(shown)
+
+
+def _without_ids_and_times(text: str) -> str:
+    return re.sub(r"[0-9a-f]{32}", "ID", re.sub(r"since [\d:]+ \(\d+ s\)", "since TIME", text))
+
+
 def test_why_says_what_a_load_waits_for(system: rr.System, gate: Gate) -> None:
     app, provider = system.open_registrar("app"), system.open_registrar("provider")
     serve(provider, "part", load=lambda request: gate(request))
@@ -257,6 +274,17 @@ def test_a_graph_is_drawn_for_mermaid_and_graphviz(app: rr.Registrar, of: str) -
     assert dot.count("{") == dot.count("}") or of != "tree"
     assert ('"root" -> "root/shop"' in dot) == (of != "dependencies")
     assert ('"holder app" -> ' in dot) == (of != "tree")
+
+
+def test_registrars_with_names_alike_have_boxes_of_their_own() -> None:
+    rows = [ResourceRow(f"{number}", f"{name}/thing", "1", "", "loaded", "OK", "", 1, [], 0, [], 0)
+            for number, name in enumerate(("arm.left", "arm-left", "arm_left"))]  # fmt: skip
+
+    boxes = [
+        line.partition("[")[0] for line in graphs.mermaid([], rows, "dependencies").splitlines() if "subgraph" in line
+    ]
+
+    assert len(set(boxes)) == 3
 
 
 # -- driving ---------------------------------------------------------------------------------------------------------
@@ -610,6 +638,19 @@ def test_a_time_limit_that_is_none_is_refused_by_its_option(shop: rr.System, sec
     ran = rr_actors("load", "shop/thing", '{"name": "x"}', "--timeout", seconds)
     assert ran.returncode == 2
     assert "--timeout" in ran.stderr
+
+
+@pytest.mark.parametrize("number", ["²", "9" * 5000], ids=["a superscript", "a long number"])
+def test_a_signal_that_is_no_number_of_one_is_refused(shop: rr.System, number: str) -> None:
+    assert "expected a signal's name or number" in refused(2, "kill", "shop", "--signal", number)
+
+
+def test_a_recording_without_an_end_is_refused(shop: rr.System, tmp_path: Path) -> None:
+    ran = rr_actors("record", tmp_path / "new.jsonl", "--seconds", "inf")
+
+    assert ran.returncode == 2
+    assert "'--seconds'" in ran.stderr
+    assert not (tmp_path / "new.jsonl").exists()
 
 
 def test_a_closed_standard_output_is_said_in_one_line(shop: rr.System) -> None:

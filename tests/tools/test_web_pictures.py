@@ -13,7 +13,7 @@ import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import Holder, ResourceRow
 from rr_actors.system.console.console_client import ConsoleClient
-from rr_actors.system.console.console_messages import Children, Entries, Event, Events, Missed, RegistrarRow
+from rr_actors.system.console.console_messages import Entries, Event, Events, RegistrarRow
 from rr_actors.tools.web import sequence_page
 from rr_actors.tools.web.graph_picture import around, chart, edges_in, travels
 from rr_actors.tools.web.sequence_page import Recorder
@@ -159,7 +159,7 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> Gate:
     gate = Gate()
 
     class Slow(ConsoleClient):
-        def record(self) -> Iterator[Entries | Missed]:
+        def record(self) -> Iterator[Entries]:
             gate()
             return super().record()
 
@@ -211,9 +211,9 @@ def test_a_page_sees_that_its_recording_goes_on_when_it_is_full_and_what_it_has_
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Told(ConsoleClient):
-        def record(self) -> Iterator[Entries | Missed]:
+        def record(self) -> Iterator[Entries]:
             entries = [Entry(float(number), "loaded") for number in range(3)]
-            return iter([Entries(entries), Missed(5, 9, Children(0, [])), Entries(entries[:1], 7)])
+            return iter([Entries(entries), Entries([], 5), Entries(entries[:1], 7)])
 
     monkeypatch.setattr(sequence_page, "ConsoleClient", Told)
     monkeypatch.setattr(sequence_page, "_LIMIT", 2)

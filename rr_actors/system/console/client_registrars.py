@@ -16,7 +16,7 @@ from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.registrar import Registrar, load_bytes
 from rr_actors.system.console.console_messages import (
-    ANSWER_LIMIT_BYTES,
+    RESPONSE_LIMIT_BYTES,
     AskActor,
     Done,
     Hold,
@@ -28,8 +28,6 @@ from rr_actors.system.console.console_questions import View, Viewed
 from rr_actors.system.registrar_lookup import open_registrar
 
 logger = logging.getLogger("rr_actors")
-
-_ROOM_BYTES = 1024  # of an answer, for everything but the response
 
 
 class ClientRegistrars:
@@ -45,7 +43,7 @@ class ClientRegistrars:
         Raises:
             InvalidName, NameTaken: the name is not valid, or another client has it.
         """
-        full = CLIENTS + check_name(name, "registrar name")
+        full = check_name(CLIENTS + check_name(name, "registrar name"), "registrar name")
         system = view.system
         config = dataclasses.replace(system.config.registrar(full), erase_on_destruct=True)
         registrar = open_registrar(view.node, full, config, system)
@@ -75,9 +73,9 @@ class ClientRegistrars:
         """
         registrar = self._of(command.registrar)
         query, response = load_bytes(registrar, command.server, command.request, command.timeout_s)
-        if len(response) + _ROOM_BYTES > ANSWER_LIMIT_BYTES:
+        if len(response) > RESPONSE_LIMIT_BYTES:
             registrar.unload(query.id, timeout_s=command.timeout_s)
-            text = f"a response of {len(response)} bytes is over a client's limit of {ANSWER_LIMIT_BYTES}"
+            text = f"a response of {len(response)} bytes is over a client's limit of {RESPONSE_LIMIT_BYTES}"
             raise NotSerializable(f"{command.server}: {text}; give the name of a file, say", path="response")
         return Holding(query.id, query.resource_id, response)
 

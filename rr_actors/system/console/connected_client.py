@@ -7,25 +7,24 @@ application's process hold its queries. Each registrar has a connection of its o
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
 import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
-from rr_actors.base.errors import RrError, Unavailable, UnknownQuery
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownQuery
 from rr_actors.base.names import parse_server_id
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.arguments import state_path
 from rr_actors.registrar.pages import QueryRow
 from rr_actors.runtime.time_limits import time_limit
-from rr_actors.system.console.console_client import NotRunning, find_console
-from rr_actors.system.console.console_connections import Connections
+from rr_actors.system.console.console_client import Connections, NotRunning, find_console
 from rr_actors.system.console.console_messages import (
     TIMEOUT_LIMIT_S,
+    VALUE_LIMIT_BYTES,
     AskActor,
     Done,
     Find,
@@ -42,8 +41,6 @@ logger = logging.getLogger("rr_actors")
 _ANSWER_S = 60.0  # for a request that has no time limit of its own
 _GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
 
-_A = TypeVar("_A")
-
 
 class Client:
     """A client of a running system. connect() makes it; as a context manager it is closed at the end. From any thread.
@@ -56,7 +53,8 @@ class Client:
 
     def __init__(self, run_dir: Path) -> None:
         self._connections = Connections(lambda: run_dir, _ANSWER_S)
-        welcome = self._connections.welcome()
+        with self._connections.lent() as client:
+            welcome = client.welcome
         self.system = welcome.system
         self.state_dir = Path(welcome.state_dir)
         self.pid = welcome.pid
@@ -82,11 +80,11 @@ class Client:
 
         Raises:
             NotFound: there is no such actor.
-            NotSerializable: the message or the answer is no plain data.
+            NotSerializable: the message or the answer is no plain data, or too long (as for load()).
             RrError: the actor did not answer, or its handler raised.
         """
         limit_s = _limit(timeout_s)
-        command = AskActor(actor, encode(message, f"message to {actor}"), limit_s)
+        command = AskActor(actor, _encoded(message, f"message to {actor}"), limit_s)
         return Codec(None, "answer").show(self._connections.ask(command, Replied, limit_s + _GRACE_S).answer)
 
     def close(self) -> None:
@@ -133,11 +131,11 @@ class ClientRegistrar:
 
         Raises:
             LoadError: as Registrar.load().
-            NotSerializable: the request is no plain data, or the response is longer than 4 MiB.
+            NotSerializable: the request is no plain data, or longer than 900,000 bytes; or the response than 4 MiB.
             NotRunning: the system has ended, or this client is closed.
         """
         limit_s, target = _limit(timeout_s), str(parse_server_id(server))
-        command = Hold(self.name, target, encode(request), limit_s)
+        command = Hold(self.name, target, _encoded(request, "request"), limit_s)
         held = self._connections.ask(command, Holding, limit_s + _GRACE_S)
         codec = Codec(response_type, f"{target}: response")
         try:
@@ -153,9 +151,7 @@ class ClientRegistrar:
         self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
     ) -> ClientQuery:
         """Load as load() does, from any event loop. If cancelled, release the query when the load has ended."""
-        return await _awaited(
-            lambda: self.load(server, request, response_type=response_type, timeout_s=timeout_s), ClientQuery.unload
-        )
+        return await _awaited(lambda: self.load(server, request, response_type=response_type, timeout_s=timeout_s))
 
     def unload(self, query_or_id: ClientQuery | str, *, timeout_s: float | None = 30.0) -> None:
         """Release a query.
@@ -270,38 +266,46 @@ def _limit(timeout_s: float | None) -> float:
     return TIMEOUT_LIMIT_S if limit_s is None else min(limit_s, TIMEOUT_LIMIT_S)
 
 
+def _encoded(value: Any, what: str) -> bytes:
+    data = encode(value, what)
+    if len(data) > VALUE_LIMIT_BYTES:
+        text = f"{what}: {len(data)} bytes is over a client's limit of {VALUE_LIMIT_BYTES}"
+        raise NotSerializable(f"{text}; give the name of a file, say", path=what)
+    return data
+
+
 def _id_of(query_or_id: ClientQuery | str) -> str:
     return query_or_id if isinstance(query_or_id, str) else query_or_id.id
 
 
-async def _awaited(call: Callable[[], _A], undo: Callable[[_A], object]) -> _A:
-    """Await a call that a thread makes; if cancelled, undo its result later, even if the loop has ended by then."""
-    made: Future[_A] = Future()
+async def _awaited(load: Callable[[], ClientQuery]) -> ClientQuery:
+    """Await a load that a thread makes; if cancelled, release its query later, even if the loop has ended by then."""
+    loaded: Future[ClientQuery] = Future()
 
     def make() -> None:
         try:
-            made.set_result(call())
+            loaded.set_result(load())
         except BaseException as error:
-            made.set_exception(error)
+            loaded.set_exception(error)
 
     asyncio.get_running_loop().run_in_executor(None, make)
     try:
-        return await asyncio.shield(asyncio.wrap_future(made))
+        return await asyncio.shield(asyncio.wrap_future(loaded))
     except asyncio.CancelledError:
-        made.add_done_callback(functools.partial(_undo, undo))
+        loaded.add_done_callback(_release_later)
         raise
 
 
-def _undo(undo: Callable[[_A], object], made: Future[_A]) -> None:
-    """Undo the result of a call, in a thread of its own: the loop and its threads may be ending."""
-    if made.exception() is None:
-        threading.Thread(target=_undone, args=(undo, made.result()), name="rr-undo").start()
+def _release_later(loaded: Future[ClientQuery]) -> None:
+    """Release a query in a thread of its own: the loop and its threads may be ending."""
+    if loaded.exception() is None:
+        threading.Thread(target=_release, args=(loaded.result(),), name="rr-undo").start()
 
 
-def _undone(undo: Callable[[_A], object], result: _A) -> None:
+def _release(query: ClientQuery) -> None:
     try:
-        undo(result)
+        query.unload()
     except NotRunning:
-        logger.debug("%r: its system has ended, or its client is closed, and it is released", result)
+        logger.debug("%r: its system has ended, or its client is closed, and it is released", query)
     except RrError:
-        logger.exception("%r: its load was cancelled, and it is not released", result)
+        logger.exception("%r: its load was cancelled, and it is not released", query)

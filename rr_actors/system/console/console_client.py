@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import threading
 import time
+import weakref
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -43,7 +46,6 @@ from rr_actors.system.console.console_messages import (
     Welcome,
 )
 from rr_actors.system.console.running_systems import consoles_in, running_systems
-from rr_actors.system.recording.recordings import Recording, add
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_at
 
@@ -51,6 +53,9 @@ _A = TypeVar("_A")
 _Page = TypeVar("_Page", Children, Registrars, Resources, Queries)
 _GREETING_S = 5.0
 _RETRY_S = 0.01
+_IDLE = 8  # connections that are kept for the next call
+
+_here: weakref.WeakSet[Connections] = weakref.WeakSet()
 
 
 class ConsoleClient:
@@ -62,7 +67,8 @@ class ConsoleClient:
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
-        is_broken: whether an answer did not come: then the connection must not be used again.
+        is_broken: whether an answer did not come, or the console closes the connection after it: then the connection
+            must not be used again.
 
     Raises:
         NotRunning: no console answers in run_dir.
@@ -96,7 +102,7 @@ class ConsoleClient:
         self.is_broken = True
         self._send(request)
         answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
-        self.is_broken = False
+        self.is_broken = isinstance(answer, Refused) and not _is_valid(request)
         return _checked(answer, expected)
 
     def children(self, match: str = "") -> Children:
@@ -139,13 +145,14 @@ class ConsoleClient:
         """
         return self._parts(follow, Events | Missed)
 
-    def record(self) -> Iterator[Entries | Missed]:
-        """Yield the recorded entries from now on, until the system ends. The connection has no other use after that.
+    def record(self) -> Iterator[Entries]:
+        """Yield the recorded entries from now on, as follow() does. `dropped` has those that this reader missed, too.
 
         Raises:
             RrError: the system refused the request.
         """
-        return self._parts(BeginRecording(), Entries | Missed)
+        parts = self._parts(BeginRecording(), Entries | Missed)
+        return (Entries([], part.count) if isinstance(part, Missed) else part for part in parts)
 
     def _parts(self, request: Follow | BeginRecording, kinds: Any) -> Iterator[Any]:
         self._send(request)
@@ -222,6 +229,15 @@ def _checked(answer: Answer, expected: type[_A]) -> _A:
     return answer
 
 
+def _is_valid(request: Request) -> bool:
+    """Return whether the console can read a request; it closes the connection after another one."""
+    try:
+        msgspec.msgpack.decode(msgspec.msgpack.encode(request), type=Request)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
 def _connected(run_dir: Path) -> socket.socket:
     sockets = SocketDir(run_dir)
     deadline = time.monotonic() + _GREETING_S
@@ -245,17 +261,102 @@ def _connected(run_dir: Path) -> socket.socket:
     return connected
 
 
-def take_parts(recording: Recording, parts: Iterable[Entries | Missed]) -> None:
-    """Add to a recording the parts that ConsoleClient.record() yields, until they end.
+class Connections:
+    """Connections to one console: one for each call in flight, kept for later calls. From any thread.
 
-    Raises:
-        RrError: the system refused the request.
+    Args:
+        find: returns the directory of the console's socket; called for each new connection.
+        timeout_s: seconds that an answer may take, unless a call says otherwise.
     """
-    for part in parts:
-        if isinstance(part, Missed):
-            add(recording, [], part.count)
-        else:
-            add(recording, part.entries, part.dropped)
+
+    def __init__(self, find: Callable[[], Path], timeout_s: float) -> None:
+        self._find = find
+        self._timeout_s = timeout_s
+        self._closed = ""
+        self._lock = threading.Lock()
+        self._idle: list[ConsoleClient] = []
+        self._all: weakref.WeakSet[ConsoleClient] = weakref.WeakSet()
+        _here.add(self)
+
+    def open(self) -> ConsoleClient:
+        """Return a new connection. The caller closes it; close() does, too.
+
+        Raises:
+            NotRunning: no system runs, or these connections are closed.
+            Unavailable: the system is another user's, or speaks another version.
+        """
+        if not self._closed:
+            client = ConsoleClient(self._find(), timeout_s=self._timeout_s)
+            with self._lock:
+                if not self._closed:
+                    self._all.add(client)
+                    return client
+            client.close()
+        raise NotRunning(self._closed)
+
+    @contextmanager
+    def lent(self) -> Generator[ConsoleClient]:
+        """Lend a connection that no other call uses within the `with` block.
+
+        Raises:
+            NotRunning, Unavailable: as open().
+        """
+        with self._lock:
+            kept = self._idle.pop() if self._idle else None
+        client = kept or self.open()
+        try:
+            yield client
+        except NotRunning:  # the system has ended, and the idle connections with it
+            with self._lock:
+                idle, self._idle = self._idle, []
+            for other in idle:
+                other.close()
+            raise
+        finally:
+            self._give_back(client)
+
+    def ask(self, request: Request, expected: type[_A], timeout_s: float | None = None) -> _A:
+        """Send a request and return its answer.
+
+        Raises:
+            RrError: the system refused the request, or could not carry it out.
+            NotRunning: the system has ended, or these connections are closed.
+            Unavailable: no answer came in time; the system may carry out the request all the same.
+        """
+        with self.lent() as client:
+            return client.ask(request, expected, timeout_s)
+
+    def close(self, why: str) -> None:
+        """Close all connections. Calls in flight and later ones raise NotRunning. A second close does nothing."""
+        with self._lock:
+            self._closed = self._closed or why
+            clients, self._idle = list(self._all), []
+        for client in clients:
+            client.close()
+
+    def leave_to_parent(self) -> None:
+        """Close the copies in a forked child, so that the parent's connections end with the parent."""
+        self._lock = threading.Lock()  # another thread may have held it at the fork
+        self._closed = "this process was forked from the client's: call rr.connect() here"
+        self._idle = []
+        for client in list(self._all):
+            client.drop()
+
+    def _give_back(self, client: ConsoleClient) -> None:
+        with self._lock:
+            kept = not client.is_broken and not self._closed and len(self._idle) < _IDLE
+            if kept:
+                self._idle.append(client)
+        if not kept:
+            client.close()
+
+
+def _forked() -> None:
+    for connections in list(_here):
+        connections.leave_to_parent()
+
+
+os.register_at_fork(after_in_child=_forked)
 
 
 def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:

@@ -21,6 +21,7 @@ from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console.client_registrars import ClientRegistrars, ask
 from rr_actors.system.console.console_messages import (
+    RESPONSE_LIMIT_BYTES,
     Answer,
     AskActor,
     Command,
@@ -177,9 +178,9 @@ class Commands:
         path, supervisor, child = self._child(command.child)
         if child.pid is None:
             raise ActorUnavailable(f"{path}: it is {child.state}, and has no process to be killed", id=path)
-        if child.pid == self._pid_of(supervisor.path):
-            text = f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead"
-            raise UsageError(text)
+        above, _, id = supervisor.path.rpartition("/")
+        if child.pid == (SupervisorRef(above).which_child(id).pid if above else os.getpid()):
+            raise UsageError(f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead")
         name = _signal_name(command.signal)
         facts = {"path": path, "pid": child.pid, "signal": name}
         if command.dry_run:
@@ -191,11 +192,6 @@ class Commands:
         if not sent:
             raise ActorUnavailable(f"{path}: its process {child.pid} has ended", id=path)
         return Done(f"sent {name} to {path} (pid {child.pid})", facts)
-
-    def _pid_of(self, path: str) -> int | None:
-        """Return the id of the process that a supervisor runs in."""
-        above, _, id = path.rpartition("/")
-        return SupervisorRef(above).which_child(id).pid if above else os.getpid()
 
     def _terminate(self, command: Terminate) -> Done:
         path, supervisor, child = self._child(command.child)
@@ -268,11 +264,13 @@ def _json(text: str) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value in the form that JSON gives it, or its text if JSON cannot hold it."""
+    """Return a value in the form that JSON gives it, or its text if JSON or an answer cannot hold it."""
     try:
-        return msgspec.json.decode(msgspec.json.encode(value, enc_hook=repr))
+        plain = msgspec.json.decode(msgspec.json.encode(value, enc_hook=repr))
+        fits = len(msgspec.msgpack.encode(plain)) <= RESPONSE_LIMIT_BYTES
     except Exception:  # a user's value: keys that are no text, numbers that are too long
         return shown(value)
+    return plain if fits else shown(value)
 
 
 def _signal_name(number: int) -> str:

@@ -38,6 +38,7 @@ KEPT_OF_RECORDING = 50_000
 BATCH_S = 0.05
 """Seconds that an event waits for others, to be sent with them."""
 _BATCH = 500
+_SHORT = 1000  # characters of a text, so that a batch of them fits into a frame
 
 
 class Reader:
@@ -56,9 +57,10 @@ class Reader:
         self.is_blocked = False
         self.newest = 0
         self.records = isinstance(follow, BeginRecording)
-        self._kept = KEPT_OF_RECORDING if isinstance(follow, BeginRecording) else KEPT
-        self._kinds = frozenset(() if isinstance(follow, BeginRecording) else follow.events)
-        self._about = "" if isinstance(follow, BeginRecording) else follow.about
+        self._kept = KEPT_OF_RECORDING if self.records else KEPT
+        wanted = Follow() if isinstance(follow, BeginRecording) else follow
+        self._kinds = frozenset(wanted.events)
+        self._about = wanted.about
         self._send = send
         self._fall_behind = fall_behind
         self._is_catching_up = False
@@ -69,9 +71,8 @@ class Reader:
         """Keep an event for the console, if the console has asked for such events."""
         if self._kinds and event.event not in self._kinds:
             return
-        if self._about and not mentions(event.facts, self._about):
-            return
-        self._keep(event)
+        if not self._about or mentions(event.facts, self._about):
+            self._keep(event)
 
     def take(self, entries: list[Entry], dropped: int) -> None:
         """Keep entries of a recording for the console."""
@@ -96,7 +97,7 @@ class Reader:
             return
         while self._waiting and not self.is_blocked:
             batch, self._waiting = self._waiting[:_BATCH], self._waiting[_BATCH:]
-            self._send(_entries(batch, self._dropped) if self.records else _framed(batch))
+            self._send(_entries(batch, self._dropped) if self.records else _events(batch))
             self._dropped = 0
 
     def take_missed(self) -> tuple[int, int]:
@@ -186,14 +187,14 @@ def _entries(entries: list[Any], dropped: int) -> bytes:
     try:
         return framed(Entries(entries, dropped), ANSWER_LIMIT_BYTES)
     except NotSerializable:  # half a character in a file's name, or very long texts
-        bare = [msgspec.structs.replace(entry, detail=readable(entry.detail), facts={}) for entry in entries]
+        bare = [msgspec.structs.replace(one, detail=readable(one.detail[:_SHORT]), facts={}) for one in entries]
         return framed(Entries(bare, dropped), ANSWER_LIMIT_BYTES)
 
 
-def _framed(events: list[Any]) -> bytes:
+def _events(events: list[Any]) -> bytes:
     try:
         return framed(Events(events), ANSWER_LIMIT_BYTES)
-    except NotSerializable:  # half a character in a file's name, or very long texts
+    except NotSerializable:  # as above
         return framed(Events([_readable(event) for event in events]), ANSWER_LIMIT_BYTES)
 
 
@@ -201,4 +202,4 @@ def _readable(event: Event) -> Event:
     facts: dict[str, Any] = {}
     for key, value in event.facts.items():
         facts[readable(key)] = value if isinstance(value, bool | float) else readable(shown(value))
-    return Event(event.seq, event.at, event.event, facts)
+    return msgspec.structs.replace(event, facts=facts)

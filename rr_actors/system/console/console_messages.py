@@ -23,11 +23,16 @@ SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request. The longest part of any is a resource's request as JSON."""
 ANSWER_LIMIT_BYTES = 4 * 2**20
+RESPONSE_LIMIT_BYTES = ANSWER_LIMIT_BYTES - 1024
+"""The longest response of a resource: an answer has other texts, too."""
 PAGE_LIMIT = 500
 """The most rows of a page."""
 
 _Text = Annotated[str, msgspec.Meta(max_length=1000)]
 _Long = Annotated[str, msgspec.Meta(max_length=900_000)]
+VALUE_LIMIT_BYTES = 900_000
+"""The longest request of a resource, or message to an actor, of a client."""
+_Value = Annotated[bytes, msgspec.Meta(max_length=VALUE_LIMIT_BYTES)]
 _Offset = Annotated[int, msgspec.Meta(ge=0, le=2**40)]
 _Limit = Annotated[int, msgspec.Meta(ge=1, le=PAGE_LIMIT)]
 TIMEOUT_LIMIT_S = 86_400.0
@@ -208,7 +213,7 @@ class Hold(_Message, frozen=True):
 
     registrar: _Text
     server: _Text
-    request: Annotated[bytes, msgspec.Meta(max_length=900_000)]
+    request: _Value
     timeout_s: _Seconds = 30.0
 
 
@@ -224,7 +229,7 @@ class AskActor(_Message, frozen=True):
     """Ask an actor of the tree, by its path or id; the message is plain data, as canonical bytes."""
 
     actor: _Text
-    message: Annotated[bytes, msgspec.Meta(max_length=900_000)]
+    message: _Value
     timeout_s: _Seconds = 30.0
 
 
@@ -420,22 +425,6 @@ class Missed(_Message, frozen=True):
     tree: Children
 
 
-Answer = (
-    Welcome
-    | Children
-    | Registrars
-    | Resources
-    | Queries
-    | Found
-    | Happenings
-    | Letters
-    | Figures
-    | Done
-    | Holding
-    | Replied
-    | Refused
-    | Following
-    | Events
-    | Entries
-    | Missed
-)
+OfQuestion = Children | Registrars | Resources | Queries | Found | Happenings | Letters | Figures
+OfCommand = Done | Holding | Replied
+Answer = Welcome | OfQuestion | OfCommand | Refused | Following | Events | Entries | Missed

@@ -21,6 +21,7 @@ from rr_actors.registrar.registrar import Registrar, page
 from rr_actors.supervision.event_history import Record
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console.console_messages import (
+    PAGE_LIMIT,
     Answer,
     Children,
     ChildRow,
@@ -53,39 +54,25 @@ _TRACEBACK = 4000  # characters
 
 
 class Viewed(Protocol):
-    """The part of System that a console uses."""
+    """The part of System that a console uses. System has the docstrings."""
 
     name: str
     config: SystemConfig
 
     @property
-    def ended(self) -> ExitReport | None:
-        """The report of how the tree has ended; None while it runs."""
-        ...
+    def ended(self) -> ExitReport | None: ...
 
-    def supervisor(self, path: str | None = None) -> SupervisorRef:
-        """Return a supervisor by its path."""
-        ...
+    def supervisor(self, path: str | None = None) -> SupervisorRef: ...
 
-    def ref(self, id: str) -> ActorRef[Any]:
-        """Return a reference to a child actor."""
-        ...
+    def ref(self, id: str) -> ActorRef[Any]: ...
 
-    def registrar(self, name: str) -> Registrar:
-        """Return a registrar, or a handle on one."""
-        ...
+    def registrar(self, name: str) -> Registrar: ...
 
-    def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar:
-        """Open a registrar of this process."""
-        ...
+    def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar: ...
 
-    def dead_letters(self) -> DeadLetters:
-        """Return the messages that reached nobody."""
-        ...
+    def dead_letters(self) -> DeadLetters: ...
 
-    def figures(self) -> list[Figure]:
-        """Return the figures of the system."""
-        ...
+    def figures(self) -> list[Figure]: ...
 
 
 class View:
@@ -142,7 +129,7 @@ class View:
 
     # -- the tree --------------------------------------------------------------------------------------------------
 
-    def children(self, match: str = "", offset: int = 0, limit: int = 500) -> Children:
+    def children(self, match: str = "", offset: int = 0, limit: int = PAGE_LIMIT) -> Children:
         """Return a page of the tree."""
         rows = [row for row in self._walk() if match in row.path]
         return Children(len(rows), rows[offset : offset + limit])
@@ -161,9 +148,11 @@ class View:
             yield msgspec.structs.replace(row, state=state, error=readable(text_of(error)))
             return
         recent, most = described["recent_restarts"], described["max_restarts"]
-        yield msgspec.structs.replace(row, strategy=_strategy(described), max_restarts=most, recent_restarts=recent)
+        strategy = f"{described['strategy']}, {most} in {described['max_seconds']:g} s"
+        yield msgspec.structs.replace(row, strategy=strategy, max_restarts=most, recent_restarts=recent)
         for child in described["children"]:
-            below = _child_row(child, f"{row.path}/{child['id']}", row.depth + 1)
+            how = child["type"], child["state"], child["pid"], child["restarts"], child["up_s"]
+            below = ChildRow(f"{row.path}/{child['id']}", row.depth + 1, *how)
             if below.type == "supervisor" and below.state == "running":
                 yield from self._supervisor(below)
             else:
@@ -262,15 +251,6 @@ class View:
             resources = [row for row in resources if id in (row.id, *(holder.query_id for holder in row.holders))]
             queries = [row for row in queries if row.id == id]
         return Found(resources, queries, notes)
-
-
-def _strategy(described: dict[str, Any]) -> str:
-    return f"{described['strategy']}, {described['max_restarts']} in {described['max_seconds']:g} s"
-
-
-def _child_row(child: dict[str, Any], path: str, depth: int) -> ChildRow:
-    state, pid, restarts = child["state"], child["pid"], child["restarts"]
-    return ChildRow(path, depth, child["type"], state, pid, restarts, child["up_s"])
 
 
 def _fitting(record: Record) -> Record:

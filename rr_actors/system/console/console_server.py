@@ -10,6 +10,7 @@ import asyncio
 import functools
 import logging
 import os
+import select
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -26,7 +27,6 @@ from rr_actors.system.console.console_messages import (
     REQUEST_LIMIT_BYTES,
     SOCKET,
     VERSION,
-    Answer,
     BeginRecording,
     Command,
     Follow,
@@ -56,6 +56,8 @@ FRAME_S = 5.0
 """Seconds that a client may take for its first message, and for the rest of a message that it has begun."""
 STALLED_S = 30.0
 """Seconds that a client may leave an answer unread."""
+LOOK_S = 5.0
+"""Seconds after which the server looks again whether a client has left whose requests it does not read yet."""
 _AGAIN_S = 0.1
 
 
@@ -82,7 +84,7 @@ class Console:
         self.feed = Feed(subscribers, recordings)
         self.welcome = Welcome(VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()
-        self.stopping = False
+        self.stopping = False  # then commands are refused; the feed goes on
         self._sockets = SocketDir(Path(node.info.run_dir))
         self._server: asyncio.AbstractServer | None = None
         self._making: asyncio.Task[None] | None = None
@@ -117,10 +119,6 @@ class Console:
         if self._server is not None and not self._sockets.has(SOCKET):
             self._making = asyncio.get_running_loop().create_task(self._serve())
 
-    def refuse_commands(self) -> None:
-        """Refuse commands from now on, because the system stops. The feed goes on."""
-        self.stopping = True
-
     async def close(self) -> None:
         """Stop listening, and close every connection. Try each step. A second close does nothing."""
         server, self._server = self._server, None
@@ -147,21 +145,20 @@ class Console:
     def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> tuple[bytes, str]:
         """Return the frame that answers a request, and the id of the query that it loaded for a client. In a worker."""
         try:
-            answer = self._answer(request, is_gone, connection)
-            return framed(answer, ANSWER_LIMIT_BYTES), answer.query_id if isinstance(answer, Holding) else ""
+            if isinstance(request, Hello | Follow | BeginRecording):
+                raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
+            if not isinstance(request, Command):
+                answer = self.view.answer(request)
+            elif self.stopping:
+                raise Unavailable(f"system {self.node.info.name!r} is stopping")
+            else:
+                answer = self.commands.carry_out(request, is_gone, connection)
+            frame = framed(answer, ANSWER_LIMIT_BYTES, "the longest answer of a console")
+            return frame, answer.query_id if isinstance(answer, Holding) else ""
         except Exception as error:
             if not isinstance(error, RrError):
                 logger.exception("console: %s failed", type(request).__name__)
             return refusal(error), ""
-
-    def _answer(self, request: Request, is_gone: Callable[[], bool], connection: object) -> Answer:
-        if isinstance(request, Hello | Follow | BeginRecording):
-            raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
-        if isinstance(request, Command):
-            if self.stopping:
-                raise Unavailable(f"system {self.node.info.name!r} is stopping")
-            return self.commands.carry_out(request, is_gone, connection)
-        return self.view.answer(request)
 
     def missed(self, count: int, seq: int) -> bytes:
         """Return the frame for a reader that was too slow. In a worker."""
@@ -186,9 +183,9 @@ class Connection(asyncio.Protocol):
         self._busy = False
         self._blocked = False
         self._ended = False
+        self._looks = False  # whether the loop will look for the client
         self._reader: Reader | None = None
         self._has_registrars = False
-        self._key = ("console", id(self))
 
     # -- called by asyncio -------------------------------------------------------------------------------------------
 
@@ -211,18 +208,37 @@ class Connection(asyncio.Protocol):
         if self._ended:
             return
         self._requests += self._frames.feed(data)
-        if self._frames.error is not None:
+        if self._frames.error is not None or self._frames.ended:
             self._requests.clear()
-            self._leave(self._frames.error)
+            self._leave(self._frames.error or UsageError("expected a request, got a frame of 0 bytes"))
         elif self._reader is not None:
             self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
         else:
             self._next()
             if self._requests:  # otherwise read on, to notice a client that leaves
                 self._transport.pause_reading()
+                if not self._looks:
+                    self._look_later()
+
+    def _look_later(self) -> None:
+        self._looks = True
+        asyncio.get_running_loop().call_later(LOOK_S, self._look_for_client)
+
+    def _look_for_client(self) -> None:
+        """Abort the connection if the client has left: while nothing is read, the transport does not notice that."""
+        self._looks = False
+        if self._ended or self._transport.is_reading():
+            return
+        poll = select.poll()
+        poll.register(self._transport.get_extra_info("socket"), select.POLLRDHUP)
+        if poll.poll(0):
+            self._transport.abort()
+        else:
+            self._look_later()
 
     def eof_received(self) -> bool:
-        """Have the connection closed: the client sends no more, and its last request is not answered either."""
+        """Close the connection: the client sends no more, and its last request is not answered either."""
+        self.end()
         return False
 
     def pause_writing(self) -> None:
@@ -257,7 +273,7 @@ class Connection(asyncio.Protocol):
     def _clean_up(self, fn: Callable[..., None], *args: Any) -> None:
         """Have a worker release what the client has left, after an opening that may still be in progress."""
         try:
-            self._console.node.dispatcher.workers.serial(self._key, fn, *args)
+            self._console.node.dispatcher.workers.serial(self, fn, *args)
         except MailboxFull:
             asyncio.get_running_loop().call_later(_AGAIN_S, self._clean_up, fn, *args)
         except Unavailable:  # the process is closing, and with it all its registrars
@@ -304,7 +320,7 @@ class Connection(asyncio.Protocol):
         try:
             if isinstance(request, OpenRegistrar):
                 self._has_registrars = True
-                workers.serial(self._key, *answer, done=functools.partial(self._answered, request))
+                workers.serial(self, *answer, done=functools.partial(self._answered, request))
             else:
                 workers.submit(*answer, done=functools.partial(self._answered, request))
         except Unavailable as error:
@@ -352,12 +368,12 @@ class Connection(asyncio.Protocol):
     def end(self) -> None:
         """Send what is written, and close the connection; at once, if the client does not read."""
         self._ended = True
-        self._stop_timer()
         if self._reader is not None:
             self._console.feed.remove(self._reader)
         if self._blocked:
             self._transport.abort()
         else:
+            self._set_timer(STALLED_S)  # the client may never read the rest
             self._transport.close()
 
     def _leave(self, error: BaseException) -> None:

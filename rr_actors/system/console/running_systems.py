@@ -40,7 +40,10 @@ class Entry:
         for place in _places():
             try:
                 with _opened(place, make=True) as folder:
-                    _sweep(folder)
+                    for name in folder.names():
+                        match = _NAME.fullmatch(name)
+                        if match is not None and not Path("/proc", match[1]).exists():  # its process is gone
+                            folder.discard(name)
                     os.symlink(self._run_dir, self._name, dir_fd=folder.fd)
                 self._place = place
                 return
@@ -65,10 +68,11 @@ def running_systems() -> list[Path]:
     for place in _places():
         try:
             with _opened(place) as folder:
-                for name in sorted(folder.names()):
-                    run_dir = _target(folder, name)
-                    if run_dir is not None and _answers(run_dir):
-                        found.append(run_dir)
+                for name in sorted(filter(_NAME.fullmatch, folder.names())):
+                    with contextlib.suppress(OSError):  # its system has just removed it
+                        run_dir = Path(os.readlink(name, dir_fd=folder.fd))
+                        if _answers(run_dir):
+                            found.append(run_dir)
             break
         except FileNotFoundError:
             if os.access(place[0], os.W_OK):  # no system has made a list in this place yet
@@ -110,23 +114,6 @@ def _opened(place: tuple[str, str], *, make: bool = False) -> Folder:
         if not make and not parent.has(place[1]):
             raise FileNotFoundError
         return parent.inner(place[1])
-
-
-def _sweep(folder: Folder) -> None:
-    """Remove the entries of processes that are gone."""
-    for name in folder.names():
-        match = _NAME.fullmatch(name)
-        if match is not None and not Path("/proc", match[1]).exists():
-            folder.discard(name)
-
-
-def _target(folder: Folder, name: str) -> Path | None:
-    if _NAME.fullmatch(name) is None:
-        return None
-    try:
-        return Path(os.readlink(name, dir_fd=folder.fd))
-    except OSError:
-        return None
 
 
 def _answers(run_dir: Path) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 from opentelemetry.metrics import CallbackOptions, MeterProvider, Observation
 from opentelemetry.sdk.resources import Resource
@@ -17,12 +17,8 @@ _FRESH_S = 0.5  # a collection reads the instruments one after another: they sha
 _KINDS = {"client": SpanKind.CLIENT, "server": SpanKind.SERVER}
 
 
-def spans_of(timings: Sequence[Timing]) -> list[ReadableSpan]:
-    """Return the spans of these timings, each with its process as the resource."""
-    return [_span(timing) for timing in timings]
-
-
-def _span(timing: Timing) -> ReadableSpan:
+def span_of(timing: Timing) -> ReadableSpan:
+    """Return the span of a timing, with its process as the resource."""
     ended = timing.ended
     attributes = {"rr.registrar": timing.registrar, "rr.server": timing.server, "rr.query": timing.query}
     attributes |= {"rr.resource": timing.resource, "rr.unfinished": ended is None}

@@ -67,7 +67,7 @@ class Recordings:
         self._counters = counters
         self._record = record
         self._unrecord: Callable[[], None] | None = None
-        self._sinks: dict[Sink, Callable[[], object]] = {}
+        self._sinks: dict[Sink, Callable[[], object] | None] = {}
         self._lock = threading.Lock()
 
     def begin(self, sink: Sink, closed: Callable[[], object] | None = None) -> Callable[[], None]:
@@ -80,7 +80,7 @@ class Recordings:
             A function that removes the sink. A second call does nothing.
         """
         with self._lock:
-            self._sinks = {**self._sinks, sink: closed or _nothing}
+            self._sinks = {**self._sinks, sink: closed}
             if self._unrecord is None:
                 self._unrecord = self._record(self._heard)
         return functools.partial(self._end, sink)
@@ -101,7 +101,8 @@ class Recordings:
         steps = Steps()
         for sink, closed in self._sinks.items():
             self._end(sink)
-            steps.take("ending a recording", closed)
+            if closed is not None:
+                steps.take("ending a recording", closed)
         steps.end("not all recordings have ended in order")
 
     def leave_to_parent(self) -> None:
@@ -120,17 +121,11 @@ class Recordings:
                 return
         else:
             entries = [_entry_of(event)]
-        numbered: list[Entry] = []
-        for entry in entries:
-            self.seq += 1
-            numbered.append(msgspec.structs.replace(entry, seq=self.seq))
+        numbered = [msgspec.structs.replace(entry, seq=seq) for seq, entry in enumerate(entries, self.seq + 1)]
+        self.seq += len(numbered)
         self._counters.take(numbered)
         for sink in self._sinks:
             sink(numbered, dropped)
-
-
-def _nothing() -> None:
-    """Do nothing, at the end of a sink that gave no function for it."""
 
 
 def _entry_of(event: dict[str, Any]) -> Entry:
@@ -221,7 +216,7 @@ class Recording:
         if self.path is not None:
             return read_recording(self.path).entries()
         with self._lock:
-            return sorted(self._entries, key=_when)
+            return sorted(self._entries, key=lambda entry: (entry.at, entry.seq))
 
     def trace(self, what: Query[Any] | ResourceInfo | str) -> Trace:
         """Return the trace of one load: its messages and answers, its callbacks, and the loads that these made.
@@ -276,10 +271,6 @@ def add(recording: Recording, entries: list[Entry], dropped: int = 0) -> None:
     recording._take(entries, dropped)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
-def _when(entry: Entry) -> tuple[float, int]:
-    return entry.at, entry.seq
-
-
 class RecordingFile:
     """A new file that entries are written to, which only its user can read (0600).
 
@@ -324,10 +315,14 @@ class RecordingFile:
 
     def _line(self, entry: Entry) -> bytes:
         try:
-            return self._encode(entry) + b"\n"
+            line = self._encode(entry) + b"\n"
+            if len(line) <= LINE_LIMIT:
+                return line
+            lost = f"a line of {len(line)} bytes, over the limit of {LINE_LIMIT}"
         except (UnicodeEncodeError, TypeError, ValueError) as error:  # for instance half a character in a file's name
-            bare = msgspec.structs.replace(entry, detail=readable(entry.detail), facts={"lost": readable(str(error))})
-            return self._encode(bare) + b"\n"
+            lost = str(error)
+        bare = msgspec.structs.replace(entry, detail=readable(entry.detail), facts={"lost": readable(lost)})
+        return self._encode(bare) + b"\n"
 
     def finish(self) -> None:
         """Close the file; close() raises the error of a failure. A second call does nothing."""

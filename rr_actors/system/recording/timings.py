@@ -9,7 +9,8 @@ import msgspec
 
 from rr_actors.registrar.model.recorded import Entry
 
-_ANSWERS = {"Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "UnloadRefused": "Unload"}
+ANSWERS = {"Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "UnloadRefused": "Unload"}
+"""For the name of each answer, that of its question."""
 
 
 class Timing(msgspec.Struct, frozen=True):
@@ -75,25 +76,13 @@ def _calls(trace_id: str, entries: Sequence[Entry]) -> tuple[list[Timing], dict[
                 consumer = entry.registrar if entry.event == "sent" else entry.peer
                 server = servers.get(entry.query, entry.peer if entry.event == "sent" else entry.registrar)
                 where = (entry.process, entry.pid) if entry.event == "sent" else ("", 0)
+                what = _id(trace_id, entry.name, entry.query), trace_id, "", f"{entry.name.lower()} {server}", "client"
                 began = entry.at if known is None else min(known.began, entry.at)
-                name = f"{entry.name.lower()} {server}"
-                calls[entry.name, entry.query] = Timing(
-                    _id(trace_id, entry.name, entry.query),
-                    trace_id,
-                    "",
-                    name,
-                    "client",
-                    *where,
-                    consumer,
-                    server,
-                    entry.query,
-                    "",
-                    began,
-                )
-        elif entry.name in _ANSWERS:
+                calls[entry.name, entry.query] = Timing(*what, *where, consumer, server, entry.query, "", began)
+        elif entry.name in ANSWERS:
             if entry.resource:
                 resources[entry.query] = entry.resource
-            key = _ANSWERS[entry.name], entry.query
+            key = ANSWERS[entry.name], entry.query
             known = calls.get(key)
             if known is not None and (entry.event == "received" or known.ended is None):
                 error = entry.detail if entry.name.endswith("Refused") else ""
@@ -108,20 +97,10 @@ def _callbacks(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
     for number, entry in enumerate(entries):
         key = entry.pid, entry.resource, entry.name
         if entry.event == "began":
-            running[key] = Timing(
-                _id(trace_id, "callback", f"{entry.resource} {entry.name} {number}"),
-                trace_id,
-                "",
-                f"callback {entry.name} {entry.server}",
-                "server",
-                entry.process,
-                entry.pid,
-                entry.registrar,
-                entry.server,
-                "",
-                entry.resource,
-                entry.at,
-            )
+            id = _id(trace_id, "callback", f"{entry.resource} {entry.name} {number}")
+            what = id, trace_id, "", f"callback {entry.name} {entry.server}", "server"
+            where = entry.process, entry.pid, entry.registrar, entry.server
+            running[key] = Timing(*what, *where, "", entry.resource, entry.at)
         elif entry.event == "ended" and (began := running.pop(key, None)) is not None:
             found.append(msgspec.structs.replace(began, ended=entry.at, error=entry.detail))
     return [*found, *running.values()]

@@ -7,7 +7,7 @@ or a callback, has the id of the resource. A load that a callback makes has this
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -21,7 +21,6 @@ from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.timings import Timing, timings_of
 
 _PREFIX = 4  # an id can be given by its first characters, at least so many
-_CALLBACK = ("began", "ended")
 _STARTS = ("started", "restarted")
 _ENDS = ("exited", "stopped", "started", "restarted", "start_failed", "gave_up")
 
@@ -56,8 +55,8 @@ class Trace:
             UsageError: the extra is not installed.
         """
         with Extra("spans()", "otel"):  # even an installed extra is imported only here
-            from rr_actors.system.recording.otel_export import spans_of
-        return spans_of(self.timings())
+            from rr_actors.system.recording.otel_export import span_of
+        return [span_of(timing) for timing in self.timings()]
 
     def __str__(self) -> str:
         began = self.entries[0].at if self.entries else 0.0
@@ -78,7 +77,7 @@ def line_of(entry: Entry) -> str:
         what = f"{entry.registrar} -> {entry.peer}: {entry.name}"
     elif entry.event == "received":
         what = f"{entry.registrar} <- {entry.peer}: {entry.name}"
-    elif entry.event in _CALLBACK:
+    elif entry.event in ("began", "ended"):
         what = f"{entry.registrar}: {entry.name} callback of {entry.server} {entry.event}"
     else:
         what = f"{entry.event} {entry.process or entry.server}"
@@ -152,7 +151,8 @@ class Index:
             [id] if is_query else [*dict.fromkeys([*self.queries_on.get(id, ()), *([id] * (id in self.of_query))])]
         )
         if not is_query:
-            self._resource(id, self._first(self.of_resource.get(id, ())), chosen, ahead, seen)
+            first = min((self.entries[number].at for number in self.of_resource.get(id, ())), default=0.0)
+            self._resource(id, first, chosen, ahead, seen)
         ahead += [(query, 0.0) for query in queries]
         while ahead:
             query, since = ahead.pop()
@@ -185,9 +185,6 @@ class Index:
             since = min(since, self.entries[began].at)
         chosen.update(number for number in numbers if self.entries[number].at >= since)
         ahead += [(query, since) for query in self.loads_for.get(resource, ())]
-
-    def _first(self, numbers: Iterable[int]) -> float:
-        return min((self.entries[number].at for number in numbers), default=0.0)
 
     def deaths(self, chosen: Sequence[Entry]) -> list[Entry]:
         """Return the ends and starts of the children whose registrars took part, and the start after an end."""

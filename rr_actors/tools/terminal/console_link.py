@@ -6,8 +6,7 @@ import os
 from collections.abc import Callable
 from typing import TypeVar
 
-from rr_actors.system.console.console_client import find_console
-from rr_actors.system.console.console_connections import Connections
+from rr_actors.system.console.console_client import Connections, find_console
 from rr_actors.system.console.console_messages import Events, Follow, Missed, Request, Welcome
 
 _A = TypeVar("_A")
@@ -29,7 +28,8 @@ class ConsoleLink:
     def __init__(self, state_dir: str | os.PathLike[str] | None = None) -> None:
         self.state_dir = state_dir
         self._connections = Connections(lambda: find_console(self.state_dir), _LONGEST_S)
-        self.state_dir = self._connections.welcome().state_dir
+        with self._connections.lent() as client:
+            self.state_dir = client.welcome.state_dir
 
     def ask(self, request: Request, expected: type[_A], timeout_s: float | None = None) -> _A:
         """Send a request and return its answer.

@@ -238,14 +238,13 @@ def _wrapped(text: str, width: int, style: str = "") -> list[Row]:
 
 def _places(link: Asks, path: str) -> list[c.ChildRow]:
     """Return the child of this path, or none if it was forgotten. The system also lists paths that contain it."""
-    page = link.ask(c.ListChildren(path), c.Children, _LOOK_S)
-    seen = len(page.rows)
-    found = [row for row in page.rows if row.path == path]
-    while not found and page.rows and seen < page.total:
+    seen = 0
+    while True:
         page = link.ask(c.ListChildren(path, seen), c.Children, _LOOK_S)
         seen += len(page.rows)
         found = [row for row in page.rows if row.path == path]
-    return found
+        if found or not page.rows or seen >= page.total:
+            return found
 
 
 def _as_it_is(row: c.ChildRow) -> str:

@@ -18,8 +18,8 @@ from nicegui import ui
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console, take_parts
-from rr_actors.system.recording.recordings import Recording
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.recording.recordings import Recording, add
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.tools.web.watch import Moment, Watch
 from rr_actors.tools.web.web_pages import Page
@@ -188,9 +188,10 @@ class SequencePage(Page):
         """)
 
 
-def _take(recording: Recording, parts: Iterator[c.Entries | c.Missed]) -> None:
+def _take(recording: Recording, parts: Iterator[c.Entries]) -> None:
     with contextlib.suppress(RrError):  # the system has ended
-        take_parts(recording, parts)
+        for part in parts:
+            add(recording, part.entries, part.dropped)
 
 
 def _placed(entry: Entry) -> Entry:
