@@ -133,8 +133,11 @@ def start_task(
     """
 
     def ended(task: asyncio.Task[tuple[Any, BaseException | None]]) -> None:
-        result, error = (None, asyncio.CancelledError()) if task.cancelled() else task.result()
-        done(result, error)
+        if task.cancelled():  # before it began
+            coroutine.close()
+            done(None, asyncio.CancelledError())
+        else:
+            done(*task.result())
 
     task = loop.create_task(_outcome(coroutine), context=context)
     # Not inside the task: `done` may make another thread enter `context`, in which the task would still be.

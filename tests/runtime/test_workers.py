@@ -6,6 +6,7 @@ import asyncio
 import contextvars
 import errno
 import functools
+import inspect
 import logging
 import os
 import threading
@@ -17,7 +18,7 @@ import pytest
 from rr_actors.base.errors import MailboxFull, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.thread_wakeup import EventBell
-from rr_actors.runtime.user_loop import is_coroutine
+from rr_actors.runtime.user_loop import is_coroutine, start_task
 from rr_actors.runtime.workers import Workers, is_async
 from support import Calls, Gate, eventually
 
@@ -763,3 +764,20 @@ def test_a_coroutine_that_comes_after_the_end_ends_its_thread_in_order(dispatche
     gate.open()
 
     eventually(lambda: workers.threads == 0)
+
+
+def test_a_coroutine_whose_task_is_cancelled_before_it_begins_is_closed() -> None:
+    done = Calls()
+
+    async def never_begun() -> None: ...
+
+    coroutine = never_begun()
+
+    async def cancel_at_once() -> None:
+        start_task(asyncio.get_running_loop(), coroutine, done, contextvars.Context()).cancel()
+        await asyncio.sleep(0.01)
+
+    asyncio.run(cancel_at_once())
+    ((result, error),) = done.wait()
+    assert (result, type(error)) == (None, asyncio.CancelledError)
+    assert inspect.getcoroutinestate(coroutine) == inspect.CORO_CLOSED
