@@ -322,10 +322,29 @@ def check_may_block(what: str) -> None:
         dispatcher.check_may_block(what)
 
 
-def _forget_in_child() -> None:
+# A forked process inherits its parent's running systems, and leaves them to the parent. It shares the sockets and the
+# epoll of the loop with the parent: closing or freeing them in the child disturbs the parent.
+
+_running: weakref.WeakKeyDictionary[Any, Callable[[Any], object]] = weakref.WeakKeyDictionary()
+_left: list[object] = []
+
+
+def leave_in_children(running: T, leave: Callable[[T], object]) -> None:
+    """Call leave(running) in each process that is forked from now on, where its result is never freed."""
+    _running[running] = leave
+
+
+def forget_in_children(running: object) -> None:
+    """End leave_in_children() for an object that has ended."""
+    _running.pop(running, None)
+
+
+def _leave_all_in_child() -> None:
     if _process.dispatcher is not None:
         _process.dispatcher._abandon()  # pyright: ignore[reportPrivateUsage]  # same file, of the same process
     _process.__init__()
+    _left.extend([leave(running) for running, leave in list(_running.items())])
+    _running.clear()
 
 
 def _close_at_exit() -> None:
@@ -334,5 +353,5 @@ def _close_at_exit() -> None:
         _process.dispatcher.close(0.0)  # its holders may still release it
 
 
-os.register_at_fork(after_in_child=_forget_in_child)
+os.register_at_fork(after_in_child=_leave_all_in_child)
 interpreter.at_exit(_close_at_exit)

@@ -34,7 +34,7 @@ from rr_actors.supervision.control_channel import (
     Stop,
 )
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
-from rr_actors.supervision.health import Health
+from rr_actors.supervision.heartbeat import Health
 from rr_actors.supervision.supervisor import target_of
 from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.hosted import Hosted, prepare

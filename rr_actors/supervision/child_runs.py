@@ -47,10 +47,8 @@ from rr_actors.system.hosting.node import Node
 logger = logging.getLogger("rr_actors.supervision")
 
 ENTRY = "rr_actors.supervision.child_main:main"
-
 _LAST_WORDS_S = 0.05  # the longest wait for a dead process's last messages
 _LEAVE_S = 2.0  # the longest time from a process's last answer to its end
-
 
 OnEnd = Callable[[Exit], None]
 
@@ -132,14 +130,13 @@ class ProcessRun:
     """Called if the child has become ready and then ends without stop(). Set it before start()."""
 
     def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
-        loop = asyncio.get_running_loop()
+        self._loop = loop = asyncio.get_running_loop()
         self.pid: int | None = None
         self.managers: set[str] = set()  # the paths of those that run below a supervisor
         self._node = node
         self.spec = spec
         self._path = path
         self._on_died = on_died
-        self._loop = loop
         self._process: Process | None = None
         self._channel: Channel | None = None
         self._launching: asyncio.Task[None] | None = None
@@ -368,9 +365,6 @@ def _unpack(failed: Failed, path: str) -> BaseException:
     return error
 
 
-# Life: one run of one child as its supervisor sees it, and its Records.
-
-
 class Life:
     """One run of one child, as its supervisor sees it."""
 
@@ -399,8 +393,11 @@ class Life:
 
 def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record:
     """Return the Record of a report of the core, completed with the facts of the run."""
-    exit = report.exit
-    code = _code_of_start(report) if exit is None else exit.code
+    exit, error = report.exit, report.error
+    if exit is not None:
+        code = exit.code
+    else:  # a StartFailed has the code if the process died before it was ready
+        code = error.details.get("code") if isinstance(error, StartFailed) else None
     restarted = report.event == "started" and life is not None and life.why is Why.RESTART
     return Record(
         event="restarted" if restarted else report.event,
@@ -420,11 +417,6 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
         ready_s=None if life is None or life.ready_at is None else life.ready_at - life.began,
         up_s=None if life is None or exit is None else life.up_s,
     )
-
-
-def _code_of_start(report: Report) -> int | None:
-    """Return the exit code of a process that died before it was ready, else None."""
-    return report.error.details.get("code") if isinstance(report.error, StartFailed) else None
 
 
 def _detail(report: Report) -> str:

@@ -30,15 +30,12 @@ class Entries:
 
         An error is logged: the directory may be gone, with the system.
         """
-        registrars: list[str] = []
         try:
             for where, child in starting_with(spec, path):
                 self._mark_one(child, where, status, why)
-                if is_manager(child):
-                    registrars.append(where.rpartition("/")[2])
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
-        return registrars if status is Status.GONE else []
+        return registrars_of(spec, path) if status is Status.GONE else []
 
     def announce(self, spec: ChildSpec, path: str) -> None:
         """Mark the top of a tree, which has no supervisor, and all below it as STARTING.

@@ -34,11 +34,17 @@ from rr_actors.base.errors import (
     shown,
 )
 from rr_actors.supervision.core import child_calls
-from rr_actors.supervision.core.child_calls import Counts
+from rr_actors.supervision.core.child_calls import (
+    Change,
+    ChildUpdated,
+    Counts,
+    NoSupervisor,
+    Question,
+    SupervisorCall,
+)
 from rr_actors.supervision.core.rendering import describe_settings
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.supervision.core.state import ChildState, Decision, ExitSupervisor, Reply
-from rr_actors.supervision.core.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
 from rr_actors.supervision.event_history import Record, Records

@@ -36,8 +36,7 @@ from rr_actors.base.errors import (
     Unavailable,
     UsageError,
 )
-from rr_actors.supervision.core.backoff import Backoff
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.wire.name_service import Entry, Status, actor_key, open_state_dir, registrar_key
 from support import lives, quickly, wait_gone

@@ -19,6 +19,7 @@ import dataclasses
 from collections.abc import Hashable, Sequence
 from typing import Any, Literal, NamedTuple
 
+from msgspec import Struct
 from msgspec.structs import replace
 
 from rr_actors.base.checks import invalid
@@ -38,7 +39,49 @@ from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spe
 from rr_actors.supervision.core.state import Call, Child, Decision, Phase, Tree, Why
 from rr_actors.supervision.core.transition import Draft
 
-# -- calls ---------------------------------------------------------------------------------------------------------
+# -- messages ------------------------------------------------------------------------------------------------------
+
+
+class SupervisorCall(Struct, frozen=True):
+    """A message that only a supervisor understands. Handlers of other actors never get it."""
+
+
+class Change(SupervisorCall, frozen=True):
+    """A call that is answered when a child has started or stopped. The function `name` below decides it."""
+
+    name: Literal["start_child", "terminate_child", "restart_child", "delete_child", "update"]
+    subject: Any
+
+
+class Question(SupervisorCall, frozen=True):
+    """A call that is answered at once."""
+
+    name: Literal["which_children", "which_child", "count_children", "get_childspec", "history", "describe"]
+    id: str = ""
+
+
+class ChildUpdated(SupervisorCall, frozen=True):
+    """The child supervisor `id` has been given a new specification."""
+
+    id: str
+    spec: Supervisor
+
+
+class NoSupervisor(NotFound):
+    """The call went to an actor that is no supervisor."""
+
+
+def check_for_actor(message: object, actor: object) -> None:
+    """Check that a message to `actor`, which is no supervisor, is not a call for one.
+
+    Raises:
+        NoSupervisor: the message is one.
+    """
+    if isinstance(message, SupervisorCall):
+        raise NoSupervisor(f"it is no supervisor, but a child of class {type(actor).__qualname__}")
+
+
+# -- changes -------------------------------------------------------------------------------------------------------
 
 
 def start_child(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, now: float) -> Decision:

@@ -13,9 +13,8 @@ from msgspec.structs import replace
 
 from rr_actors.base.errors import StartFailed, UsageError, text_of
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.core.child_calls import replay
-from rr_actors.supervision.core.specs import RestartType
+from rr_actors.supervision.core.specs import Backoff, RestartType
 from rr_actors.supervision.core.state import (
     Child,
     Decision,
