@@ -98,11 +98,7 @@ class Workers:
             Unavailable: the workers are closed.
         """
         when_full = WAITS if patient else REFUSED
-        task = Task(fn, args, done, Context() if context is None else context, when_full, None, at_once)
-        if is_async(fn):
-            self._start_async(task)
-        else:
-            self._threads.start(task)
+        self._start(Task(fn, args, done, Context() if context is None else context, when_full, None, at_once))
 
     def serial(
         self,
@@ -126,10 +122,7 @@ class Workers:
                 return
             self._queues[key] = None  # the queue is made when a second call waits
         try:
-            if is_async(fn):
-                self._start_async(task)
-            else:
-                self._threads.start(task)
+            self._start(task)
         except Unavailable:
             self._start_following(key)  # other threads may have submitted more calls meanwhile
             raise
@@ -143,7 +136,10 @@ class Workers:
         self._threads.go()
 
     async def run(self, fn: Callable[..., Any], *args: Any, context: Context | None = None) -> Any:
-        """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop."""
+        """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop.
+
+        It gets a thread beyond the limit, too: the framework's own work must go on while callbacks take all threads.
+        """
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def done(result: Any, error: BaseException | None) -> None:
@@ -158,7 +154,7 @@ class Workers:
                 failure.__cause__ = error
                 future.set_exception(failure)
 
-        self.submit(fn, *args, done=done, context=context)
+        self._start(Task(fn, args, done, Context() if context is None else context, GETS_A_THREAD))
         return await future
 
     def in_thread(self, fn: Callable[..., Any], *args: Any, beyond_limit: bool = False) -> None:
@@ -221,6 +217,18 @@ class Workers:
         self._closed = True
         self._threads.abandon()
 
+    def _start(self, task: Task) -> None:
+        if not is_async(task.fn):
+            self._threads.start(task)
+            return
+        coroutine, error = task.call()
+        if error is None:
+            self._await_result(task, coroutine)
+        elif task.done is None and task.key is None:  # wrong arguments
+            raise error
+        else:
+            self._ended(task, None, error)
+
     # -- how calls end ---------------------------------------------------------------------------------------------
 
     def _ran(self, task: Task, result: Any, error: BaseException | None, idle: bool) -> None:
@@ -251,15 +259,6 @@ class Workers:
         return None if task.key is None else self._following(task.key)
 
     # -- the user loop ---------------------------------------------------------------------------------------------
-
-    def _start_async(self, task: Task) -> None:
-        coroutine, error = task.call()
-        if error is None:
-            self._await_result(task, coroutine)
-        elif task.done is None and task.key is None:  # wrong arguments
-            raise error
-        else:
-            self._ended(task, None, error)
 
     def _await_result(self, task: Task, coroutine: Coroutine[Any, Any, Any]) -> None:
         self.start_coroutine(coroutine, functools.partial(self._ended, task), task.context)

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
+from rr_actors.base.errors import Unavailable
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes import lifeline
 from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, record_of
@@ -271,7 +272,8 @@ class Supervision:
     async def _ended_with_all_below(self, life: Life, exit: Exit) -> None:
         """Wait until the processes below a dead supervisor are gone: their successors must not meet them."""
         pids = self._entries.pids_below(life.path)
-        await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
+        with contextlib.suppress(Unavailable):  # the machine gives no thread, but the child's end must be decided
+            await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
         if isinstance(life.run, ProcessRun):
             self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, exit)
