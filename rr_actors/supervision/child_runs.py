@@ -24,19 +24,7 @@ from rr_actors.base.errors import StartFailed
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes.process import Exited, Process, signal_name
 from rr_actors.runtime.time_limits import wait_while_running
-from rr_actors.supervision.control_channel import (
-    Channel,
-    Exiting,
-    Failed,
-    Ignored,
-    Message,
-    News,
-    Ping,
-    Pong,
-    Ready,
-    Start,
-    Stop,
-)
+from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.core.state import Exit, Reason, Report, StartChild, Why
 from rr_actors.supervision.event_history import Record
@@ -138,12 +126,12 @@ class ProcessRun:
         self._path = path
         self._on_died = on_died
         self._process: Process | None = None
-        self._channel: Channel | None = None
+        self._channel: control.Channel | None = None
         self._launching: asyncio.Task[None] | None = None
-        self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: the process died first
+        self._answer: asyncio.Future[control.Message | None] = loop.create_future()  # None: the process died first
         self._end: asyncio.Future[Exit] = loop.create_future()
         self._exited: Exited | None = None
-        self._exiting: Exiting | None = None
+        self._exiting: control.Exiting | None = None
         self._killed: Exit | None = None  # why the supervisor killed it
         self._silent = False  # the child's end of the channel is closed
         self._up = False
@@ -160,7 +148,7 @@ class ProcessRun:
         assert self._channel is not None
         if self._stopping:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
-        self._channel.send(Start())
+        self._channel.send(control.Start())
         if self.spec.heartbeat_s is not None and not self._end.done():
             self._heartbeat = Heartbeat(self.spec.heartbeat_s, self._ping, self._hung, self._ill)
         await wait_while_running(self._answer, timeout_s)
@@ -187,7 +175,7 @@ class ProcessRun:
             self._kill(Exit("killed", "brutal_kill"))
         elif self._channel is not None:
             limit_s = None if shutdown_s == "infinity" else float(shutdown_s)
-            self._channel.send(Stop(final))
+            self._channel.send(control.Stop(final))
             await wait_while_running(self._end, limit_s)
             if not self._end.done():
                 self._kill(Exit("killed", f"had not stopped after shutdown_s={limit_s:g} s"))
@@ -204,7 +192,7 @@ class ProcessRun:
         self.pid = process.pid
         try:
             process.watch(self._loop, self._died)
-            self._channel = await Channel.open(process.control, self._received, self._lost)
+            self._channel = await control.Channel.open(process.control, self._path, self._received, self._lost)
         except Exception:  # for instance, no descriptors are left
             self._process = self.pid = None
             process.close()
@@ -218,17 +206,17 @@ class ProcessRun:
         payload = pickling.dumps((self._node.info, self._path, spec))
         return self._node.spawner.start(ENTRY, payload, name=self._path)
 
-    async def _judge(self, answer: Message | None) -> bool:
+    async def _judge(self, answer: control.Message | None) -> bool:
         match answer:
-            case Ready():
+            case control.Ready():
                 self._up = True
                 if self._end.done():
                     self._loop.call_soon(self._tell)
                 return True
-            case Ignored():
+            case control.Ignored():
                 await self._leave()
                 return False
-            case Failed():
+            case control.Failed():
                 await self._leave()
                 raise await self._node.dispatcher.workers.run(_unpack, answer, self._path)
             case _:
@@ -247,17 +235,17 @@ class ProcessRun:
 
     # -- its messages ----------------------------------------------------------------------------------------------
 
-    def _received(self, message: Message) -> None:
+    def _received(self, message: control.Message) -> None:
         match message:
-            case Ready() | Ignored() | Failed():
+            case control.Ready() | control.Ignored() | control.Failed():
                 if not self._answer.done():
                     self._answer.set_result(message)
-            case Exiting():
+            case control.Exiting():
                 self._exiting = message
-            case Pong():
+            case control.Pong():
                 if self._heartbeat is not None:
                     self._heartbeat.heard(message.trouble)
-            case News():
+            case control.News():
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # resource events may be many
                     self._channel.rest()
@@ -274,7 +262,7 @@ class ProcessRun:
 
     def _ping(self) -> None:
         if self._channel is not None:
-            self._channel.send(Ping())
+            self._channel.send(control.Ping())
 
     def _hung(self) -> None:
         self._kill(Exit("abnormal", f"hung: its loop had not answered for {self.spec.heartbeat_s:g} s (heartbeat_s)"))
@@ -350,7 +338,7 @@ def _start_timeout_s(spec: ChildSpec, node: Node) -> float | None:
     return node.config.start_timeout_s
 
 
-def _unpack(failed: Failed, path: str) -> BaseException:
+def _unpack(failed: control.Failed, path: str) -> BaseException:
     """Return the exception of the child, with its traceback as a note. In a worker, since it runs users' code."""
     error: BaseException | None = None
     if failed.error:

@@ -79,11 +79,13 @@ class Channel(asyncio.Protocol):
     """One end of the socket pair, on the loop. Messages travel in frames (rr_actors/wire/frames.py).
 
     Args:
+        path: the child's, for the log.
         received: called with each message.
         lost: called once, when the other end is gone or has sent something that is no message.
     """
 
-    def __init__(self, received: Callable[[Message], None], lost: Callable[[], None]) -> None:
+    def __init__(self, path: str, received: Callable[[Message], None], lost: Callable[[], None]) -> None:
+        self._path = path
         self._received = received
         self._lost = lost
         self._reader: FrameReader[Message] = FrameReader(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
@@ -91,11 +93,13 @@ class Channel(asyncio.Protocol):
         self._resting: asyncio.TimerHandle | None = None
 
     @classmethod
-    async def open(cls, end: socket.socket, received: Callable[[Message], None], lost: Callable[[], None]) -> Channel:
+    async def open(
+        cls, end: socket.socket, path: str, received: Callable[[Message], None], lost: Callable[[], None]
+    ) -> Channel:
         """Return the channel on `end`, which belongs to it from now on."""
         end.setblocking(False)
         loop = asyncio.get_running_loop()
-        _, channel = await loop.create_unix_connection(lambda: cls(received, lost), sock=end)
+        _, channel = await loop.create_unix_connection(lambda: cls(path, received, lost), sock=end)
         return channel
 
     def send(self, message: Message) -> None:
@@ -138,7 +142,7 @@ class Channel(asyncio.Protocol):
         for message in self._reader.feed(data):
             self._received(message)
         if self._reader.error is not None or self._reader.ended:  # neither end sends a last, empty frame
-            logger.error("control channel: closed: %s", self._reader.error or "an empty frame")
+            logger.error("%s: control channel closed: %s", self._path, self._reader.error or "an empty frame")
             if self._transport is not None:
                 self._transport.abort()
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import socket
 from collections.abc import Callable
 from typing import Any
+
+import pytest
 
 import rr_actors as rr
 from rr_actors.supervision.control_channel import Channel, News
@@ -35,8 +38,8 @@ def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order()
             heard.append(message.event["number"])
             parent.rest()
 
-        parent = await Counting.open(there, received, lost.set)
-        child = await Channel.open(here, lambda message: None, lambda: None)
+        parent = await Counting.open(there, "root/a", received, lost.set)
+        child = await Channel.open(here, "root/a", lambda message: None, lambda: None)
         for number in range(1000):
             child.send(News({"number": number}))
             await asyncio.sleep(0)
@@ -49,6 +52,20 @@ def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order()
     asyncio.run(both())
 
     assert heard == list(range(1000))
+
+
+def test_a_damaged_channel_is_closed_with_the_name_of_its_child(caplog: pytest.LogCaptureFixture) -> None:
+    async def damage() -> None:
+        here, there = socket.socketpair()
+        lost = asyncio.Event()
+        await Channel.open(there, "root/cameras", lambda message: None, lost.set)
+        here.sendall(b"no frame of ours")
+        async with asyncio.timeout(5):
+            await lost.wait()
+        here.close()
+
+    asyncio.run(damage())
+    assert re.search("root/cameras: control channel closed: ", caplog.text)
 
 
 def test_what_a_killed_process_had_told_is_heard_before_its_end(start: Start, workshop: Workshop) -> None:
