@@ -147,11 +147,7 @@ class Dispatcher:
         return ident != self._ident and ident != self.workers.user_loop_ident
 
     def check_may_block(self, what: str) -> None:
-        """Check that the calling thread may wait.
-
-        Raises:
-            UsageError: on the loop's thread, or the user loop's.
-        """
+        """Raise UsageError on the loop's thread and the user loop's, which must not wait."""
         if self.is_loop_thread():
             raise UsageError(f"{what}: refused on the thread of the rr_actors loop, where it would hang the process")
         if not self.may_block():
@@ -295,7 +291,7 @@ def acquire(*, workers_limit: int | None = None) -> Dispatcher:
             _process.dispatcher = Dispatcher()
         _process.holders += 1
         if workers_limit is not None:
-            _process.dispatcher.workers.limit = workers_limit
+            _process.dispatcher.workers.set_limit(workers_limit)
         return _process.dispatcher
 
 

@@ -112,16 +112,13 @@ class UserLoop:
             self._loop.set_exception_handler(self._log_elsewhere)
             self._stop = asyncio.Event()
             ready()
-            runner.run(self._until_stopped())
+            runner.run(self._stop.wait())
 
     def _log_elsewhere(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         try:
             self._elsewhere(functools.partial(log_exception, loop, context))
         except Unavailable:
             logger.error("on the loop: %s", context.get("message"))
-
-    async def _until_stopped(self) -> None:
-        await self._stop.wait()
 
 
 def start_task(

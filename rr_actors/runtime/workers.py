@@ -184,13 +184,8 @@ class Workers:
         """The number of worker threads now, running or idle."""
         return len(self._threads)
 
-    @property
-    def limit(self) -> int:
-        """The most threads at a time."""
-        return self._threads.limit
-
-    @limit.setter
-    def limit(self, limit: int) -> None:
+    def set_limit(self, limit: int) -> None:
+        """Set the most threads at a time."""
         self._threads.limit = limit
 
     def close(self, timeout_s: float = 1.0) -> None:

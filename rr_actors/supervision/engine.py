@@ -84,11 +84,11 @@ class Supervision:
         self.history = History()
         self.tree = Tree.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
         self.final = False
+        self.entries = Entries(node.directory)
         self._node = node
         self._target_of = target_of
         self._on_started = on_started
         self._on_exit = on_exit
-        self._entries = Entries(node.directory)
         self._lives: dict[int, Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # of the last start of each child
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -105,8 +105,7 @@ class Supervision:
     def stop(self, *, final: bool) -> None:
         """Stop the children, also in the middle of a start, then call on_exit if that has not been done.
 
-        Args:
-            final: the children will not be started again.
+        `final`: they will not be started again.
         """
         self.final = self.final or final
         self.apply(restarts.decide_stop(self.tree, time.monotonic()))
@@ -136,15 +135,6 @@ class Supervision:
         child = find_child(self.tree, id)
         return self._lives.get(child.run) if child.state == "running" else None
 
-    def check_names(self, spec: ChildSpec) -> None:
-        """Check that a new child has no registrar that is in the system already, and no client's name.
-
-        Raises:
-            NameTaken: a registrar of that name exists.
-            InvalidSpec: the name is one of a client's.
-        """
-        self._entries.check_names(spec, self.path_of(spec.id))
-
     def path_of(self, id: str) -> str:
         """Return the child's path in the tree."""
         return f"{self.path}/{id}"
@@ -165,7 +155,7 @@ class Supervision:
                 life = Life(action, self.path_of(action.id))
                 self._lives[action.run] = life
                 self._specs[action.id] = action.spec
-                self._entries.mark(life.spec, life.path, Status.STARTING, self._deaths(life))
+                self.entries.mark(life.spec, life.path, Status.STARTING, self._deaths(life))
                 self._task(self._start(life, action.delay_s))
             case StopChild():
                 life = self._lives.get(action.run)
@@ -271,11 +261,11 @@ class Supervision:
 
     async def _ended_with_all_below(self, life: Life, exit: Exit) -> None:
         """Wait until the processes below a dead supervisor are gone: their successors must not meet them."""
-        pids = self._entries.pids_below(life.path)
+        pids = self.entries.pids_below(life.path)
         with contextlib.suppress(Unavailable):  # the machine gives no thread, but the child's end must be decided
             await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
         if isinstance(life.run, ProcessRun):
-            self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
+            self._retire(self.entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, exit)
 
     def _has_ended(self, life: Life, exit: Exit) -> None:
@@ -312,7 +302,7 @@ class Supervision:
             return
         if status is Status.STOPPED and self._ends_with_supervisor(report.id):
             status = Status.GONE
-        self._retire(self._entries.mark(spec, path, status, _why(record)))
+        self._retire(self.entries.mark(spec, path, status, _why(record)))
 
     def _deaths(self, life: Life) -> str:
         """Say how earlier runs died. The child's registrar names that in the errors of loads that they interrupted."""

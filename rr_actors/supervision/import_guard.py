@@ -57,11 +57,7 @@ def check_children_can_import(spec: ChildSpec, path: str, what: str) -> None:
 
 
 def check_no_child_imports(what: str) -> None:
-    """Check that this is no child process in the middle of an import: it would start one more system.
-
-    Raises:
-        UsageError: it is one.
-    """
+    """Raise UsageError in a child process that is in the middle of an import: it would start one more system."""
     if fork_server.inherited is not None and (now := in_progress()):
         modules = ", ".join(map(repr, sorted(now)))
         raise UsageError(

@@ -38,11 +38,7 @@ class Entries:
         return registrars_of(spec, path) if status is Status.GONE else []
 
     def announce(self, spec: ChildSpec, path: str) -> None:
-        """Mark the top of a tree, which has no supervisor, and all below it as STARTING.
-
-        Raises:
-            ConfigError: the directory cannot be written.
-        """
+        """Mark the top of a tree, which has no supervisor, and all below it as STARTING, or raise ConfigError."""
         for where, child in starting_with(spec, path):
             self._mark_one(child, where, Status.STARTING)
 
@@ -102,11 +98,7 @@ def is_manager(spec: ChildSpec) -> bool:
 
 
 def check_managers(names: list[str], where: str) -> None:
-    """Check that no manager has the name of a client's registrar. Those are given up when their application is killed.
-
-    Raises:
-        InvalidSpec: a manager has such a name.
-    """
+    """Raise InvalidSpec for a manager with a client's name: its registrar would be given up with its application."""
     for name in names:
         if name.startswith(CLIENTS):
             expected = f"a manager's id that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"

@@ -102,7 +102,7 @@ class SupervisorActor(LoopActor):
             place.path,
             place.node,
             target_of=target_of,
-            on_started=self._has_started,
+            on_started=lambda: self._all_up.set_result(None),
             on_exit=self._has_ended,
         )
         place.cut_short = lambda: self._supervision.stop(final=False)
@@ -134,9 +134,6 @@ class SupervisorActor(LoopActor):
 
     async def _after_stop(self, final: bool) -> None:
         await self._supervision.finish()
-
-    def _has_started(self) -> None:
-        self._all_up.set_result(None)
 
     def _has_ended(self, ending: ExitSupervisor) -> None:
         self._all_down.set_result(ending)
@@ -179,8 +176,7 @@ class SupervisorActor(LoopActor):
                 supervision.tree = child_calls.update_child(supervision.tree, id, spec)
                 return supervision.tree.spec
             case _:
-                what = f"expected a supervisor's call, got {shown(message)}"
-                raise UsageError(f"supervisor {supervision.path}: {what}")
+                raise UsageError(f"supervisor {supervision.path}: expected a supervisor's call, got {shown(message)}")
 
     def _change(self, change: Change, reply: pykka.Future[Any] | None) -> None:
         def answer(outcome: Reply) -> None:
@@ -204,10 +200,10 @@ class SupervisorActor(LoopActor):
             case "start_child":
                 if isinstance(subject, ChildSpec | Supervisor) and subject.id not in tree.children:
                     new = as_child_spec(subject)
+                    where = self._supervision.path_of(new.id)
                     if not isinstance(new.actor_class_or_manager, Supervisor):
-                        where = self._supervision.path_of(new.id)
                         check_hostable(new.actor_class_or_manager, where, new.args, new.kwargs)
-                    self._supervision.check_names(new)
+                    self._supervision.entries.check_names(new, where)
                 return child_calls.start_child(tree, subject, answer, now)
             case "terminate_child":
                 return child_calls.terminate_child(tree, subject, answer, now)

@@ -262,7 +262,10 @@ class Spawner:
                 self._server.close()
                 self._server = None
             if self._server is None:
-                self._server = fork_server.inherit_or_launch(self._preload, self._family)
+                server = fork_server.inherited
+                if server is None or not server.is_running():
+                    server = ForkServer.launch(self._preload, self._family)
+                self._server = server
             return self._server
 
     def _discard(self, server: ForkServer) -> None:

@@ -278,11 +278,7 @@ def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]
 
 
 def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, where: str) -> None:
-    """Check that `child` may be one of `supervisor`: none is significant where auto_shutdown is "never".
-
-    Raises:
-        InvalidSpec: of the field `where`.significant.
-    """
+    """Raise InvalidSpec, of the field `where`.significant, if `child` is significant and auto_shutdown is "never"."""
     if child.significant and supervisor.auto_shutdown == "never":
         expected = f"False for {child.id!r}, as auto_shutdown is 'never'"
         raise invalid(f"Supervisor {supervisor.id!r}", f"{where}.significant", expected, True)
