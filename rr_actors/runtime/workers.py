@@ -61,13 +61,11 @@ class Workers:
         *,
         limit: int = WORKERS_LIMIT,
         idle_s: float = IDLE_S,
-        name: str = "rr",
     ) -> None:
         self._deliver = deliver
         self._hand_over = deliver if hand_over is None else hand_over
-        self._name = name
         self._lock = threading.Lock()
-        self._threads = Threads(self._ran, self._go_on, deliver, limit=limit, idle_s=idle_s, name=name)
+        self._threads = Threads(self._ran, self._go_on, deliver, limit=limit, idle_s=idle_s)
         self._queues: dict[Hashable, deque[Task] | None] = {}
         self._user_loop: UserLoop | None = None
         self.user_loop_ident: int | None = None
@@ -171,7 +169,7 @@ class Workers:
             if self._user_loop is None:
                 try:
                     elsewhere = functools.partial(self.in_thread, beyond_limit=True)
-                    self._user_loop = UserLoop(f"{self._name}-user-loop", elsewhere)
+                    self._user_loop = UserLoop("rr-user-loop", elsewhere)
                 except Unavailable:
                     coroutine.close()
                     raise

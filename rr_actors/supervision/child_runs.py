@@ -22,6 +22,7 @@ from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
 from rr_actors.base.errors import StartFailed
 from rr_actors.base.steps import Steps
+from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.process import Exited, Process, signal_name
 from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision import control_channel as control
@@ -150,7 +151,8 @@ class ProcessRun:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
         self._channel.send(control.Start())
         if self.spec.heartbeat_s is not None and not self._end.done():
-            self._heartbeat = Heartbeat(self.spec.heartbeat_s, self._ping, self._hung, self._ill)
+            limit_s = self.spec.heartbeat_s
+            self._heartbeat = Heartbeat(limit_s, self._ping, lambda why: self._kill(Exit("abnormal", why)))
         await wait_while_running(self._answer, timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -264,12 +266,6 @@ class ProcessRun:
         if self._channel is not None:
             self._channel.send(control.Ping())
 
-    def _hung(self) -> None:
-        self._kill(Exit("abnormal", f"hung: its loop had not answered for {self.spec.heartbeat_s:g} s (heartbeat_s)"))
-
-    def _ill(self, trouble: str) -> None:
-        self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
-
     # -- its end ---------------------------------------------------------------------------------------------------
 
     def _kill(self, why: Exit) -> None:
@@ -279,7 +275,7 @@ class ProcessRun:
     def _died(self, exited: Exited) -> None:
         assert self._process is not None
         self._exited = exited
-        self._process.kill_group()
+        lifeline.kill_group(self._process.pid)
         if self._heartbeat is not None:
             self._heartbeat.stop()
         if self._channel is not None:

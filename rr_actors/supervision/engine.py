@@ -37,7 +37,7 @@ from rr_actors.supervision.core.state import (
     Tree,
 )
 from rr_actors.supervision.event_history import History, Record
-from rr_actors.supervision.name_entries import Entries, is_manager
+from rr_actors.supervision.name_entries import Entries, manager_of
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
 
@@ -292,7 +292,7 @@ class Supervision:
     def _record(self, report: Report) -> None:
         path, spec = self.path_of(report.id), self._specs.get(report.id)
         kind = "actor"
-        if spec is not None and (spec.type == "supervisor" or is_manager(spec)):
+        if spec is not None and (spec.type == "supervisor" or manager_of(spec) is not None):
             kind = "supervisor" if spec.type == "supervisor" else "manager"
         record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)

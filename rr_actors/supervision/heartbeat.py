@@ -30,18 +30,14 @@ class Heartbeat:
 
     Args:
         ping: sends the question.
-        hung: called if there was no answer for `limit_s`. That ends the heartbeat.
-        ill: called with the trouble if two answers in a row had one: it may pass by itself after the first. That
-            ends the heartbeat.
+        kill: called with the reason, at the end of the heartbeat: there was no answer for `limit_s`, or two answers in
+            a row had a trouble, which may pass by itself after the first.
     """
 
-    def __init__(
-        self, limit_s: float, ping: Callable[[], None], hung: Callable[[], None], ill: Callable[[str], None]
-    ) -> None:
+    def __init__(self, limit_s: float, ping: Callable[[], None], kill: Callable[[str], None]) -> None:
         self._limit_s = limit_s
         self._ping = ping
-        self._hung = hung
-        self._ill = ill
+        self._kill = kill
         self._answer: asyncio.Future[str] | None = None
         self._asking = asyncio.get_running_loop().create_task(self._ask())
 
@@ -64,11 +60,11 @@ class Heartbeat:
             if not answer.done():  # uvloop runs timers before it reads: an answer may be there, unread
                 await asyncio.sleep(self._limit_s * _LAST_LOOK)
             if not answer.done():
-                self._hung()
+                self._kill(f"hung: its loop had not answered for {self._limit_s:g} s (heartbeat_s)")
                 return
             trouble = answer.result()
             if trouble and was_ill:
-                self._ill(trouble)
+                self._kill(f"unhealthy: it {trouble} (heartbeat_s)")
                 return
             was_ill = bool(trouble)
 

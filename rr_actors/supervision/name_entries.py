@@ -44,11 +44,10 @@ class Entries:
 
     def _mark_one(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> None:
         self._directory.mark(actor_key(path), status, why)
-        what = spec.actor_class_or_manager
-        if isinstance(what, type) and issubclass(what, Manager):
+        if (manager := manager_of(spec)) is not None:
             name = path.rpartition("/")[2]
             if status is Status.STARTING:  # others find it by its classes: `load(Cameras.open_camera, ...)`
-                self._directory.put_classes(name, class_names(what))
+                self._directory.put_classes(name, class_names(manager))
             self._directory.mark(registrar_key(name), status, why)
 
     def check_names(self, spec: ChildSpec, path: str) -> None:
@@ -91,10 +90,10 @@ class Entries:
         return [manager.rpartition("/")[2] for manager in managers - static]
 
 
-def is_manager(spec: ChildSpec) -> bool:
-    """Return whether the child is a Manager, which has a registrar."""
+def manager_of(spec: ChildSpec) -> type[Manager] | None:
+    """Return the child's class if it is a Manager, which has a registrar."""
     what = spec.actor_class_or_manager
-    return isinstance(what, type) and issubclass(what, Manager)
+    return what if isinstance(what, type) and issubclass(what, Manager) else None
 
 
 def check_managers(names: list[str], where: str) -> None:
@@ -107,4 +106,4 @@ def check_managers(names: list[str], where: str) -> None:
 
 def registrars_of(spec: ChildSpec, path: str) -> list[str]:
     """Return the registrars of the child at `path` and of all that start with it. They are named like the managers."""
-    return [where.rpartition("/")[2] for where, child in starting_with(spec, path) if is_manager(child)]
+    return [where.rpartition("/")[2] for where, child in starting_with(spec, path) if manager_of(child) is not None]

@@ -727,12 +727,12 @@ def test_a_call_of_a_key_that_comes_while_the_first_is_refused_ends_too(
 
 
 def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    workers = Workers(lambda done, result, error: done(result, error), name="slow")
+    workers = Workers(lambda done, result, error: done(result, error))
     being_started, go_on = threading.Event(), threading.Event()
     start = threading.Thread.start
 
     def start_slowly(thread: threading.Thread) -> None:
-        if thread.name.startswith("slow-worker"):
+        if thread.name.startswith("rr-worker"):
             being_started.set()
             assert go_on.wait(10.0)
         start(thread)

@@ -103,10 +103,6 @@ class Process:
             return False
         return True
 
-    def kill_group(self) -> None:
-        """SIGKILL the rest of the process group, after the death of the process."""
-        lifeline.kill_group(self.pid)
-
     def close(self) -> None:
         """Kill the process if it lives, and close its descriptors. On the loop's thread if it is watched."""
         self.kill()
