@@ -39,6 +39,7 @@ class Dispatcher:
         loop: the event loop.
         workers: the workers that run user code.
         closed: whether calls are refused: the loop has ended, or belongs to the process that this one was forked from.
+        no_loop: the reason for that, once `closed` is true.
         more: on the loop: whether other calls follow the one that runs.
     """
 
@@ -51,7 +52,7 @@ class Dispatcher:
         self._woken_for = -1  # the turn for which the loop was woken last
         self.closed = False
         self.more = False
-        self._no_loop = "the loop of rr_actors has ended in this process"
+        self.no_loop = "the loop of rr_actors has ended in this process"
         try:
             self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         except OSError as error:
@@ -75,7 +76,7 @@ class Dispatcher:
             Unavailable: the dispatcher is closed.
         """
         if self.closed:
-            raise Unavailable(self._no_loop)
+            raise Unavailable(self.no_loop)
         self._calls.append((fn, args))
         woken_for = self._woken_for
         turn = self._turn
@@ -87,7 +88,7 @@ class Dispatcher:
             try:
                 self.loop.call_soon_threadsafe(self._drain)
             except RuntimeError as error:
-                raise Unavailable(self._no_loop) from error
+                raise Unavailable(self.no_loop) from error
         # Last: if this thread is interrupted before, the next call wakes the loop, perhaps once more than needed.
         self._woken_for = turn
 
@@ -101,7 +102,7 @@ class Dispatcher:
             self.call(fn, *args)
             return
         if self.closed:
-            raise Unavailable(self._no_loop)
+            raise Unavailable(self.no_loop)
         self._calls.append((fn, args))
         turn = self._turn
         os.eventfd_write(self._bell, 1)
@@ -132,10 +133,6 @@ class Dispatcher:
             coroutine.close()
             raise
         return Course(self, coroutine)
-
-    def no_loop(self) -> Unavailable:
-        """Return the error for a call that the loop will not run."""
-        return Unavailable(self._no_loop)
 
     def is_loop_thread(self) -> bool:
         """Return whether the calling thread is the loop's."""
@@ -175,7 +172,7 @@ class Dispatcher:
     def _abandon(self) -> None:
         """Refuse everything, in a forked child: it does not have the threads, and must not wait for them."""
         self.closed = True
-        self._no_loop = f"the loop of rr_actors {FORKED}"
+        self.no_loop = f"the loop of rr_actors {FORKED}"
         self._ident = 0  # a thread of the child may have the same id
         self.workers.abandon()
 
@@ -232,7 +229,7 @@ class Course(Generic[T]):
         except RuntimeError as error:
             running.close()
             self._coroutine.close()
-            raise self._dispatcher.no_loop() from error
+            raise Unavailable(self._dispatcher.no_loop) from error
         try:
             return future.result(timeout_s)
         except concurrent.futures.CancelledError as error:

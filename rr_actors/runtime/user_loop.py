@@ -81,17 +81,16 @@ class UserLoop:
             user's class may do anything in its __str__.
     """
 
-    def __init__(self, name: str, elsewhere: Callable[[Callable[[], object]], None]) -> None:
+    def __init__(self, elsewhere: Callable[[Callable[[], object]], None]) -> None:
         self._tasks: set[asyncio.Task[None]] = set()
         self._elsewhere = elsewhere
-        self.thread = start_loop_thread(self._run, name)
+        self.thread = start_loop_thread(self._run, "rr-user-loop")
 
     def start(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run a coroutine as a task in `context`; `done` is called in the loop's thread."""
         try:
             self._loop.call_soon_threadsafe(self._spawn, coroutine, done, context)
         except RuntimeError as error:
-            coroutine.close()
             raise Unavailable("the user loop is closed: this process is stopping") from error
 
     def stop(self) -> None:

@@ -162,20 +162,18 @@ class Workers:
 
     def start_coroutine(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run the coroutine as a task on the user loop; `done` is called in that loop's thread."""
-        with self._lock:
-            if self._closed:
-                coroutine.close()
-                raise Unavailable("the workers are closed: this process is stopping")
-            if self._user_loop is None:
-                try:
-                    elsewhere = functools.partial(self.in_thread, beyond_limit=True)
-                    self._user_loop = UserLoop("rr-user-loop", elsewhere)
-                except Unavailable:
-                    coroutine.close()
-                    raise
-                self.user_loop_ident = self._user_loop.thread.ident
-            user_loop = self._user_loop
-        user_loop.start(coroutine, done, context)
+        try:
+            with self._lock:
+                if self._closed:
+                    raise Unavailable("the workers are closed: this process is stopping")
+                if self._user_loop is None:
+                    self._user_loop = UserLoop(functools.partial(self.in_thread, beyond_limit=True))
+                    self.user_loop_ident = self._user_loop.thread.ident
+                user_loop = self._user_loop
+            user_loop.start(coroutine, done, context)
+        except Unavailable:
+            coroutine.close()
+            raise
 
     @property
     def threads(self) -> int:

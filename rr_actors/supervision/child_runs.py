@@ -8,6 +8,7 @@ process and its process group are dead.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -40,6 +41,8 @@ _LAST_WORDS_S = 0.05  # the longest wait for a dead process's last messages
 _LEAVE_S = 2.0  # the longest time from a process's last answer to its end
 
 OnEnd = Callable[[Exit], None]
+Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
+"""The class to start for a child in this process, its args and its kwargs."""
 
 
 class Run(Protocol):
@@ -71,21 +74,9 @@ class Run(Protocol):
 
 
 class LocalRun:
-    """The Run of a child in this process.
+    """The Run of a child in this process. It calls `on_end` if the child becomes ready and then ends without stop()."""
 
-    Args:
-        target: the child's class, args and kwargs.
-        on_end: called if the child has become ready and then ends without stop().
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        spec: ChildSpec,
-        path: str,
-        target: tuple[type[Any], Sequence[Any], Mapping[str, Any]],
-        on_end: OnEnd,
-    ) -> None:
+    def __init__(self, node: Node, spec: ChildSpec, path: str, target: Target, on_end: OnEnd) -> None:
         self.pid: int | None = os.getpid()
         self._timeout_s = _start_timeout_s(spec, node)
         self._target = target
@@ -338,10 +329,8 @@ def _unpack(failed: control.Failed, path: str) -> BaseException:
     """Return the exception of the child, with its traceback as a note. In a worker, since it runs users' code."""
     error: BaseException | None = None
     if failed.error:
-        try:
+        with contextlib.suppress(Exception):  # its class cannot be imported here: its text and traceback must do
             error = pickling.loads(failed.error)
-        except Exception:  # its class cannot be imported here: its text and traceback must do
-            error = None
     if not isinstance(error, BaseException):
         error = StartFailed(f"{path}: {failed.text}", id=path)
     if failed.traceback:

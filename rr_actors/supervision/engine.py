@@ -12,13 +12,13 @@ import functools
 import logging
 import os
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes import lifeline
-from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, record_of
+from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, Target, record_of
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.child_calls import find_child
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
@@ -54,8 +54,6 @@ FENCE_S = 1.0
 
 DEATHS = 3
 """How many deaths of earlier runs a child hears of: as many as a load may cause before it fails."""
-
-Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 
 _STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
 

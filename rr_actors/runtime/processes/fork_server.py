@@ -115,7 +115,7 @@ class ForkServer:
             theirs.close()  # otherwise the pipe would not show the death of the server
             if not lifeline.is_readable(status_r, deadline - time.monotonic()):
                 raise TimeoutError("the fork server did not answer in time")
-            pid = _read_signed(status_r)
+            pid = read_signed(status_r)
             on_failure.pop_all()
         self._has_answered = True
         return Forked(pid, status_r, data_w)
@@ -185,7 +185,7 @@ def _tracker() -> int | None:
     return None if tracker is None else vars(tracker)["_resource_tracker"]._fd
 
 
-def _read_signed(fd: int) -> int:
+def read_signed(fd: int) -> int:
     """Read a number from a pipe; raise EOFError if the writing process has ended before. Blocks."""
     data = b""
     while len(data) < _SIGNED.size:
@@ -222,14 +222,6 @@ inherited: ForkServer | None = None
 """The server that forked this process, or that this process is; None in a process that rr_actors has not made. Set by
 rr_actors/runtime/processes/child_bootstrap.py.
 """
-
-
-def read_code(status: int) -> int | None:
-    """Return the exit code in a status pipe, -N for signal N; None if the server ended before. Blocks."""
-    try:
-        return _read_signed(status)
-    except (EOFError, OSError):
-        return None
 
 
 # -- the launch message: written by the parent, run by the child -----------------------------------------------------

@@ -153,7 +153,10 @@ class Process:
             self._loop.remove_reader(fd)
 
     def _collect(self, timeout_s: float = 0.0) -> None:
-        code = fork_server.read_code(self._status) if lifeline.is_readable(self._status, timeout_s) else None
+        code = None
+        if lifeline.is_readable(self._status, timeout_s):
+            with contextlib.suppress(EOFError, OSError):  # the fork server has ended before
+                code = fork_server.read_signed(self._status)
         self.exited = Exited(code, self._dead_at or time.monotonic())
 
 

@@ -130,13 +130,9 @@ def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decisi
     Error: InvalidSpec, with nothing changed, for another id, or a change from or to simple_one_for_one.
     """
     draft = Draft(tree, now)
-    try:
-        _check_update(tree, spec)
-    except InvalidSpec as error:
+    error = _update_error(tree, spec) or (None if draft.alive else draft.gone())
+    if error is not None:
         draft.reply([caller], error=error)
-        return draft.done()
-    if not draft.alive:
-        draft.reply([caller], error=draft.gone())
         return draft.done()
     new = spec.child_specs
     if tree.dynamic:
@@ -344,16 +340,17 @@ def _wrong_type(who: str, field: str, expected: str, got: object) -> InvalidSpec
     return InvalidSpec(text, field=field, expected=expected, got=got)
 
 
-def _check_update(tree: Tree, spec: object) -> None:
+def _update_error(tree: Tree, spec: object) -> InvalidSpec | None:
     who = f"update of {tree.path}"
     if not isinstance(spec, Supervisor):
-        raise invalid(who, "spec", "a Supervisor", spec)
+        return invalid(who, "spec", "a Supervisor", spec)
     if spec.id != tree.spec.id:
-        raise invalid(who, "id", f"{tree.spec.id!r}, its id", spec.id)
+        return invalid(who, "id", f"{tree.spec.id!r}, its id", spec.id)
     if (spec.strategy == "simple_one_for_one") != tree.dynamic:
         expected = "simple_one_for_one" if tree.dynamic else "any but simple_one_for_one"
         text = (
             f"{who}: strategy: expected {expected} (children of the other kind cannot be kept), "
             f"got {shown(spec.strategy)}"
         )
-        raise InvalidSpec(text, field="strategy", expected=expected, got=spec.strategy)
+        return InvalidSpec(text, field="strategy", expected=expected, got=spec.strategy)
+    return None
