@@ -18,7 +18,7 @@ from typing import Any
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable, text_of
-from rr_actors.runtime import interpreter
+from rr_actors.runtime import event_loop, interpreter
 from rr_actors.runtime.processes.process import Inherited
 from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
@@ -44,8 +44,8 @@ def main(inherited: Inherited) -> int:
     info, path, spec = pickling.loads(inherited.payload)
     interpreter.name_process(f"rr: {path.rpartition('/')[2]}")
     sys.breakpointhook = functools.partial(_break, path)
+    dispatcher = event_loop.acquire()  # to the end of the process: its last messages are sent after its node has ended
     child = ChildProcess(inherited, info, path, spec)
-    dispatcher = child.node.dispatcher
 
     signal.signal(signal.SIGTERM, lambda _signal, _frame: dispatcher.call(child.terminate))
     return dispatcher.run(child.live())
@@ -155,8 +155,7 @@ class ChildProcess:
             logger.exception("%s: closing", self._path)
         if self._channel is not None:
             channel, self._channel = self._channel, None  # log records go to standard error from now on
-            channel.close()
-            await asyncio.sleep(0)
+            await channel.finish(_CLOSE_S)
 
     # -- messages --------------------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ are decoded by type. Pickled values of users stay bytes here; a worker unpickles
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from collections.abc import Callable
@@ -91,6 +92,7 @@ class Channel(asyncio.Protocol):
         self._reader: FrameReader[Message] = FrameReader(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
         self._transport: asyncio.Transport | None = None
         self._resting: asyncio.TimerHandle | None = None
+        self._gone = asyncio.Event()
 
     @classmethod
     async def open(
@@ -133,6 +135,17 @@ class Channel(asyncio.Protocol):
         if self._transport is not None:
             self._transport.close()
 
+    async def finish(self, patience_s: float) -> None:
+        """Close the channel, and wait until all messages are sent, or the other end reads nothing for `patience_s`."""
+        self.close()
+        while (transport := self._transport) is not None:
+            unsent = transport.get_write_buffer_size()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(patience_s):
+                    await self._gone.wait()
+            if transport.get_write_buffer_size() == unsent:
+                return
+
     # -- asyncio.Protocol ------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -148,6 +161,7 @@ class Channel(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
+        self._gone.set()
         self.go_on()
         lost, self._lost = self._lost, _nobody
         lost()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import re
 import signal
@@ -18,6 +19,15 @@ from support import Calls, Workshop, eventually
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
+
+
+class Talkative(rr.Manager):
+    """Logs ten megabytes, and then cannot start."""
+
+    def on_start(self) -> None:
+        for _ in range(100):
+            logging.getLogger("talkative").warning("x" * 100_000)
+        raise ValueError("no such device")
 
 
 def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order() -> None:
@@ -66,6 +76,26 @@ def test_a_damaged_channel_is_closed_with_the_name_of_its_child(caplog: pytest.L
 
     asyncio.run(damage())
     assert re.search("root/cameras: control channel closed: ", caplog.text)
+
+
+def test_a_child_that_cannot_start_sends_its_error_after_all_that_it_had_logged(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(rr.StartFailed, match="no such device"):
+        start(rr.ChildSpec(Talkative, id="talkative"))
+    assert len([record for record in caplog.records if record.name == "talkative"]) == 100
+
+
+def test_a_channel_whose_other_end_reads_nothing_is_given_up() -> None:
+    async def finish() -> None:
+        here, there = socket.socketpair()
+        channel = await Channel.open(here, "root/a", lambda message: None, lambda: None)
+        channel.send(News({"text": "x" * 10_000_000}))
+        async with asyncio.timeout(5):
+            await channel.finish(0.1)
+        there.close()
+
+    asyncio.run(finish())
 
 
 def test_what_a_killed_process_had_told_is_heard_before_its_end(start: Start, workshop: Workshop) -> None:
