@@ -15,7 +15,7 @@ import signal
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 from msgspec.structs import replace
 
@@ -45,36 +45,12 @@ Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 """The class to start for a child in this process, its args and its kwargs."""
 
 
-class Run(Protocol):
-    """One run of one child. All methods are called on the loop."""
-
-    pid: int | None
-    """The id of its process, once it has one."""
-
-    async def start(self) -> bool:
-        """Start the child. Return True once it is ready, False if its on_start returned IGNORE. Not after stop().
-
-        Raises:
-            StartFailed: the child did not become ready, or was stopped first.
-            BaseException: the error of its on_start.
-        """
-        ...
-
-    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
-        """Stop the child, also during its start: ask, wait for shutdown_s, kill. Call it once.
-
-        Args:
-            final: the child will not be started again.
-        """
-        ...
-
-    def kill(self) -> None:
-        """Kill or abandon the child at once."""
-        ...
-
-
 class LocalRun:
-    """The Run of a child in this process. It calls `on_end` if the child becomes ready and then ends without stop()."""
+    """The Run of a child in this process, with the methods of ProcessRun. It is abandoned if it cannot be stopped.
+
+    Args:
+        on_end: called if the child has become ready and then ends without stop().
+    """
 
     def __init__(self, node: Node, spec: ChildSpec, path: str, target: Target, on_end: OnEnd) -> None:
         self.pid: int | None = os.getpid()
@@ -88,7 +64,6 @@ class LocalRun:
         return await self._hosted.start(args, kwargs, self._timeout_s)
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
-        """Stop the child; abandon it if it does not stop in time."""
         return _exit_of(await self._hosted.stop(shutdown_s, final=final))
 
     def kill(self) -> None:
@@ -111,7 +86,7 @@ class ProcessRun:
 
     def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
         self._loop = loop = asyncio.get_running_loop()
-        self.pid: int | None = None
+        self.pid: int | None = None  # once it has one
         self.managers: set[str] = set()  # the paths of those that run below a supervisor
         self._node = node
         self.spec = spec
@@ -133,6 +108,12 @@ class ProcessRun:
     # -- Run -------------------------------------------------------------------------------------------------------
 
     async def start(self) -> bool:
+        """Start the child. Return True once it is ready, False if its on_start returned IGNORE. Not after stop().
+
+        Raises:
+            StartFailed: the child did not become ready, or was stopped first.
+            BaseException: the error of its on_start.
+        """
         timeout_s = _start_timeout_s(self.spec, self._node)
         self.lay_out()
         assert self._launching is not None
@@ -156,6 +137,10 @@ class ProcessRun:
             self._launching = self._loop.create_task(self._launch())
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
+        """Stop the child, also during its start: ask, wait for shutdown_s, kill. Call it once.
+
+        `final`: the child will not be started again.
+        """
         self._stopping = True
         if self._heartbeat is not None:
             self._heartbeat.stop()
@@ -175,6 +160,7 @@ class ProcessRun:
         return await asyncio.shield(self._end)
 
     def kill(self) -> None:
+        """Kill the child at once."""
         self._kill(Exit("killed", "killed by its supervisor"))
 
     # -- its start -------------------------------------------------------------------------------------------------
@@ -317,6 +303,10 @@ class ProcessRun:
         if code is None:
             return Exit("killed", "its exit code is unknown, as the fork server was killed, too")
         return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
+
+
+Run = LocalRun | ProcessRun
+"""One run of one child. All methods are called on the loop."""
 
 
 def _start_timeout_s(spec: ChildSpec, node: Node) -> float | None:
