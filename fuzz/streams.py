@@ -161,7 +161,7 @@ class _Line:
 def _feed_control(data: bytes) -> None:
     received: list[Any] = []
     line = _Line()
-    channel = control_channel.Channel(received.append, lambda: None)
+    channel = control_channel.Channel("root/a", received.append, lambda: None)
     channel.connection_made(cast("Any", line))
     for piece in pieces(data[1:], data[0] if data else 0):
         channel.data_received(piece)

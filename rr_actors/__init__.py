@@ -71,9 +71,8 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
     from rr_actors.registrar.model.rows import State
     from rr_actors.registrar.queries import Query, ResourceInfo
     from rr_actors.registrar.registrar import Registrar
-    from rr_actors.supervision.core.backoff import Backoff
     from rr_actors.supervision.core.rendering import Tree, render
-    from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+    from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
     from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
     from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
     from rr_actors.system.event_subscribers import (

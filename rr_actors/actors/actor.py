@@ -6,7 +6,7 @@ from typing import Any
 
 from rr_actors.actors.lifecycle import BaseActor
 from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, Reason
-from rr_actors.supervision.core.supervisor_calls import check_for_actor
+from rr_actors.supervision.core.child_calls import check_for_actor
 
 __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit", "Reason"]
 

@@ -74,8 +74,8 @@ class Backlog(Generic[_T]):
             self._is_running = False
             raise
 
-    def _hear_all(self) -> Coroutine[Any, Any, None] | None:
-        """Call the callback for each item. If it gives a coroutine, return one that awaits it and then continues."""
+    def _hear_all(self) -> None:
+        """Call the callback for each item. If it gives a coroutine, go on when that has ended."""
         while True:
             what: _T | None = None
             with self._lock:
@@ -83,7 +83,7 @@ class Backlog(Generic[_T]):
                 if missed == 0:
                     if not self._waiting:
                         self._is_running = False
-                        return None
+                        return
                     what = self._waiting.popleft()
             try:
                 hears = functools.partial(self._hear, cast("_T", what))
@@ -92,12 +92,18 @@ class Backlog(Generic[_T]):
                 self._failed(error, what)
                 continue
             if is_coroutine(result):
-                return self._await(result, what)
+                self._await(result, what)
+                return
 
-    async def _await(self, coroutine: Coroutine[Any, Any, Any], what: _T | None) -> None:
+    def _await(self, coroutine: Coroutine[Any, Any, Any], what: _T | None) -> None:
+        def done(_result: Any, error: BaseException | None) -> None:
+            if error is not None:
+                self._failed(error, what)
+            with contextlib.suppress(Unavailable):  # this process is stopping
+                self._begin()
+
         try:
-            await coroutine
-        except BaseException as error:
+            self._workers.start_coroutine(coroutine, done, Context())
+        except Unavailable as error:  # the next put() tries again
             self._failed(error, what)
-        with contextlib.suppress(Unavailable):  # this process is stopping
-            self._begin()
+            self._is_running = False

@@ -8,12 +8,11 @@ the user loop they would hold up all other coroutines.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
-import threading
 import traceback
 from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -98,21 +97,10 @@ def described(
 
 async def _raised(error: BaseException, describe: Callable[[BaseException], Any]) -> Raised:
     """Describe a coroutine's exception in a worker; by its class alone if its text hangs."""
-    loop = asyncio.get_running_loop()
-    described: asyncio.Future[Raised] = loop.create_future()
-
-    def take(raised: Raised) -> None:
-        if not described.done():
-            described.set_result(raised)
-
-    def tell(raised: Raised) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
-            loop.call_soon_threadsafe(take, raised)
-
-    if not _describe_elsewhere(error, describe, tell):
+    if (coming := _described_elsewhere(error, describe)) is None:
         return Raised(error, describe)
-    await asyncio.wait((described,), timeout=TEXT_LIMIT_S)
-    return described.result() if described.done() else Raised(_unspoken(error), describe)
+    await asyncio.wait((asyncio.wrap_future(coming),), timeout=TEXT_LIMIT_S)
+    return coming.result() if coming.done() else Raised(_unspoken(error), describe)
 
 
 def raised_by(error: BaseException) -> Raised:
@@ -123,31 +111,25 @@ def raised_by(error: BaseException) -> Raised:
     process = event_loop.current()
     if process is None or not process.may_block():
         return Raised(error)
-    found: list[Raised] = []
-    described = threading.Event()
-
-    def take(raised: Raised) -> None:
-        found.append(raised)
-        described.set()
-
-    if not _describe_elsewhere(error, _nothing_more, take):
+    if (coming := _described_elsewhere(error, _nothing_more)) is None:
         return Raised(error)
-    described.wait(TEXT_LIMIT_S)
-    return found[0] if found else Raised(_unspoken(error))
+    try:
+        return coming.result(TEXT_LIMIT_S)
+    except TimeoutError:
+        return Raised(_unspoken(error))
 
 
-def _describe_elsewhere(
-    error: BaseException, describe: Callable[[BaseException], Any], take: Callable[[Raised], None]
-) -> bool:
-    """Let a worker describe the error and call `take` with the result; return False if no worker is left."""
+def _described_elsewhere(error: BaseException, describe: Callable[[BaseException], Any]) -> Future[Raised] | None:
+    """Let a worker describe the error, and return a future for the result; None if no worker is left."""
     process = event_loop.current()
     if process is None:
-        return False
+        return None
+    coming: Future[Raised] = Future()
     try:
-        process.workers.in_thread(lambda: take(Raised(error, describe)), beyond_limit=True)
+        process.workers.in_thread(lambda: coming.set_result(Raised(error, describe)), beyond_limit=True)
     except Unavailable:
-        return False
-    return True
+        return None
+    return coming
 
 
 def _unspoken(error: BaseException) -> TimeoutError:

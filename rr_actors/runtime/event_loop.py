@@ -39,6 +39,7 @@ class Dispatcher:
         loop: the event loop.
         workers: the workers that run user code.
         closed: whether calls are refused: the loop has ended, or belongs to the process that this one was forked from.
+        no_loop: the reason for that, once `closed` is true.
         more: on the loop: whether other calls follow the one that runs.
     """
 
@@ -51,7 +52,7 @@ class Dispatcher:
         self._woken_for = -1  # the turn for which the loop was woken last
         self.closed = False
         self.more = False
-        self._no_loop = "the loop of rr_actors has ended in this process"
+        self.no_loop = "the loop of rr_actors has ended in this process"
         try:
             self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         except OSError as error:
@@ -75,7 +76,7 @@ class Dispatcher:
             Unavailable: the dispatcher is closed.
         """
         if self.closed:
-            raise Unavailable(self._no_loop)
+            raise Unavailable(self.no_loop)
         self._calls.append((fn, args))
         woken_for = self._woken_for
         turn = self._turn
@@ -87,7 +88,7 @@ class Dispatcher:
             try:
                 self.loop.call_soon_threadsafe(self._drain)
             except RuntimeError as error:
-                raise Unavailable(self._no_loop) from error
+                raise Unavailable(self.no_loop) from error
         # Last: if this thread is interrupted before, the next call wakes the loop, perhaps once more than needed.
         self._woken_for = turn
 
@@ -101,7 +102,7 @@ class Dispatcher:
             self.call(fn, *args)
             return
         if self.closed:
-            raise Unavailable(self._no_loop)
+            raise Unavailable(self.no_loop)
         self._calls.append((fn, args))
         turn = self._turn
         os.eventfd_write(self._bell, 1)
@@ -133,10 +134,6 @@ class Dispatcher:
             raise
         return Course(self, coroutine)
 
-    def no_loop(self) -> Unavailable:
-        """Return the error for a call that the loop will not run."""
-        return Unavailable(self._no_loop)
-
     def is_loop_thread(self) -> bool:
         """Return whether the calling thread is the loop's."""
         return threading.get_ident() == self._ident
@@ -147,11 +144,7 @@ class Dispatcher:
         return ident != self._ident and ident != self.workers.user_loop_ident
 
     def check_may_block(self, what: str) -> None:
-        """Check that the calling thread may wait.
-
-        Raises:
-            UsageError: on the loop's thread, or the user loop's.
-        """
+        """Raise UsageError on the loop's thread and the user loop's, which must not wait."""
         if self.is_loop_thread():
             raise UsageError(f"{what}: refused on the thread of the rr_actors loop, where it would hang the process")
         if not self.may_block():
@@ -179,7 +172,7 @@ class Dispatcher:
     def _abandon(self) -> None:
         """Refuse everything, in a forked child: it does not have the threads, and must not wait for them."""
         self.closed = True
-        self._no_loop = f"the loop of rr_actors {FORKED}"
+        self.no_loop = f"the loop of rr_actors {FORKED}"
         self._ident = 0  # a thread of the child may have the same id
         self.workers.abandon()
 
@@ -236,7 +229,7 @@ class Course(Generic[T]):
         except RuntimeError as error:
             running.close()
             self._coroutine.close()
-            raise self._dispatcher.no_loop() from error
+            raise Unavailable(self._dispatcher.no_loop) from error
         try:
             return future.result(timeout_s)
         except concurrent.futures.CancelledError as error:
@@ -295,7 +288,7 @@ def acquire(*, workers_limit: int | None = None) -> Dispatcher:
             _process.dispatcher = Dispatcher()
         _process.holders += 1
         if workers_limit is not None:
-            _process.dispatcher.workers.limit = workers_limit
+            _process.dispatcher.workers.set_limit(workers_limit)
         return _process.dispatcher
 
 
@@ -322,10 +315,29 @@ def check_may_block(what: str) -> None:
         dispatcher.check_may_block(what)
 
 
-def _forget_in_child() -> None:
+# A forked process inherits its parent's running systems, and leaves them to the parent. It shares the sockets and the
+# epoll of the loop with the parent: closing or freeing them in the child disturbs the parent.
+
+_running: weakref.WeakKeyDictionary[Any, Callable[[Any], object]] = weakref.WeakKeyDictionary()
+_left: list[object] = []
+
+
+def leave_in_children(running: T, leave: Callable[[T], object]) -> None:
+    """Call leave(running) in each process that is forked from now on, where its result is never freed."""
+    _running[running] = leave
+
+
+def forget_in_children(running: object) -> None:
+    """End leave_in_children() for an object that has ended."""
+    _running.pop(running, None)
+
+
+def _leave_all_in_child() -> None:
     if _process.dispatcher is not None:
         _process.dispatcher._abandon()  # pyright: ignore[reportPrivateUsage]  # same file, of the same process
     _process.__init__()
+    _left.extend([leave(running) for running, leave in list(_running.items())])
+    _running.clear()
 
 
 def _close_at_exit() -> None:
@@ -334,5 +346,5 @@ def _close_at_exit() -> None:
         _process.dispatcher.close(0.0)  # its holders may still release it
 
 
-os.register_at_fork(after_in_child=_forget_in_child)
+os.register_at_fork(after_in_child=_leave_all_in_child)
 interpreter.at_exit(_close_at_exit)

@@ -44,14 +44,6 @@ def left_alone() -> Generator[None]:
                 gc.enable()
 
 
-def set_aside() -> None:
-    """Exclude the present objects from collections: the modules, which stay until the process ends.
-
-    A collection of this package's modules alone takes a tenth of a fork server's start.
-    """
-    gc.freeze()
-
-
 def share() -> None:
     """Let forked processes share the memory of this one's present objects: no collection touches them."""
     global _shared

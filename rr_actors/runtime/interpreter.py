@@ -28,9 +28,8 @@ _AGAIN_S = 0.00001
 
 class _Process:
     def __init__(self) -> None:
-        self.ours = False
         self.interval_s = _SWITCH_S  # the interval outside of hurried(): a callback may have set another
-        self.hurried_s = 0.0  # _AGAIN_S as Python rounds it
+        self.hurried_s = 0.0  # _AGAIN_S as Python rounds it; 0 in a process of the user's
 
 
 _process = _Process()
@@ -41,7 +40,6 @@ def begin() -> None:
     sys.setswitchinterval(_AGAIN_S)
     _process.hurried_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
-    _process.ours = True
 
 
 def name_process(name: str) -> None:
@@ -52,7 +50,7 @@ def name_process(name: str) -> None:
 
 def hurried(work: Callable[[A], object], argument: A) -> None:
     """Call work(argument), which releases Python's lock for a moment, and get the lock back soon. From any thread."""
-    if not _process.ours:
+    if not _process.hurried_s:
         work(argument)
         return
     interval_s = sys.getswitchinterval()

@@ -81,9 +81,7 @@ class Threads:
             `idle`: the calling thread ran the task, and has no other task now.
         go_on: called as go_on(task, result, error) instead for a task with a key, or one that gave a coroutine; returns
             the task that the thread runs next.
-        deliver: called as deliver(done, result, error) from any thread; calls `done` on the loop.
-        limit: the most threads at a time. While not all are known to be busy, more tasks are accepted, and wait.
-        idle_s: the seconds without work after which a thread ends.
+        deliver, limit, idle_s: those of Workers.
     """
 
     def __init__(
@@ -94,14 +92,12 @@ class Threads:
         *,
         limit: int,
         idle_s: float,
-        name: str,
     ) -> None:
         self.limit = limit
         self._tell = tell
         self._go_on = go_on
         self._deliver = deliver
         self._idle_s = idle_s
-        self._name = name
         self._lock = threading.Lock()
         self._tasks: deque[Task] = deque()  # not begun; while it is not empty, a thread is coming, or all are busy
         self._coming: _Thread | None = None  # a thread that was woken or started, and has not taken a task yet
@@ -236,7 +232,7 @@ class Threads:
             shielded(functools.partial(self._begin, worker))
 
     def _begin(self, worker: _Thread) -> None:
-        name = f"{self._name}-worker-{next(self._numbers)}"
+        name = f"rr-worker-{next(self._numbers)}"
         worker.thread = threading.Thread(target=self._work, args=(worker,), name=name, daemon=True)
         try:
             worker.thread.start()

@@ -81,17 +81,16 @@ class UserLoop:
             user's class may do anything in its __str__.
     """
 
-    def __init__(self, name: str, elsewhere: Callable[[Callable[[], object]], None]) -> None:
+    def __init__(self, elsewhere: Callable[[Callable[[], object]], None]) -> None:
         self._tasks: set[asyncio.Task[None]] = set()
         self._elsewhere = elsewhere
-        self.thread = start_loop_thread(self._run, name)
+        self.thread = start_loop_thread(self._run, "rr-user-loop")
 
     def start(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run a coroutine as a task in `context`; `done` is called in the loop's thread."""
         try:
             self._loop.call_soon_threadsafe(self._spawn, coroutine, done, context)
         except RuntimeError as error:
-            coroutine.close()
             raise Unavailable("the user loop is closed: this process is stopping") from error
 
     def stop(self) -> None:
@@ -112,16 +111,13 @@ class UserLoop:
             self._loop.set_exception_handler(self._log_elsewhere)
             self._stop = asyncio.Event()
             ready()
-            runner.run(self._until_stopped())
+            runner.run(self._stop.wait())
 
     def _log_elsewhere(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         try:
             self._elsewhere(functools.partial(log_exception, loop, context))
         except Unavailable:
             logger.error("on the loop: %s", context.get("message"))
-
-    async def _until_stopped(self) -> None:
-        await self._stop.wait()
 
 
 def start_task(
@@ -133,8 +129,11 @@ def start_task(
     """
 
     def ended(task: asyncio.Task[tuple[Any, BaseException | None]]) -> None:
-        result, error = (None, asyncio.CancelledError()) if task.cancelled() else task.result()
-        done(result, error)
+        if task.cancelled():  # before it began
+            coroutine.close()
+            done(None, asyncio.CancelledError())
+        else:
+            done(*task.result())
 
     task = loop.create_task(_outcome(coroutine), context=context)
     # Not inside the task: `done` may make another thread enter `context`, in which the task would still be.

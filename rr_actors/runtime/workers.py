@@ -61,13 +61,11 @@ class Workers:
         *,
         limit: int = WORKERS_LIMIT,
         idle_s: float = IDLE_S,
-        name: str = "rr",
     ) -> None:
         self._deliver = deliver
         self._hand_over = deliver if hand_over is None else hand_over
-        self._name = name
         self._lock = threading.Lock()
-        self._threads = Threads(self._ran, self._go_on, deliver, limit=limit, idle_s=idle_s, name=name)
+        self._threads = Threads(self._ran, self._go_on, deliver, limit=limit, idle_s=idle_s)
         self._queues: dict[Hashable, deque[Task] | None] = {}
         self._user_loop: UserLoop | None = None
         self.user_loop_ident: int | None = None
@@ -98,11 +96,7 @@ class Workers:
             Unavailable: the workers are closed.
         """
         when_full = WAITS if patient else REFUSED
-        task = Task(fn, args, done, Context() if context is None else context, when_full, None, at_once)
-        if is_async(fn):
-            self._start_async(task)
-        else:
-            self._threads.start(task)
+        self._start(Task(fn, args, done, Context() if context is None else context, when_full, None, at_once))
 
     def serial(
         self,
@@ -126,10 +120,7 @@ class Workers:
                 return
             self._queues[key] = None  # the queue is made when a second call waits
         try:
-            if is_async(fn):
-                self._start_async(task)
-            else:
-                self._threads.start(task)
+            self._start(task)
         except Unavailable:
             self._start_following(key)  # other threads may have submitted more calls meanwhile
             raise
@@ -143,7 +134,10 @@ class Workers:
         self._threads.go()
 
     async def run(self, fn: Callable[..., Any], *args: Any, context: Context | None = None) -> Any:
-        """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop."""
+        """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop.
+
+        It gets a thread beyond the limit, too: the framework's own work must go on while callbacks take all threads.
+        """
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def done(result: Any, error: BaseException | None) -> None:
@@ -158,7 +152,7 @@ class Workers:
                 failure.__cause__ = error
                 future.set_exception(failure)
 
-        self.submit(fn, *args, done=done, context=context)
+        self._start(Task(fn, args, done, Context() if context is None else context, GETS_A_THREAD))
         return await future
 
     def in_thread(self, fn: Callable[..., Any], *args: Any, beyond_limit: bool = False) -> None:
@@ -168,33 +162,26 @@ class Workers:
 
     def start_coroutine(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run the coroutine as a task on the user loop; `done` is called in that loop's thread."""
-        with self._lock:
-            if self._closed:
-                coroutine.close()
-                raise Unavailable("the workers are closed: this process is stopping")
-            if self._user_loop is None:
-                try:
-                    elsewhere = functools.partial(self.in_thread, beyond_limit=True)
-                    self._user_loop = UserLoop(f"{self._name}-user-loop", elsewhere)
-                except Unavailable:
-                    coroutine.close()
-                    raise
-                self.user_loop_ident = self._user_loop.thread.ident
-            user_loop = self._user_loop
-        user_loop.start(coroutine, done, context)
+        try:
+            with self._lock:
+                if self._closed:
+                    raise Unavailable("the workers are closed: this process is stopping")
+                if self._user_loop is None:
+                    self._user_loop = UserLoop(functools.partial(self.in_thread, beyond_limit=True))
+                    self.user_loop_ident = self._user_loop.thread.ident
+                user_loop = self._user_loop
+            user_loop.start(coroutine, done, context)
+        except Unavailable:
+            coroutine.close()
+            raise
 
     @property
     def threads(self) -> int:
         """The number of worker threads now, running or idle."""
         return len(self._threads)
 
-    @property
-    def limit(self) -> int:
-        """The most threads at a time."""
-        return self._threads.limit
-
-    @limit.setter
-    def limit(self, limit: int) -> None:
+    def set_limit(self, limit: int) -> None:
+        """Set the most threads at a time."""
         self._threads.limit = limit
 
     def close(self, timeout_s: float = 1.0) -> None:
@@ -220,6 +207,18 @@ class Workers:
         self._lock = threading.Lock()  # another thread may have held it at the fork
         self._closed = True
         self._threads.abandon()
+
+    def _start(self, task: Task) -> None:
+        if not is_async(task.fn):
+            self._threads.start(task)
+            return
+        coroutine, error = task.call()
+        if error is None:
+            self._await_result(task, coroutine)
+        elif task.done is None and task.key is None:  # wrong arguments
+            raise error
+        else:
+            self._ended(task, None, error)
 
     # -- how calls end ---------------------------------------------------------------------------------------------
 
@@ -251,15 +250,6 @@ class Workers:
         return None if task.key is None else self._following(task.key)
 
     # -- the user loop ---------------------------------------------------------------------------------------------
-
-    def _start_async(self, task: Task) -> None:
-        coroutine, error = task.call()
-        if error is None:
-            self._await_result(task, coroutine)
-        elif task.done is None and task.key is None:  # wrong arguments
-            raise error
-        else:
-            self._ended(task, None, error)
 
     def _await_result(self, task: Task, coroutine: Coroutine[Any, Any, Any]) -> None:
         self.start_coroutine(coroutine, functools.partial(self._ended, task), task.context)

@@ -18,23 +18,11 @@ from typing import Any
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable, text_of
-from rr_actors.runtime import interpreter
+from rr_actors.runtime import event_loop, interpreter
 from rr_actors.runtime.processes.process import Inherited
-from rr_actors.supervision.control_channel import (
-    Channel,
-    Exiting,
-    Failed,
-    Ignored,
-    Message,
-    News,
-    Ping,
-    Pong,
-    Ready,
-    Start,
-    Stop,
-)
+from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
-from rr_actors.supervision.health import Health
+from rr_actors.supervision.heartbeat import Health
 from rr_actors.supervision.supervisor import target_of
 from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.hosted import Hosted, prepare
@@ -56,13 +44,10 @@ def main(inherited: Inherited) -> int:
     info, path, spec = pickling.loads(inherited.payload)
     interpreter.name_process(f"rr: {path.rpartition('/')[2]}")
     sys.breakpointhook = functools.partial(_break, path)
+    dispatcher = event_loop.acquire()  # to the end of the process: its last messages are sent after its node has ended
     child = ChildProcess(inherited, info, path, spec)
-    dispatcher = child.node.dispatcher
 
-    def on_sigterm(_signal: int, _frame: object) -> None:
-        dispatcher.call(child.terminate)
-
-    signal.signal(signal.SIGTERM, on_sigterm)
+    signal.signal(signal.SIGTERM, lambda _signal, _frame: dispatcher.call(child.terminate))
     return dispatcher.run(child.live())
 
 
@@ -89,10 +74,10 @@ class ChildProcess:
         self._path = path
         self._spec = spec
         self._shutdown_s: Shutdown  # from the specification
-        self._channel: Channel | None = None
+        self._channel: control.Channel | None = None
         self._hosted: Hosted | None = None
         self._told_to_start = asyncio.Event()
-        self._stop: Stop | None = None
+        self._stop: control.Stop | None = None
         self._is_limited = False  # the parent limits the stops that it asks for
         self._told_to_stop = asyncio.Event()
         self._ended = asyncio.Event()
@@ -100,14 +85,16 @@ class ChildProcess:
 
     async def live(self) -> int:
         """Run the child until its end, and return the exit code."""
-        self._channel = await Channel.open(self._inherited.control, self._received, self._lost)
-        self.forward_logs()
+        self._channel = await control.Channel.open(self._inherited.control, self._path, self._received, self.terminate)
+        info = self.node.info
+        if info.config.logging:  # from here on, since the import of users' modules logs, too
+            forwarded_logs.begin(self._path, info.log_levels, self._send_log)
         try:
             await self.node.start()
             code = await self._live()
         except Exception as error:
             logger.exception("%s: could not be hosted", self._path)
-            self._say(Failed(text_of(error), traceback.format_exc()))
+            self._say(control.Failed(text_of(error), traceback.format_exc()))
             code = 1
         await self._close()
         return code
@@ -115,7 +102,7 @@ class ChildProcess:
     def terminate(self) -> None:
         """Stop the child gracefully, after SIGTERM or the loss of the supervisor."""
         if self._stop is None:
-            self._stop, self._is_limited = Stop(), True
+            self._stop, self._is_limited = control.Stop(), True
         self._told_to_stop.set()
 
     async def _live(self) -> int:
@@ -124,14 +111,14 @@ class ChildProcess:
             return self._leave(ExitReport("shutdown", "stopped before it was started"))
         try:
             if not await self._start():
-                self._say(Ignored())
+                self._say(control.Ignored())
                 return 0
         except Exception as error:
             if self._stop is not None:
                 return self._leave(ExitReport("shutdown", "stopped while it was starting"))
             self._say(await self.node.dispatcher.workers.run(_failed, error))
             return 1
-        self._say(Ready())
+        self._say(control.Ready())
         await _first(self._told_to_stop, self._ended)
         return self._leave(self._report if self._report is not None else await self._stop_actor())
 
@@ -155,7 +142,7 @@ class ChildProcess:
         return await self._hosted.stop(limit_s, final=self._stop.final)
 
     def _leave(self, report: ExitReport) -> int:
-        self._say(Exiting(report.reason, report.detail, report.traceback))
+        self._say(control.Exiting(report.reason, report.detail, report.traceback))
         return 0 if report.reason in ("normal", "shutdown") else 1
 
     async def _close(self) -> None:
@@ -168,21 +155,20 @@ class ChildProcess:
             logger.exception("%s: closing", self._path)
         if self._channel is not None:
             channel, self._channel = self._channel, None  # log records go to standard error from now on
-            channel.close()
-            await asyncio.sleep(0)
+            await channel.finish(_CLOSE_S)
 
     # -- messages --------------------------------------------------------------------------------------------------
 
-    def _received(self, message: Message) -> None:
+    def _received(self, message: control.Message) -> None:
         match message:
-            case Start():
+            case control.Start():
                 self._told_to_start.set()
-            case Stop():
+            case control.Stop():
                 self.node.stopping = f"{self._path} is being stopped"
                 self._stop = message
                 self._told_to_stop.set()
-            case Ping():
-                self._say(Pong(self._health.trouble()))
+            case control.Ping():
+                self._say(control.Pong(self._health.trouble()))
             case _:
                 logger.error("%s: unexpected on the control channel: %r", self._path, message)
 
@@ -194,37 +180,27 @@ class ChildProcess:
         catalogs = [config.catalog_path(state_dir).parent for config in configs if config.durability != "none"]
         return [Path(state_dir), *catalogs]
 
-    def _lost(self) -> None:
-        """Stop the child: its supervisor is gone."""
-        self.terminate()
-
     def _exited(self, report: ExitReport) -> None:
         self._report = report
         self._ended.set()
-
-    def forward_logs(self) -> None:
-        """Send this process's log records to the application's logging, also while it imports users' modules."""
-        info = self.node.info
-        if info.config.logging:
-            forwarded_logs.begin(self._path, info.log_levels, self._send_log)
 
     def _send_log(self, event: dict[str, Any]) -> bool:
         """Send a log record as news, from any thread. Return False if that is not possible any more."""
         if self._channel is None:
             return False
         try:
-            self.node.dispatcher.call(self._say, News(event))
+            self.node.dispatcher.call(self._say, control.News(event))
         except Unavailable:
             return False
         return True
 
     def _tell(self, event: dict[str, Any]) -> None:
         try:
-            self._say(News(event))
+            self._say(control.News(event))
         except NotSerializable:
             logger.exception("%s: an event that is not plain data: %r", self._path, event)
 
-    def _say(self, message: Message) -> None:
+    def _say(self, message: control.Message) -> None:
         if self._channel is not None:
             self._channel.send(message)
 
@@ -236,10 +212,10 @@ async def _first(*events: asyncio.Event) -> None:
         future.cancel()
 
 
-def _failed(error: Exception) -> Failed:
+def _failed(error: Exception) -> control.Failed:
     """Return the message for a failed start. In a worker, since pickling runs users' code."""
     trace = "".join(traceback.format_exception(error))
     try:
-        return Failed(text_of(error), trace, pickling.dumps(error, "exception"))
+        return control.Failed(text_of(error), trace, pickling.dumps(error, "exception"))
     except Exception:  # then only its text and its traceback are sent
-        return Failed(text_of(error), trace)
+        return control.Failed(text_of(error), trace)

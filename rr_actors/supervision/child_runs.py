@@ -8,13 +8,14 @@ process and its process group are dead.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 from msgspec.structs import replace
 
@@ -22,21 +23,10 @@ from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
 from rr_actors.base.errors import StartFailed
 from rr_actors.base.steps import Steps
+from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.process import Exited, Process, signal_name
 from rr_actors.runtime.time_limits import wait_while_running
-from rr_actors.supervision.control_channel import (
-    Channel,
-    Exiting,
-    Failed,
-    Ignored,
-    Message,
-    News,
-    Ping,
-    Pong,
-    Ready,
-    Start,
-    Stop,
-)
+from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.core.state import Exit, Reason, Report, StartChild, Why
 from rr_actors.supervision.event_history import Record
@@ -47,58 +37,22 @@ from rr_actors.system.hosting.node import Node
 logger = logging.getLogger("rr_actors.supervision")
 
 ENTRY = "rr_actors.supervision.child_main:main"
-
 _LAST_WORDS_S = 0.05  # the longest wait for a dead process's last messages
 _LEAVE_S = 2.0  # the longest time from a process's last answer to its end
 
-
 OnEnd = Callable[[Exit], None]
-
-
-class Run(Protocol):
-    """One run of one child. All methods are called on the loop."""
-
-    pid: int | None
-    """The id of its process, once it has one."""
-
-    async def start(self) -> bool:
-        """Start the child. Return True once it is ready, False if its on_start returned IGNORE. Not after stop().
-
-        Raises:
-            StartFailed: the child did not become ready, or was stopped first.
-            BaseException: the error of its on_start.
-        """
-        ...
-
-    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
-        """Stop the child, also during its start: ask, wait for shutdown_s, kill. Call it once.
-
-        Args:
-            final: the child will not be started again.
-        """
-        ...
-
-    def kill(self) -> None:
-        """Kill or abandon the child at once."""
-        ...
+Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
+"""The class to start for a child in this process, its args and its kwargs."""
 
 
 class LocalRun:
-    """The Run of a child in this process.
+    """The Run of a child in this process, with the methods of ProcessRun. It is abandoned if it cannot be stopped.
 
     Args:
-        target: the child's class, args and kwargs.
         on_end: called if the child has become ready and then ends without stop().
     """
 
-    def __init__(
-        self,
-        node: Node,
-        spec: ChildSpec,
-        path: str,
-        target: tuple[type[Any], Sequence[Any], Mapping[str, Any]],
-        on_end: OnEnd,
-    ) -> None:
+    def __init__(self, node: Node, spec: ChildSpec, path: str, target: Target, on_end: OnEnd) -> None:
         self.pid: int | None = os.getpid()
         self._timeout_s = _start_timeout_s(spec, node)
         self._target = target
@@ -110,7 +64,6 @@ class LocalRun:
         return await self._hosted.start(args, kwargs, self._timeout_s)
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
-        """Stop the child; abandon it if it does not stop in time."""
         return _exit_of(await self._hosted.stop(shutdown_s, final=final))
 
     def kill(self) -> None:
@@ -132,21 +85,20 @@ class ProcessRun:
     """Called if the child has become ready and then ends without stop(). Set it before start()."""
 
     def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
-        loop = asyncio.get_running_loop()
-        self.pid: int | None = None
+        self._loop = loop = asyncio.get_running_loop()
+        self.pid: int | None = None  # once it has one
         self.managers: set[str] = set()  # the paths of those that run below a supervisor
         self._node = node
         self.spec = spec
         self._path = path
         self._on_died = on_died
-        self._loop = loop
         self._process: Process | None = None
-        self._channel: Channel | None = None
+        self._channel: control.Channel | None = None
         self._launching: asyncio.Task[None] | None = None
-        self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: the process died first
+        self._answer: asyncio.Future[control.Message | None] = loop.create_future()  # None: the process died first
         self._end: asyncio.Future[Exit] = loop.create_future()
         self._exited: Exited | None = None
-        self._exiting: Exiting | None = None
+        self._exiting: control.Exiting | None = None
         self._killed: Exit | None = None  # why the supervisor killed it
         self._silent = False  # the child's end of the channel is closed
         self._up = False
@@ -156,6 +108,12 @@ class ProcessRun:
     # -- Run -------------------------------------------------------------------------------------------------------
 
     async def start(self) -> bool:
+        """Start the child. Return True once it is ready, False if its on_start returned IGNORE. Not after stop().
+
+        Raises:
+            StartFailed: the child did not become ready, or was stopped first.
+            BaseException: the error of its on_start.
+        """
         timeout_s = _start_timeout_s(self.spec, self._node)
         self.lay_out()
         assert self._launching is not None
@@ -163,9 +121,10 @@ class ProcessRun:
         assert self._channel is not None
         if self._stopping:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
-        self._channel.send(Start())
+        self._channel.send(control.Start())
         if self.spec.heartbeat_s is not None and not self._end.done():
-            self._heartbeat = Heartbeat(self.spec.heartbeat_s, self._ping, self._hung, self._ill)
+            limit_s = self.spec.heartbeat_s
+            self._heartbeat = Heartbeat(limit_s, self._ping, lambda why: self._kill(Exit("abnormal", why)))
         await wait_while_running(self._answer, timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -178,6 +137,10 @@ class ProcessRun:
             self._launching = self._loop.create_task(self._launch())
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
+        """Stop the child, also during its start: ask, wait for shutdown_s, kill. Call it once.
+
+        `final`: the child will not be started again.
+        """
         self._stopping = True
         if self._heartbeat is not None:
             self._heartbeat.stop()
@@ -190,13 +153,14 @@ class ProcessRun:
             self._kill(Exit("killed", "brutal_kill"))
         elif self._channel is not None:
             limit_s = None if shutdown_s == "infinity" else float(shutdown_s)
-            self._channel.send(Stop(final))
+            self._channel.send(control.Stop(final))
             await wait_while_running(self._end, limit_s)
             if not self._end.done():
                 self._kill(Exit("killed", f"had not stopped after shutdown_s={limit_s:g} s"))
         return await asyncio.shield(self._end)
 
     def kill(self) -> None:
+        """Kill the child at once."""
         self._kill(Exit("killed", "killed by its supervisor"))
 
     # -- its start -------------------------------------------------------------------------------------------------
@@ -207,7 +171,7 @@ class ProcessRun:
         self.pid = process.pid
         try:
             process.watch(self._loop, self._died)
-            self._channel = await Channel.open(process.control, self._received, self._lost)
+            self._channel = await control.Channel.open(process.control, self._path, self._received, self._lost)
         except Exception:  # for instance, no descriptors are left
             self._process = self.pid = None
             process.close()
@@ -221,17 +185,17 @@ class ProcessRun:
         payload = pickling.dumps((self._node.info, self._path, spec))
         return self._node.spawner.start(ENTRY, payload, name=self._path)
 
-    async def _judge(self, answer: Message | None) -> bool:
+    async def _judge(self, answer: control.Message | None) -> bool:
         match answer:
-            case Ready():
+            case control.Ready():
                 self._up = True
                 if self._end.done():
                     self._loop.call_soon(self._tell)
                 return True
-            case Ignored():
+            case control.Ignored():
                 await self._leave()
                 return False
-            case Failed():
+            case control.Failed():
                 await self._leave()
                 raise await self._node.dispatcher.workers.run(_unpack, answer, self._path)
             case _:
@@ -250,17 +214,17 @@ class ProcessRun:
 
     # -- its messages ----------------------------------------------------------------------------------------------
 
-    def _received(self, message: Message) -> None:
+    def _received(self, message: control.Message) -> None:
         match message:
-            case Ready() | Ignored() | Failed():
+            case control.Ready() | control.Ignored() | control.Failed():
                 if not self._answer.done():
                     self._answer.set_result(message)
-            case Exiting():
+            case control.Exiting():
                 self._exiting = message
-            case Pong():
+            case control.Pong():
                 if self._heartbeat is not None:
                     self._heartbeat.heard(message.trouble)
-            case News():
+            case control.News():
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # resource events may be many
                     self._channel.rest()
@@ -277,13 +241,7 @@ class ProcessRun:
 
     def _ping(self) -> None:
         if self._channel is not None:
-            self._channel.send(Ping())
-
-    def _hung(self) -> None:
-        self._kill(Exit("abnormal", f"hung: its loop had not answered for {self.spec.heartbeat_s:g} s (heartbeat_s)"))
-
-    def _ill(self, trouble: str) -> None:
-        self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
+            self._channel.send(control.Ping())
 
     # -- its end ---------------------------------------------------------------------------------------------------
 
@@ -294,7 +252,7 @@ class ProcessRun:
     def _died(self, exited: Exited) -> None:
         assert self._process is not None
         self._exited = exited
-        self._process.kill_group()
+        lifeline.kill_group(self._process.pid)
         if self._heartbeat is not None:
             self._heartbeat.stop()
         if self._channel is not None:
@@ -347,28 +305,27 @@ class ProcessRun:
         return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
 
 
+Run = LocalRun | ProcessRun
+"""One run of one child. All methods are called on the loop."""
+
+
 def _start_timeout_s(spec: ChildSpec, node: Node) -> float | None:
     if spec.start_timeout_s is not None or spec.type == "supervisor":  # its children have limits of their own
         return spec.start_timeout_s
     return node.config.start_timeout_s
 
 
-def _unpack(failed: Failed, path: str) -> BaseException:
+def _unpack(failed: control.Failed, path: str) -> BaseException:
     """Return the exception of the child, with its traceback as a note. In a worker, since it runs users' code."""
     error: BaseException | None = None
     if failed.error:
-        try:
+        with contextlib.suppress(Exception):  # its class cannot be imported here: its text and traceback must do
             error = pickling.loads(failed.error)
-        except Exception:  # its class cannot be imported here: its text and traceback must do
-            error = None
     if not isinstance(error, BaseException):
         error = StartFailed(f"{path}: {failed.text}", id=path)
     if failed.traceback:
         error.add_note(f"In the process of {path}:\n{failed.traceback}")
     return error
-
-
-# Life: one run of one child as its supervisor sees it, and its Records.
 
 
 class Life:
@@ -399,8 +356,11 @@ class Life:
 
 def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record:
     """Return the Record of a report of the core, completed with the facts of the run."""
-    exit = report.exit
-    code = _code_of_start(report) if exit is None else exit.code
+    exit, error = report.exit, report.error
+    if exit is not None:
+        code = exit.code
+    else:  # a StartFailed has the code if the process died before it was ready
+        code = error.details.get("code") if isinstance(error, StartFailed) else None
     restarted = report.event == "started" and life is not None and life.why is Why.RESTART
     return Record(
         event="restarted" if restarted else report.event,
@@ -420,11 +380,6 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
         ready_s=None if life is None or life.ready_at is None else life.ready_at - life.began,
         up_s=None if life is None or exit is None else life.up_s,
     )
-
-
-def _code_of_start(report: Report) -> int | None:
-    """Return the exit code of a process that died before it was ready, else None."""
-    return report.error.details.get("code") if isinstance(report.error, StartFailed) else None
 
 
 def _detail(report: Report) -> str:

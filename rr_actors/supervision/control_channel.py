@@ -7,6 +7,7 @@ are decoded by type. Pickled values of users stay bytes here; a worker unpickles
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from collections.abc import Callable
@@ -79,23 +80,28 @@ class Channel(asyncio.Protocol):
     """One end of the socket pair, on the loop. Messages travel in frames (rr_actors/wire/frames.py).
 
     Args:
+        path: the child's, for the log.
         received: called with each message.
         lost: called once, when the other end is gone or has sent something that is no message.
     """
 
-    def __init__(self, received: Callable[[Message], None], lost: Callable[[], None]) -> None:
+    def __init__(self, path: str, received: Callable[[Message], None], lost: Callable[[], None]) -> None:
+        self._path = path
         self._received = received
         self._lost = lost
         self._reader: FrameReader[Message] = FrameReader(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
         self._transport: asyncio.Transport | None = None
         self._resting: asyncio.TimerHandle | None = None
+        self._gone = asyncio.Event()
 
     @classmethod
-    async def open(cls, end: socket.socket, received: Callable[[Message], None], lost: Callable[[], None]) -> Channel:
+    async def open(
+        cls, end: socket.socket, path: str, received: Callable[[Message], None], lost: Callable[[], None]
+    ) -> Channel:
         """Return the channel on `end`, which belongs to it from now on."""
         end.setblocking(False)
         loop = asyncio.get_running_loop()
-        _, channel = await loop.create_unix_connection(lambda: cls(received, lost), sock=end)
+        _, channel = await loop.create_unix_connection(lambda: cls(path, received, lost), sock=end)
         return channel
 
     def send(self, message: Message) -> None:
@@ -129,6 +135,17 @@ class Channel(asyncio.Protocol):
         if self._transport is not None:
             self._transport.close()
 
+    async def finish(self, patience_s: float) -> None:
+        """Close the channel, and wait until all messages are sent, or the other end reads nothing for `patience_s`."""
+        self.close()
+        while (transport := self._transport) is not None:
+            unsent = transport.get_write_buffer_size()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(patience_s):
+                    await self._gone.wait()
+            if transport.get_write_buffer_size() == unsent:
+                return
+
     # -- asyncio.Protocol ------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -138,12 +155,13 @@ class Channel(asyncio.Protocol):
         for message in self._reader.feed(data):
             self._received(message)
         if self._reader.error is not None or self._reader.ended:  # neither end sends a last, empty frame
-            logger.error("control channel: closed: %s", self._reader.error or "an empty frame")
+            logger.error("%s: control channel closed: %s", self._path, self._reader.error or "an empty frame")
             if self._transport is not None:
                 self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
+        self._gone.set()
         self.go_on()
         lost, self._lost = self._lost, _nobody
         lost()

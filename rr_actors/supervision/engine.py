@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import os
 import time
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine
 from typing import Any
 
+from rr_actors.base.errors import Unavailable
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes import lifeline
-from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, record_of
+from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, Target, record_of
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.child_calls import find_child
-from rr_actors.supervision.core.specs import ChildSpec, Shutdown, Supervisor
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.supervision.core.state import (
     Action,
     Decision,
@@ -35,7 +37,7 @@ from rr_actors.supervision.core.state import (
     Tree,
 )
 from rr_actors.supervision.event_history import History, Record
-from rr_actors.supervision.name_entries import Entries, is_manager
+from rr_actors.supervision.name_entries import Entries, manager_of
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
 
@@ -53,13 +55,7 @@ FENCE_S = 1.0
 DEATHS = 3
 """How many deaths of earlier runs a child hears of: as many as a load may cause before it fails."""
 
-Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
-
 _STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
-
-
-async def _discard(run: ProcessRun) -> None:
-    await run.stop("brutal_kill", final=True)
 
 
 class Supervision:
@@ -86,14 +82,14 @@ class Supervision:
         self.history = History()
         self.tree = Tree.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
         self.final = False
+        self.entries = Entries(node.directory)
         self._node = node
         self._target_of = target_of
         self._on_started = on_started
         self._on_exit = on_exit
-        self._entries = Entries(node.directory)
         self._lives: dict[int, Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # of the last start of each child
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[Any]] = set()
         self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
@@ -107,8 +103,7 @@ class Supervision:
     def stop(self, *, final: bool) -> None:
         """Stop the children, also in the middle of a start, then call on_exit if that has not been done.
 
-        Args:
-            final: the children will not be started again.
+        `final`: they will not be started again.
         """
         self.final = self.final or final
         self.apply(restarts.decide_stop(self.tree, time.monotonic()))
@@ -138,15 +133,6 @@ class Supervision:
         child = find_child(self.tree, id)
         return self._lives.get(child.run) if child.state == "running" else None
 
-    def check_names(self, spec: ChildSpec) -> None:
-        """Check that a new child has no registrar that is in the system already, and no client's name.
-
-        Raises:
-            NameTaken: a registrar of that name exists.
-            InvalidSpec: the name is one of a client's.
-        """
-        self._entries.check_names(spec, self.path_of(spec.id))
-
     def path_of(self, id: str) -> str:
         """Return the child's path in the tree."""
         return f"{self.path}/{id}"
@@ -155,7 +141,6 @@ class Supervision:
         """Wait, after on_exit, until the clean-up has ended."""
         if self._sweeping is not None:
             self._sweeping.cancel()
-            self._sweeping = None
             await self._sweep()
         while self._tasks - {asyncio.current_task()}:
             await asyncio.wait(self._tasks - {asyncio.current_task()})
@@ -168,7 +153,7 @@ class Supervision:
                 life = Life(action, self.path_of(action.id))
                 self._lives[action.run] = life
                 self._specs[action.id] = action.spec
-                self._entries.mark(life.spec, life.path, Status.STARTING, self._deaths(life))
+                self.entries.mark(life.spec, life.path, Status.STARTING, self._deaths(life))
                 self._task(self._start(life, action.delay_s))
             case StopChild():
                 life = self._lives.get(action.run)
@@ -188,10 +173,8 @@ class Supervision:
 
     async def _start(self, life: Life, delay_s: float) -> None:
         if delay_s > 0:
-            try:
+            with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(life.told_to_stop.wait(), delay_s)
-            except TimeoutError:
-                pass
         if life.told_to_stop.is_set():
             return
         life.began = time.monotonic()
@@ -200,10 +183,9 @@ class Supervision:
             ready = await life.run.start()
         except Exception as error:
             if not life.told_to_stop.is_set():
-                self._apply_and_forget(
-                    life,
-                    restarts.decide_start_failed(self.tree, life.id, life.number, error, time.monotonic(), _chance()),
-                )
+                now = time.monotonic()
+                decision = restarts.decide_start_failed(self.tree, life.id, life.number, error, now, _chance())
+                self._apply_and_forget(life, decision)
             return
         if life.told_to_stop.is_set():
             return
@@ -215,14 +197,12 @@ class Supervision:
             self._apply_and_forget(life, decision)
 
     def _new_run(self, life: Life) -> Run:
-        def on_end(exit: Exit) -> None:
-            self._ended(life, exit)
-
+        on_end = functools.partial(self._ended, life)
         if life.spec.placement == "process":
             run = self._laid_out.pop(life.id, None)
             if run is None or run.spec is not life.spec:
                 if run is not None:
-                    self._task(_discard(run))
+                    self._task(run.stop("brutal_kill", final=True))
                 run = ProcessRun(self._node, life.spec, life.path, self._died)
             run.on_end = on_end
             return run
@@ -238,7 +218,7 @@ class Supervision:
                 run.lay_out()
         coming = {child.id for child in due} | {life.id for life in self._lives.values() if life.run is None}
         for id in [id for id in self._laid_out if id not in coming]:
-            self._task(_discard(self._laid_out.pop(id)))
+            self._task(self._laid_out.pop(id).stop("brutal_kill", final=True))
 
     async def _stop(self, action: StopChild, life: Life | None) -> None:
         if life is None or life.run is None:
@@ -251,14 +231,12 @@ class Supervision:
     async def _end_of(self, life: Life, run: Run, action: StopChild) -> Exit:
         """Stop a run, or kill it if stop() raises: its siblings and the supervisor must be stopped all the same."""
         try:
-            return await run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
+            limit_s = "brutal_kill" if self._brutal else action.shutdown_s
+            return await run.stop(limit_s, final=self._is_final(action.id))
         except Exception as error:
             logger.critical("supervisor %s: %s could not be stopped; killed", self.path, life.path, exc_info=error)
             run.kill()
             return Exit("killed", f"could not be stopped: {type(error).__name__}: {error}")
-
-    def _limit(self, shutdown_s: Shutdown) -> Shutdown:
-        return "brutal_kill" if self._brutal else shutdown_s
 
     def _is_final(self, id: str) -> bool:
         """Return whether a child that is being stopped will not be started again."""
@@ -281,10 +259,11 @@ class Supervision:
 
     async def _ended_with_all_below(self, life: Life, exit: Exit) -> None:
         """Wait until the processes below a dead supervisor are gone: their successors must not meet them."""
-        pids = self._entries.pids_below(life.path)
-        await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
+        pids = self.entries.pids_below(life.path)
+        with contextlib.suppress(Unavailable):  # the machine gives no thread, but the child's end must be decided
+            await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
         if isinstance(life.run, ProcessRun):
-            self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
+            self._retire(self.entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, exit)
 
     def _has_ended(self, life: Life, exit: Exit) -> None:
@@ -296,12 +275,12 @@ class Supervision:
         if life is not None:
             self._lives.pop(life.number, None)
 
-    def _task(self, coroutine: Coroutine[Any, Any, None]) -> None:
+    def _task(self, coroutine: Coroutine[Any, Any, object]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)  # the loop itself keeps only weak references
         task.add_done_callback(self._task_done)
 
-    def _task_done(self, task: asyncio.Task[None]) -> None:
+    def _task_done(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             logger.critical("supervisor %s: a defect of rr_actors", self.path, exc_info=error)
@@ -309,32 +288,25 @@ class Supervision:
     # -- records and the directory ---------------------------------------------------------------------------------
 
     def _record(self, report: Report) -> None:
-        path, kind = self.path_of(report.id), self._kind_of(report.id)
+        path, spec = self.path_of(report.id), self._specs.get(report.id)
+        kind = "actor"
+        if spec is not None and (spec.type == "supervisor" or manager_of(spec) is not None):
+            kind = "supervisor" if spec.type == "supervisor" else "manager"
         record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)
         self._node.emit(record.event, **record.facts())
-        self._mark_state(report, record)
-
-    def _kind_of(self, id: str) -> str:
-        spec = self._specs.get(id)
-        if spec is None or spec.type == "worker":
-            return "manager" if spec is not None and is_manager(spec) else "actor"
-        return "supervisor"
+        status = Status.GONE if report.state is None else _STATUS[report.state]
+        if spec is None or status is None:
+            return
+        if status is Status.STOPPED and self._ends_with_supervisor(report.id):
+            status = Status.GONE
+        self._retire(self.entries.mark(spec, path, status, _why(record)))
 
     def _deaths(self, life: Life) -> str:
         """Say how earlier runs died. The child's registrar names that in the errors of loads that they interrupted."""
         if life.spec.type == "supervisor":  # the actors below it may have ended in another way
             return ""
         return "; ".join(self.history.deaths(life.path, DEATHS))
-
-    def _mark_state(self, report: Report, record: Record) -> None:
-        spec = self._specs.get(report.id)
-        status = Status.GONE if report.state is None else _STATUS[report.state]
-        if spec is None or status is None:
-            return
-        if status is Status.STOPPED and self._ends_with_supervisor(report.id):
-            status = Status.GONE
-        self._retire(self._entries.mark(spec, self.path_of(report.id), status, _why(record)))
 
     def _retire(self, registrars: list[str]) -> None:
         """Have all providers release what these registrars held, unless the children stop for good anyway."""
@@ -346,13 +318,10 @@ class Supervision:
 
     def _died(self) -> None:
         if self._sweeping is None:
-            self._sweeping = asyncio.get_running_loop().call_later(SWEEP_DELAY_S, self._begin_sweep)
-
-    def _begin_sweep(self) -> None:
-        self._sweeping = None
-        self._task(self._sweep())
+            self._sweeping = asyncio.get_running_loop().call_later(SWEEP_DELAY_S, lambda: self._task(self._sweep()))
 
     async def _sweep(self) -> None:
+        self._sweeping = None
         workers = self._node.dispatcher.workers
         swept = await workers.run(self._node.spawner.sweep)
         with contextlib.suppress(OSError):  # a file that stays is removed with the run directory

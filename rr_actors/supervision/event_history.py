@@ -125,9 +125,9 @@ class History:
 
 def _how(record: Record) -> str:
     how = record.signal or (f"exit code {record.code}" if record.code is not None else "")
-    if not how or record.event != "start_failed":
-        return how if record.detail in ("", how) else ": ".join(filter(None, (how, record.detail)))
-    return how  # the detail has the code or signal, too
+    if record.detail == how or (how and record.event == "start_failed"):  # the detail has the code or signal, too
+        return how
+    return ": ".join(filter(None, (how, record.detail)))
 
 
 def _level(record: Record) -> int:

@@ -1,7 +1,7 @@
 """Heartbeat: checks that the loop of a child's process is alive, and that the process can work.
 
 The loop itself answers, so a user's callback may take any time. A process that is stopped, holds the interpreter or
-blocks its loop does not answer. The answer has the trouble that health.py finds in that process.
+blocks its loop does not answer. The answer has the trouble that Health finds in that process.
 
 A supervisor that itself stood still (SIGSTOP for the whole process group, a suspended machine, a debugger) does not
 count that time: the child may have stood still with it.
@@ -10,11 +10,19 @@ count that time: the child may have stood still with it.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import errno
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from rr_actors.runtime.time_limits import wait_while_running
 
 _LAST_LOOK = 1 / 20  # of the limit: how much longer to wait for an answer that has arrived unread
+
+_OF_ALL = (errno.ENFILE, errno.ENOMEM, errno.EINTR, errno.EIO, errno.ENOENT, errno.ENOTDIR)
+"""Errors that a new process in its place would have as well."""
+_SPARE = 8
+"""How many descriptors must be free: a connection or a segment of a journal takes some for a while."""
 
 
 class Heartbeat:
@@ -22,18 +30,14 @@ class Heartbeat:
 
     Args:
         ping: sends the question.
-        hung: called if there was no answer for `limit_s`. That ends the heartbeat.
-        ill: called with the trouble if two answers in a row had one: it may pass by itself after the first. That
-            ends the heartbeat.
+        kill: called with the reason, at the end of the heartbeat: there was no answer for `limit_s`, or two answers in
+            a row had a trouble, which may pass by itself after the first.
     """
 
-    def __init__(
-        self, limit_s: float, ping: Callable[[], None], hung: Callable[[], None], ill: Callable[[str], None]
-    ) -> None:
+    def __init__(self, limit_s: float, ping: Callable[[], None], kill: Callable[[str], None]) -> None:
         self._limit_s = limit_s
         self._ping = ping
-        self._hung = hung
-        self._ill = ill
+        self._kill = kill
         self._answer: asyncio.Future[str] | None = None
         self._asking = asyncio.get_running_loop().create_task(self._ask())
 
@@ -56,10 +60,48 @@ class Heartbeat:
             if not answer.done():  # uvloop runs timers before it reads: an answer may be there, unread
                 await asyncio.sleep(self._limit_s * _LAST_LOOK)
             if not answer.done():
-                self._hung()
+                self._kill(f"hung: its loop had not answered for {self._limit_s:g} s (heartbeat_s)")
                 return
             trouble = answer.result()
             if trouble and was_ill:
-                self._ill(trouble)
+                self._kill(f"unhealthy: it {trouble} (heartbeat_s)")
                 return
             was_ill = bool(trouble)
+
+
+class Health:
+    """The health of this process.
+
+    Args:
+        directories: returns the directories in which the process works now.
+    """
+
+    def __init__(self, directories: Callable[[], Iterable[Path]]) -> None:
+        self._directories = directories
+        self._root = os.stat("/")
+
+    def trouble(self) -> str:
+        """Return why this process cannot go on, in words; "" if it can.
+
+        It opens each directory, which takes free descriptors and the rights to it. An error that a new process would
+        have as well is no trouble. Blocks for some 10 µs for each directory.
+        """
+        if not os.path.samestat(self._root, os.stat("/")):
+            return "has another root directory than it was started in (chroot)"
+        for directory in self._directories():
+            try:
+                _open(directory)
+            except OSError as error:
+                if error.errno not in _OF_ALL:
+                    name = errno.errorcode.get(error.errno or 0, "OSError")
+                    return f"cannot open {directory}: {name} ({error.strerror})"
+        return ""
+
+
+def _open(directory: Path) -> None:
+    opened = [os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)]
+    try:
+        opened.extend(os.dup(opened[0]) for _ in range(_SPARE - 1))
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)

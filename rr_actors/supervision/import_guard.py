@@ -7,6 +7,7 @@ waits for the start has the module's import lock, and the worker that pickles th
 
 from __future__ import annotations
 
+import itertools
 import sys
 from typing import cast
 
@@ -41,29 +42,22 @@ def check_children_can_import(spec: ChildSpec, path: str, what: str) -> None:
         return
     inner = spec.actor_class_or_manager
     if spec.placement == "process":
-        _check(pickling.modules_of(spec, f"the ChildSpec of {path}"), now, path, what)
+        for module in sorted(pickling.modules_of(spec, f"the ChildSpec of {path}")):
+            # The import of "a.b.c" imports "a" and "a.b", too.
+            for name in itertools.accumulate(module.split("."), "{}.{}".format):
+                if name in now:
+                    raise UsageError(
+                        f"{what}: refused while module {name!r} is being imported: the process of {path} must import "
+                        f"{module!r}, and would run this call again. {_INSTEAD}; or move what {path} needs to a module "
+                        f"that can be imported without {name!r}"
+                    )
     elif isinstance(inner, Supervisor):
         for child in inner.child_specs:
             check_children_can_import(child, f"{path}/{child.id}", what)
 
 
-def _check(modules: set[str], now: set[str], path: str, what: str) -> None:
-    for module in sorted(modules):
-        for name in _with_packages(module):
-            if name in now:
-                raise UsageError(
-                    f"{what}: refused while module {name!r} is being imported: the process of {path} must import "
-                    f"{module!r}, and would run this call again. {_INSTEAD}; or move what {path} needs to a module "
-                    f"that can be imported without {name!r}"
-                )
-
-
 def check_no_child_imports(what: str) -> None:
-    """Check that this is no child process in the middle of an import: it would start one more system.
-
-    Raises:
-        UsageError: it is one.
-    """
+    """Raise UsageError in a child process that is in the middle of an import: it would start one more system."""
     if fork_server.inherited is not None and (now := in_progress()):
         modules = ", ".join(map(repr, sorted(now)))
         raise UsageError(
@@ -78,9 +72,3 @@ def _is_initializing(module: object) -> bool:
     except AttributeError:
         return False
     return getattr(spec, "_initializing", False) is True
-
-
-def _with_packages(module: str) -> list[str]:
-    """Return "a", "a.b" and "a.b.c" for "a.b.c": the import of the last imports the others."""
-    parts = module.split(".")
-    return [".".join(parts[: count + 1]) for count in range(len(parts))]

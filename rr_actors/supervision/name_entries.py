@@ -30,32 +30,24 @@ class Entries:
 
         An error is logged: the directory may be gone, with the system.
         """
-        registrars: list[str] = []
         try:
             for where, child in starting_with(spec, path):
                 self._mark_one(child, where, status, why)
-                if is_manager(child):
-                    registrars.append(where.rpartition("/")[2])
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
-        return registrars if status is Status.GONE else []
+        return registrars_of(spec, path) if status is Status.GONE else []
 
     def announce(self, spec: ChildSpec, path: str) -> None:
-        """Mark the top of a tree, which has no supervisor, and all below it as STARTING.
-
-        Raises:
-            ConfigError: the directory cannot be written.
-        """
+        """Mark the top of a tree, which has no supervisor, and all below it as STARTING, or raise ConfigError."""
         for where, child in starting_with(spec, path):
             self._mark_one(child, where, Status.STARTING)
 
     def _mark_one(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> None:
         self._directory.mark(actor_key(path), status, why)
-        what = spec.actor_class_or_manager
-        if isinstance(what, type) and issubclass(what, Manager):
+        if (manager := manager_of(spec)) is not None:
             name = path.rpartition("/")[2]
             if status is Status.STARTING:  # others find it by its classes: `load(Cameras.open_camera, ...)`
-                self._directory.put_classes(name, class_names(what))
+                self._directory.put_classes(name, class_names(manager))
             self._directory.mark(registrar_key(name), status, why)
 
     def check_names(self, spec: ChildSpec, path: str) -> None:
@@ -98,18 +90,14 @@ class Entries:
         return [manager.rpartition("/")[2] for manager in managers - static]
 
 
-def is_manager(spec: ChildSpec) -> bool:
-    """Return whether the child is a Manager, which has a registrar."""
+def manager_of(spec: ChildSpec) -> type[Manager] | None:
+    """Return the child's class if it is a Manager, which has a registrar."""
     what = spec.actor_class_or_manager
-    return isinstance(what, type) and issubclass(what, Manager)
+    return what if isinstance(what, type) and issubclass(what, Manager) else None
 
 
 def check_managers(names: list[str], where: str) -> None:
-    """Check that no manager has the name of a client's registrar. Those are given up when their application is killed.
-
-    Raises:
-        InvalidSpec: a manager has such a name.
-    """
+    """Raise InvalidSpec for a manager with a client's name: its registrar would be given up with its application."""
     for name in names:
         if name.startswith(CLIENTS):
             expected = f"a manager's id that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
@@ -118,4 +106,4 @@ def check_managers(names: list[str], where: str) -> None:
 
 def registrars_of(spec: ChildSpec, path: str) -> list[str]:
     """Return the registrars of the child at `path` and of all that start with it. They are named like the managers."""
-    return [where.rpartition("/")[2] for where, child in starting_with(spec, path) if is_manager(child)]
+    return [where.rpartition("/")[2] for where, child in starting_with(spec, path) if manager_of(child) is not None]

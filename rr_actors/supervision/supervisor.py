@@ -7,7 +7,7 @@ import logging
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, cast
 
 import pykka
@@ -33,12 +33,12 @@ from rr_actors.base.errors import (
     is_a,
     shown,
 )
+from rr_actors.supervision.child_runs import Target
 from rr_actors.supervision.core import child_calls
 from rr_actors.supervision.core.child_calls import Counts
 from rr_actors.supervision.core.rendering import describe_settings
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.supervision.core.state import ChildState, Decision, ExitSupervisor, Reply
-from rr_actors.supervision.core.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
 from rr_actors.supervision.event_history import Record, Records
@@ -96,7 +96,7 @@ class SupervisorActor(LoopActor):
             place.path,
             place.node,
             target_of=target_of,
-            on_started=self._has_started,
+            on_started=lambda: self._all_up.set_result(None),
             on_exit=self._has_ended,
         )
         place.cut_short = lambda: self._supervision.stop(final=False)
@@ -129,9 +129,6 @@ class SupervisorActor(LoopActor):
     async def _after_stop(self, final: bool) -> None:
         await self._supervision.finish()
 
-    def _has_started(self) -> None:
-        self._all_up.set_result(None)
-
     def _has_ended(self, ending: ExitSupervisor) -> None:
         self._all_down.set_result(ending)
         if not self._all_up.done():
@@ -145,7 +142,7 @@ class SupervisorActor(LoopActor):
 
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
-        if isinstance(message, Change):
+        if isinstance(message, child_calls.Change):
             self._change(message, reply)  # answered later, so that other messages do not wait
         elif reply is None and not is_stop(message):
             logger.error(
@@ -157,26 +154,25 @@ class SupervisorActor(LoopActor):
     def on_receive(self, message: Any) -> Any:
         supervision = self._supervision
         match message:
-            case Question("which_children"):
+            case child_calls.Question("which_children"):
                 return [self._child(child.id) for child in child_calls.which_children(supervision.tree)]
-            case Question("which_child", id):
+            case child_calls.Question("which_child", id):
                 return self._child(id)
-            case Question("count_children"):
+            case child_calls.Question("count_children"):
                 return child_calls.count_children(supervision.tree)
-            case Question("get_childspec", id):
+            case child_calls.Question("get_childspec", id):
                 return child_calls.get_childspec(supervision.tree, id)
-            case Question("history"):
+            case child_calls.Question("history"):
                 return supervision.history.records()
-            case Question("describe"):
+            case child_calls.Question("describe"):
                 return self._describe()
-            case ChildUpdated(id, spec):
+            case child_calls.ChildUpdated(id, spec):
                 supervision.tree = child_calls.update_child(supervision.tree, id, spec)
                 return supervision.tree.spec
             case _:
-                what = f"expected a supervisor's call, got {shown(message)}"
-                raise UsageError(f"supervisor {supervision.path}: {what}")
+                raise UsageError(f"supervisor {supervision.path}: expected a supervisor's call, got {shown(message)}")
 
-    def _change(self, change: Change, reply: pykka.Future[Any] | None) -> None:
+    def _change(self, change: child_calls.Change, reply: pykka.Future[Any] | None) -> None:
         def answer(outcome: Reply) -> None:
             if reply is None:
                 return
@@ -192,16 +188,16 @@ class SupervisorActor(LoopActor):
                 raise
             fail(reply, error)
 
-    def _decide(self, change: Change, answer: Answer) -> Decision:
+    def _decide(self, change: child_calls.Change, answer: Answer) -> Decision:
         tree, now, subject = self._supervision.tree, time.monotonic(), change.subject
         match change.name:
             case "start_child":
                 if isinstance(subject, ChildSpec | Supervisor) and subject.id not in tree.children:
                     new = as_child_spec(subject)
+                    where = self._supervision.path_of(new.id)
                     if not isinstance(new.actor_class_or_manager, Supervisor):
-                        where = self._supervision.path_of(new.id)
                         check_hostable(new.actor_class_or_manager, where, new.args, new.kwargs)
-                    self._supervision.check_names(new)
+                    self._supervision.entries.check_names(new, where)
                 return child_calls.start_child(tree, subject, answer, now)
             case "terminate_child":
                 return child_calls.terminate_child(tree, subject, answer, now)
@@ -231,7 +227,7 @@ class SupervisorActor(LoopActor):
         return Child(id, ref, child.spec.type, child.state, None if life is None else life.pid)
 
 
-def target_of(spec: ChildSpec) -> tuple[type[Any], Sequence[Any], Mapping[str, Any]]:
+def target_of(spec: ChildSpec) -> Target:
     """Return the class to start for a child in this process, and its arguments.
 
     Raises:
@@ -277,7 +273,7 @@ class SupervisorRef:
 
     def which_children(self) -> list[Child]:
         """Return all children, newest first, as in OTP."""
-        return self._ask(Question("which_children"))
+        return self._ask(child_calls.Question("which_children"))
 
     def which_child(self, id: str | pykka.ActorRef[Any]) -> Child:
         """Return one child, as which_children() lists it.
@@ -285,11 +281,11 @@ class SupervisorRef:
         Raises:
             NotFound: there is no such child.
         """
-        return self._ask(Question("which_child", self._id_of(id)))
+        return self._ask(child_calls.Question("which_child", self._id_of(id)))
 
     def count_children(self) -> Counts:
         """Return the numbers of specifications, of running children, of supervisors and of workers."""
-        return self._ask(Question("count_children"))
+        return self._ask(child_calls.Question("count_children"))
 
     def get_childspec(self, id: str | pykka.ActorRef[Any]) -> ChildSpec:
         """Return the specification of a child; under simple_one_for_one also of the template, by its id.
@@ -297,15 +293,15 @@ class SupervisorRef:
         Raises:
             NotFound: there is no such child.
         """
-        return self._ask(Question("get_childspec", self._id_of(id)))
+        return self._ask(child_calls.Question("get_childspec", self._id_of(id)))
 
     def history(self) -> Records:
         """Return the last 1000 events of the children since the supervisor's own start, oldest first, as a list."""
-        return Records(self._ask(Question("history")))
+        return Records(self._ask(child_calls.Question("history")))
 
     def describe(self) -> dict[str, Any]:
         """Return the supervisor's settings, and its children in their order with restarts and age, as plain data."""
-        return self._ask(Question("describe"))
+        return self._ask(child_calls.Question("describe"))
 
     def start_child(self, spec: ChildSpec | Supervisor | Sequence[Any]) -> ActorRef[Any] | None:
         """Add a child and start it. Return its reference when it is ready, or None if its on_start returned IGNORE.
@@ -330,7 +326,7 @@ class SupervisorRef:
         else:
             child = as_child_spec(cast("ChildSpec | Supervisor", spec))
             check_children_can_import(child, f"{self.path}/{child.id}", f"supervisor {self.path}: start_child()")
-        return self._ask(Change("start_child", spec))
+        return self._ask(child_calls.Change("start_child", spec))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
         """Stop a child and return when it is down. Its specification stays, unless it is temporary or dynamic.
@@ -338,7 +334,7 @@ class SupervisorRef:
         Raises:
             NotFound: there is no such child.
         """
-        self._ask(Change("terminate_child", self._id_of(id)))
+        self._ask(child_calls.Change("terminate_child", self._id_of(id)))
 
     def restart_child(self, id: str | pykka.ActorRef[Any]) -> ActorRef[Any] | None:
         """Start a stopped child. Return its reference when it is ready, or None if its on_start returned IGNORE.
@@ -348,7 +344,7 @@ class SupervisorRef:
             ChildRunning, ChildRestarting: the child is not stopped.
             StartFailed: the child did not start, and stays stopped. `__cause__` has the reason.
         """
-        return self._ask(Change("restart_child", self._id_of(id)))
+        return self._ask(child_calls.Change("restart_child", self._id_of(id)))
 
     def delete_child(self, id: str | pykka.ActorRef[Any]) -> None:
         """Remove a stopped child's specification.
@@ -357,7 +353,7 @@ class SupervisorRef:
             NotFound: there is no such child.
             ChildRunning, ChildRestarting: the child is not stopped.
         """
-        self._ask(Change("delete_child", self._id_of(id)))
+        self._ask(child_calls.Change("delete_child", self._id_of(id)))
 
     def update(self, spec: Supervisor) -> None:
         """Give the supervisor a new specification.
@@ -369,13 +365,13 @@ class SupervisorRef:
         """
         if not is_a(spec, Supervisor):
             raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
-        self._ask(Change("update", spec))
+        self._ask(child_calls.Change("update", spec))
         path, new = self.path, spec
         while "/" in path:  # the parent must have the new specification for the next start
             path, _, id = path.rpartition("/")
-            new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(ChildUpdated(id, new))
+            new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(child_calls.ChildUpdated(id, new))
 
-    def _ask(self, call: SupervisorCall) -> Any:
+    def _ask(self, call: child_calls.SupervisorCall) -> Any:
         asker = _asker_below(self.path)
         if asker is not None and _starts_here(self._ref):
             raise _too_early(self.path, asker)
@@ -385,7 +381,7 @@ class SupervisorRef:
             if asker is None:
                 raise
             raise _too_early(self.path, asker) from error
-        except (ActorDeadError, NoSupervisor) as error:
+        except (ActorDeadError, child_calls.NoSupervisor) as error:
             known = tuple(_supervisors(self.path.partition("/")[0]))
             raise NotFound(f"supervisor {self.path!r}: {error}{_listed(known)}", id=self.path, known=known) from error
 
@@ -457,7 +453,7 @@ def _too_early(path: str, asker: str) -> ActorUnavailable:
 def _supervisors(path: str) -> Iterator[str]:
     """Yield the paths of the supervisor at `path` and of the supervisors below it that answer."""
     try:
-        children: list[Child] = ref_to(path).ask(Question("which_children"), timeout=_LOOK_S)
+        children: list[Child] = ref_to(path).ask(child_calls.Question("which_children"), timeout=_LOOK_S)
     except (RrError, ActorDeadError, pykka.Timeout):
         return
     yield path

@@ -41,8 +41,16 @@ from rr_actors.registrar.arguments import check_text, state_path, stop_limit, sy
 from rr_actors.registrar.engine.server import check_not_own, serving
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.runtime.backlogs import Backlog
-from rr_actors.runtime.event_loop import FORKED, Course, Dispatcher, acquire, check_may_block, release
-from rr_actors.runtime.processes import fork_safety
+from rr_actors.runtime.event_loop import (
+    FORKED,
+    Course,
+    Dispatcher,
+    acquire,
+    check_may_block,
+    forget_in_children,
+    leave_in_children,
+    release,
+)
 from rr_actors.runtime.processes.process import keep_standard_fds
 from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
@@ -215,7 +223,7 @@ class System:
                 self._end = None
                 self._why_stopped = _NOT_RUNNING
                 self._dead_letters = Collection()
-                fork_safety.add(self, System._leave_to_parent)
+                leave_in_children(self, System._leave_to_parent)
                 starting.wait(dispatcher.course(self._start(info)))
             except BaseException as error:
                 steps = Steps()  # the caller must hear of the first failure
@@ -387,7 +395,7 @@ class System:
 
     def _give_back(self) -> None:
         steps = Steps()
-        fork_safety.discard(self)
+        forget_in_children(self)
         self._node = None
         pages, self._pages = self._pages, []
         for page in pages:
@@ -406,7 +414,7 @@ class System:
         steps.end(f"system {self.name!r}: not everything is given back")
 
     def _leave_to_parent(self) -> object:
-        """Forget all that runs, in a forked child, and return it for fork_safety.py to keep: it is the parent's."""
+        """Forget all that runs, in a forked child, and return it for event_loop.py to keep: it is the parent's."""
         left = (self._node, self._tree, self._console, self._dispatcher, self._state, self._pages)
         for page in self._pages:
             page.forget()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any
 
 import pytest
@@ -134,3 +135,26 @@ def test_the_workers_are_closed_while_it_waits_and_nothing_breaks(dispatcher: Di
 
     eventually(lambda: dispatcher.workers.threads == 0)
     assert list(failed) == []
+
+
+def test_a_coroutine_that_comes_after_the_end_is_closed(dispatcher: Dispatcher) -> None:
+    gate, failed = Gate(), Calls()
+    given: list[Coroutine[Any, Any, None]] = []
+
+    async def too_late() -> None: ...
+
+    def hear(_what: int) -> Any:
+        gate()
+        given.append(too_late())
+        return given[0]
+
+    of(dispatcher, hear, Calls(), failed).put(1)
+    gate.wait_arrived()
+    dispatcher.workers.close(timeout_s=0.0)
+    gate.open()
+
+    eventually(lambda: dispatcher.workers.threads == 0)
+    assert inspect.getcoroutinestate(given[0]) == inspect.CORO_CLOSED
+    ((error, what),) = failed.wait()
+    assert isinstance(error, Unavailable)
+    assert what == 1

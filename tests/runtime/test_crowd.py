@@ -59,7 +59,7 @@ def test_callbacks_that_wait_for_one_another_all_run(dispatcher: Dispatcher) -> 
 
 
 def test_no_callback_is_refused_because_all_threads_are_taken(dispatcher: Dispatcher) -> None:
-    dispatcher.workers.limit = 4
+    dispatcher.workers.set_limit(4)
     release, running, done = threading.Event(), threading.Semaphore(0), Calls()
 
     def callback(_number: int) -> None:

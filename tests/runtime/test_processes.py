@@ -294,7 +294,7 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
             said = hear(child.control)
             child.kill()
             wait_gone(child.pid)
-            child.kill_group()
+            lifeline.kill_group(child.pid)
             inside_s = wait_gone(said["inside"])
             assert lives(said["outside"])
             assert spawner.sweep() == 1
@@ -311,7 +311,7 @@ def test_a_python_without_pidfds_ends_what_a_child_started_all_the_same(
         said = hear(child.control)
         assert child.kill()
         assert exit_of(child).code == -signal.SIGKILL
-        child.kill_group()
+        lifeline.kill_group(child.pid)
         wait_gone(said["inside"])
         assert spawner.sweep() == 1
         wait_gone(said["outside"])

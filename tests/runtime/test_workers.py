@@ -6,6 +6,7 @@ import asyncio
 import contextvars
 import errno
 import functools
+import inspect
 import logging
 import os
 import threading
@@ -17,7 +18,7 @@ import pytest
 from rr_actors.base.errors import MailboxFull, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.thread_wakeup import EventBell
-from rr_actors.runtime.user_loop import is_coroutine
+from rr_actors.runtime.user_loop import is_coroutine, start_task
 from rr_actors.runtime.workers import Workers, is_async
 from support import Calls, Gate, eventually
 
@@ -726,12 +727,12 @@ def test_a_call_of_a_key_that_comes_while_the_first_is_refused_ends_too(
 
 
 def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    workers = Workers(lambda done, result, error: done(result, error), name="slow")
+    workers = Workers(lambda done, result, error: done(result, error))
     being_started, go_on = threading.Event(), threading.Event()
     start = threading.Thread.start
 
     def start_slowly(thread: threading.Thread) -> None:
-        if thread.name.startswith("slow-worker"):
+        if thread.name.startswith("rr-worker"):
             being_started.set()
             assert go_on.wait(10.0)
         start(thread)
@@ -763,3 +764,20 @@ def test_a_coroutine_that_comes_after_the_end_ends_its_thread_in_order(dispatche
     gate.open()
 
     eventually(lambda: workers.threads == 0)
+
+
+def test_a_coroutine_whose_task_is_cancelled_before_it_begins_is_closed() -> None:
+    done = Calls()
+
+    async def never_begun() -> None: ...
+
+    coroutine = never_begun()
+
+    async def cancel_at_once() -> None:
+        start_task(asyncio.get_running_loop(), coroutine, done, contextvars.Context()).cancel()
+        await asyncio.sleep(0.01)
+
+    asyncio.run(cancel_at_once())
+    ((result, error),) = done.wait()
+    assert (result, type(error)) == (None, asyncio.CancelledError)
+    assert inspect.getcoroutinestate(coroutine) == inspect.CORO_CLOSED

@@ -97,7 +97,7 @@ def test_whatever_comes_in_a_frame_is_a_message_or_a_named_error(wire: str, body
 @given(bodies=st.lists(message_like(), min_size=1, max_size=5), cut=st.integers(0, 400))
 def test_a_control_channel_takes_messages_or_closes(bodies: list[bytes], cut: int) -> None:
     received: list[Any] = []
-    channel = control_channel.Channel(received.append, lambda: None)
+    channel = control_channel.Channel("root/a", received.append, lambda: None)
     stream = b"".join(frame(body) for body in bodies)
     for part in (stream[:cut], stream[cut:]):
         channel.data_received(part)
@@ -389,7 +389,9 @@ def test_bad_bytes_leave_nothing_in_memory(tmp_path: Path) -> None:
         for _ in range(count):
             for wire in WIRES.values():
                 FrameReader(msgspec.msgpack.Decoder(wire), 10_000).feed(frame(chance.randbytes(60)))
-            control_channel.Channel(lambda message: None, lambda: None).data_received(frame(chance.randbytes(60)))
+            control_channel.Channel("root/a", lambda message: None, lambda: None).data_received(
+                frame(chance.randbytes(60))
+            )
             for read, good in READERS.values():
                 bad = bytearray(good)
                 bad[chance.randrange(len(bad))] = chance.randrange(256)

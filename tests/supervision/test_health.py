@@ -20,8 +20,8 @@ from rr_actors.base.errors import StartFailed
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.supervision.core import restarts
-from rr_actors.supervision.core.backoff import Backoff
-from rr_actors.supervision.health import Health
+from rr_actors.supervision.core.specs import Backoff
+from rr_actors.supervision.heartbeat import Health
 from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_gone, wait_respawned
 from support_children import hear
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
+import re
 import signal
 import socket
 from collections.abc import Callable
 from typing import Any
+
+import pytest
 
 import rr_actors as rr
 from rr_actors.supervision.control_channel import Channel, News
@@ -15,6 +19,15 @@ from support import Calls, Workshop, eventually
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
+
+
+class Talkative(rr.Manager):
+    """Logs ten megabytes, and then cannot start."""
+
+    def on_start(self) -> None:
+        for _ in range(100):
+            logging.getLogger("talkative").warning("x" * 100_000)
+        raise ValueError("no such device")
 
 
 def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order() -> None:
@@ -35,8 +48,8 @@ def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order()
             heard.append(message.event["number"])
             parent.rest()
 
-        parent = await Counting.open(there, received, lost.set)
-        child = await Channel.open(here, lambda message: None, lambda: None)
+        parent = await Counting.open(there, "root/a", received, lost.set)
+        child = await Channel.open(here, "root/a", lambda message: None, lambda: None)
         for number in range(1000):
             child.send(News({"number": number}))
             await asyncio.sleep(0)
@@ -49,6 +62,40 @@ def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order()
     asyncio.run(both())
 
     assert heard == list(range(1000))
+
+
+def test_a_damaged_channel_is_closed_with_the_name_of_its_child(caplog: pytest.LogCaptureFixture) -> None:
+    async def damage() -> None:
+        here, there = socket.socketpair()
+        lost = asyncio.Event()
+        await Channel.open(there, "root/cameras", lambda message: None, lost.set)
+        here.sendall(b"no frame of ours")
+        async with asyncio.timeout(5):
+            await lost.wait()
+        here.close()
+
+    asyncio.run(damage())
+    assert re.search("root/cameras: control channel closed: ", caplog.text)
+
+
+def test_a_child_that_cannot_start_sends_its_error_after_all_that_it_had_logged(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(rr.StartFailed, match="no such device"):
+        start(rr.ChildSpec(Talkative, id="talkative"))
+    assert len([record for record in caplog.records if record.name == "talkative"]) == 100
+
+
+def test_a_channel_whose_other_end_reads_nothing_is_given_up() -> None:
+    async def finish() -> None:
+        here, there = socket.socketpair()
+        channel = await Channel.open(here, "root/a", lambda message: None, lambda: None)
+        channel.send(News({"text": "x" * 10_000_000}))
+        async with asyncio.timeout(5):
+            await channel.finish(0.1)
+        there.close()
+
+    asyncio.run(finish())
 
 
 def test_what_a_killed_process_had_told_is_heard_before_its_end(start: Start, workshop: Workshop) -> None:

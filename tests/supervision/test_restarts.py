@@ -16,9 +16,8 @@ from rr_actors.base.errors import (
     UsageError,
 )
 from rr_actors.supervision.core import child_calls, restarts
-from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.core.child_calls import count_children, get_childspec, update_child, which_children
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
 from rr_actors.supervision.core.state import Exit, Mode, StartChild, Tree
 from support_simulated import Thing, World, child, world
 

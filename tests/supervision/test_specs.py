@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from rr_actors.base.errors import ConfigError, InvalidSpec
-from rr_actors.supervision.core.backoff import Backoff
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
+from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor, as_child_spec, starting_with
 from support_simulated import Thing, child
 
 

@@ -29,6 +29,7 @@ from rr_actors.base.errors import (
     ChildRestarting,
     ChildRunning,
     InvalidSpec,
+    MailboxFull,
     NotFound,
     NotSerializable,
     RestartIntensityExceeded,
@@ -36,11 +37,11 @@ from rr_actors.base.errors import (
     Unavailable,
     UsageError,
 )
-from rr_actors.supervision.core.backoff import Backoff
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+from rr_actors.runtime.workers import Workers
+from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.wire.name_service import Entry, Status, actor_key, open_state_dir, registrar_key
-from support import lives, quickly, wait_gone
+from support import Gate, lives, quickly, wait_gone
 from support_supervision import Idle, Log, StuckManager, Threaded, Tree, Worker, eventually, let_go
 
 Plant = Callable[..., Tree]
@@ -935,3 +936,26 @@ def test_a_supervisor_that_gives_up_takes_leave_of_the_managers_added_to_it(
     eventually(lambda: tree.records("restarted"))
     assert _registrar(tree, "shop") is Status.UP
     assert _registrar(tree, "added") is Status.GONE
+
+
+def take_all_threads(workers: Workers, gate: Gate) -> None:
+    while True:
+        workers.submit(gate)
+
+
+def test_children_are_restarted_while_callbacks_take_all_threads(plant: Plant, log: Log) -> None:
+    inner = Supervisor([worker(log, "a")], id="inner", placement="process")
+    tree = plant(inner, worker(log, "b"))
+    old = {path: tree.pid(path) for path in ("root/inner", "root/b")}
+    gate, workers = Gate(), tree.dispatcher.workers
+    workers.set_limit(1)
+    with pytest.raises(MailboxFull):
+        take_all_threads(workers, gate)
+    try:
+        for pid in old.values():
+            os.kill(pid, signal.SIGKILL)
+        for path, pid in old.items():
+            tree.pid(path, not_=pid)
+    finally:
+        gate.open()
+    assert {record.event for record in tree.supervisor().history()} == {"started", "exited", "restarted"}

@@ -115,7 +115,7 @@ class ForkServer:
             theirs.close()  # otherwise the pipe would not show the death of the server
             if not lifeline.is_readable(status_r, deadline - time.monotonic()):
                 raise TimeoutError("the fork server did not answer in time")
-            pid = _read_signed(status_r)
+            pid = read_signed(status_r)
             on_failure.pop_all()
         self._has_answered = True
         return Forked(pid, status_r, data_w)
@@ -185,12 +185,8 @@ def _tracker() -> int | None:
     return None if tracker is None else vars(tracker)["_resource_tracker"]._fd
 
 
-def _read_signed(fd: int) -> int:
-    """Read a number from a pipe. Blocks.
-
-    Raises:
-        EOFError: the writing process has ended before.
-    """
+def read_signed(fd: int) -> int:
+    """Read a number from a pipe; raise EOFError if the writing process has ended before. Blocks."""
     data = b""
     while len(data) < _SIGNED.size:
         more = os.read(fd, _SIGNED.size - len(data))
@@ -201,7 +197,9 @@ def _read_signed(fd: int) -> int:
 
 
 def _interpreter(call: str, fds: Sequence[int]) -> subprocess.Popen[bytes]:
-    command = [_executable(), *_interpreter_flags(), "-c", call]
+    spawn = sys.modules.get("multiprocessing.spawn")  # only this module can have another interpreter set
+    executable = sys.executable if spawn is None else os.fsdecode(vars(spawn)["get_executable"]())
+    command = [executable, *_interpreter_flags(), "-c", call]
     # A process group of its own, so that a ^C at the terminal reaches the parent alone, which decides.
     return subprocess.Popen(command, pass_fds=fds, stdin=subprocess.DEVNULL, process_group=0)
 
@@ -216,12 +214,6 @@ def _placed_apart() -> str:
     return f"import os, sys; {is_alike} and len(sys.argv) < {_PLACINGS} and {again}"
 
 
-def _executable() -> str:
-    """Return the interpreter that multiprocessing starts, too; only its module spawn can have another one set."""
-    spawn = sys.modules.get("multiprocessing.spawn")
-    return sys.executable if spawn is None else os.fsdecode(vars(spawn)["get_executable"]())
-
-
 def _sys_path() -> list[str]:
     return [path or _ORIGINAL_DIR or "" for path in sys.path]
 
@@ -230,21 +222,6 @@ inherited: ForkServer | None = None
 """The server that forked this process, or that this process is; None in a process that rr_actors has not made. Set by
 rr_actors/runtime/processes/child_bootstrap.py.
 """
-
-
-def inherit_or_launch(preload: Sequence[str], family: int) -> ForkServer:
-    """Return the server for this process: the inherited one while it runs, else a new one."""
-    if inherited is not None and inherited.is_running():
-        return inherited
-    return ForkServer.launch(preload, family)
-
-
-def read_code(status: int) -> int | None:
-    """Return the exit code in a status pipe, -N for signal N; None if the server ended before. Blocks."""
-    try:
-        return _read_signed(status)
-    except (EOFError, OSError):
-        return None
 
 
 # -- the launch message: written by the parent, run by the child -----------------------------------------------------

@@ -144,17 +144,15 @@ def _kill_marked(pid: int, mark: int) -> bool:
 
 def _orphans(family: int) -> Iterator[tuple[int, int]]:
     """Yield the processes of a family whose owner is dead, each with its mark."""
-    marks = ((int(name), _mark_of(name)) for name in _processes())
+    names: list[str] = []
+    with contextlib.suppress(OSError):
+        names = os.listdir("/proc")
+    marks = ((int(name), _mark_of(name)) for name in names if name.isdigit())
     members = {pid: found for pid, found in marks if found is not None and found >> _PID_BITS == family}
     for pid, found in members.items():
         owner = found & ((1 << _PID_BITS) - 1)
         if not (members.get(owner) == found and _is_alive(owner)) and _is_alive(pid):
             yield pid, found
-
-
-def _processes() -> Iterator[str]:
-    with contextlib.suppress(OSError):
-        yield from filter(str.isdigit, os.listdir("/proc"))
 
 
 def _mark_of(pid: str) -> int | None:

@@ -103,10 +103,6 @@ class Process:
             return False
         return True
 
-    def kill_group(self) -> None:
-        """SIGKILL the rest of the process group, after the death of the process."""
-        lifeline.kill_group(self.pid)
-
     def close(self) -> None:
         """Kill the process if it lives, and close its descriptors. On the loop's thread if it is watched."""
         self.kill()
@@ -157,7 +153,10 @@ class Process:
             self._loop.remove_reader(fd)
 
     def _collect(self, timeout_s: float = 0.0) -> None:
-        code = fork_server.read_code(self._status) if lifeline.is_readable(self._status, timeout_s) else None
+        code = None
+        if lifeline.is_readable(self._status, timeout_s):
+            with contextlib.suppress(EOFError, OSError):  # the fork server has ended before
+                code = fork_server.read_signed(self._status)
         self.exited = Exited(code, self._dead_at or time.monotonic())
 
 
@@ -262,7 +261,10 @@ class Spawner:
                 self._server.close()
                 self._server = None
             if self._server is None:
-                self._server = fork_server.inherit_or_launch(self._preload, self._family)
+                server = fork_server.inherited
+                if server is None or not server.is_running():
+                    server = ForkServer.launch(self._preload, self._family)
+                self._server = server
             return self._server
 
     def _discard(self, server: ForkServer) -> None:

@@ -91,11 +91,7 @@ _opening = threading.Lock()
 
 
 def break_at(frame: FrameType, name: str) -> None:
-    """Stop at the next line of the frame, and ask at the terminal. Without a terminal, log that and continue.
-
-    Args:
-        name: the process's name, for the prompt.
-    """
+    """Stop at the next line of the frame, and ask at the terminal. Without a terminal, log that and continue."""
     try:
         with _opening:
             if not _terminal:

@@ -19,6 +19,7 @@ import dataclasses
 from collections.abc import Hashable, Sequence
 from typing import Any, Literal, NamedTuple
 
+from msgspec import Struct
 from msgspec.structs import replace
 
 from rr_actors.base.checks import invalid
@@ -38,7 +39,45 @@ from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spe
 from rr_actors.supervision.core.state import Call, Child, Decision, Phase, Tree, Why
 from rr_actors.supervision.core.transition import Draft
 
-# -- calls ---------------------------------------------------------------------------------------------------------
+# -- messages ------------------------------------------------------------------------------------------------------
+
+
+class SupervisorCall(Struct, frozen=True):
+    """A message that only a supervisor understands. Handlers of other actors never get it."""
+
+
+class Change(SupervisorCall, frozen=True):
+    """A call that is answered when a child has started or stopped. The function `name` below decides it."""
+
+    name: Literal["start_child", "terminate_child", "restart_child", "delete_child", "update"]
+    subject: Any
+
+
+class Question(SupervisorCall, frozen=True):
+    """A call that is answered at once."""
+
+    name: Literal["which_children", "which_child", "count_children", "get_childspec", "history", "describe"]
+    id: str = ""
+
+
+class ChildUpdated(SupervisorCall, frozen=True):
+    """The child supervisor `id` has been given a new specification."""
+
+    id: str
+    spec: Supervisor
+
+
+class NoSupervisor(NotFound):
+    """The call went to an actor that is no supervisor."""
+
+
+def check_for_actor(message: object, actor: object) -> None:
+    """Raise NoSupervisor if a message to `actor`, which is no supervisor, is a call for one."""
+    if isinstance(message, SupervisorCall):
+        raise NoSupervisor(f"it is no supervisor, but a child of class {type(actor).__qualname__}")
+
+
+# -- changes -------------------------------------------------------------------------------------------------------
 
 
 def start_child(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, now: float) -> Decision:
@@ -91,13 +130,9 @@ def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decisi
     Error: InvalidSpec, with nothing changed, for another id, or a change from or to simple_one_for_one.
     """
     draft = Draft(tree, now)
-    try:
-        _check_update(tree, spec)
-    except InvalidSpec as error:
+    error = _update_error(tree, spec) or (None if draft.alive else draft.gone())
+    if error is not None:
         draft.reply([caller], error=error)
-        return draft.done()
-    if not draft.alive:
-        draft.reply([caller], error=draft.gone())
         return draft.done()
     new = spec.child_specs
     if tree.dynamic:
@@ -154,12 +189,9 @@ def count_children(tree: Tree) -> Counts:
 
 
 def get_childspec(tree: Tree, id: str) -> ChildSpec:
-    """Return the specification of a child, or the template for the template's id.
+    """Return the specification of a child, or the template for the template's id; raise NotFound if there is none.
 
     The specification of a dynamic child has the child's own id and all its arguments.
-
-    Raises:
-        NotFound: there is no such child.
     """
     if tree.dynamic and id == tree.template.id:
         return tree.template
@@ -167,11 +199,7 @@ def get_childspec(tree: Tree, id: str) -> ChildSpec:
 
 
 def find_child(tree: Tree, id: str) -> Child:
-    """Return the child of that id.
-
-    Raises:
-        NotFound: it names the supervisor, the id and the existing children.
-    """
+    """Return the child of that id; raise NotFound, with the existing children, if there is none."""
     child = tree.children.get(id)
     if child is None:
         raise _not_found(tree, id)
@@ -255,23 +283,18 @@ def _standing(child: Child) -> Literal["running", "restarting", "stopped"] | Non
 
 
 def _refusal(draft: Draft, child: Child, call: Call, standing: str) -> RrError:
-    who = f"{call.kind}_child({child.id!r})"
-    path = f"{draft.tree.path}/{child.id}"
     match call.kind, standing:
         case "start", "running":
-            return AlreadyStarted(f"{who}: {path} is running", id=child.id)
+            error, what = AlreadyStarted, "is running"
         case "start", "stopped":
-            return AlreadyPresent(
-                f"{who}: {path} exists and is stopped: call restart_child or delete_child", id=child.id
-            )
+            error, what = AlreadyPresent, "exists and is stopped: call restart_child or delete_child"
         case "start", _:
-            return AlreadyPresent(
-                f"{who}: {path} exists and is being restarted: call terminate_child first", id=child.id
-            )
+            error, what = AlreadyPresent, "exists and is being restarted: call terminate_child first"
         case _, "running":
-            return ChildRunning(f"{who}: {path} is running: call terminate_child first", id=child.id)
+            error, what = ChildRunning, "is running: call terminate_child first"
         case _:
-            return ChildRestarting(f"{who}: {path} is being restarted: call terminate_child first", id=child.id)
+            error, what = ChildRestarting, "is being restarted: call terminate_child first"
+    return error(f"{call.kind}_child({child.id!r}): {draft.tree.path}/{child.id} {what}", id=child.id)
 
 
 def _not_found(tree: Tree, id: str) -> NotFound:
@@ -292,18 +315,11 @@ def _absent(tree: Tree, id: str) -> RrError | None:
 
 
 def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable) -> Child:
-    """Return the child that start_child adds.
-
-    Raises:
-        InvalidSpec: this supervisor does not take such a child.
-        TooManyChildren: the supervisor has max_children.
-    """
+    """Return the child that start_child adds; raise InvalidSpec or TooManyChildren if there must not be one."""
     who = f"start_child of {tree.path}"
     if tree.dynamic:
         if not isinstance(spec, list | tuple):
-            expected = "a list of additional arguments, as it is simple_one_for_one"
-            text = f"{who}: expected {expected}, got a {type(spec).__name__}"
-            raise InvalidSpec(text, field="args", expected=expected, got=spec)
+            raise _wrong_type(who, "args", "a list of additional arguments, as it is simple_one_for_one", spec)
         limit = tree.spec.max_children
         if limit is not None and len(tree.children) >= limit:
             text = f"{who}: it has {len(tree.children)} children, and max_children is {limit}: terminate one first"
@@ -313,25 +329,28 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
         _ = child.start_spec  # raises InvalidSpec if the arguments are wrong
         return child
     if not isinstance(spec, ChildSpec | Supervisor):
-        expected = "a ChildSpec or Supervisor"
-        # The text has the type, not the repr: this runs on the loop, and a user's repr may do anything.
-        text = f"{who}: expected {expected}, got a {type(spec).__name__}"
-        raise InvalidSpec(text, field="spec", expected=expected, got=spec)
+        raise _wrong_type(who, "spec", "a ChildSpec or Supervisor", spec)
     check_significant(spec, tree.spec, spec.id)
     return Child(spec.id, as_child_spec(spec), why=Why.NEW, starters=(caller,))
 
 
-def _check_update(tree: Tree, spec: object) -> None:
+def _wrong_type(who: str, field: str, expected: str, got: object) -> InvalidSpec:
+    # The text has the type, not the repr: this runs on the loop, and a user's repr may do anything.
+    text = f"{who}: expected {expected}, got a {type(got).__name__}"
+    return InvalidSpec(text, field=field, expected=expected, got=got)
+
+
+def _update_error(tree: Tree, spec: object) -> InvalidSpec | None:
     who = f"update of {tree.path}"
     if not isinstance(spec, Supervisor):
-        raise invalid(who, "spec", "a Supervisor", spec)
+        return invalid(who, "spec", "a Supervisor", spec)
     if spec.id != tree.spec.id:
-        expected = f"{tree.spec.id!r}, its id"
-        raise invalid(who, "id", expected, spec.id)
+        return invalid(who, "id", f"{tree.spec.id!r}, its id", spec.id)
     if (spec.strategy == "simple_one_for_one") != tree.dynamic:
         expected = "simple_one_for_one" if tree.dynamic else "any but simple_one_for_one"
         text = (
             f"{who}: strategy: expected {expected} (children of the other kind cannot be kept), "
             f"got {shown(spec.strategy)}"
         )
-        raise InvalidSpec(text, field="strategy", expected=expected, got=spec.strategy)
+        return InvalidSpec(text, field="strategy", expected=expected, got=spec.strategy)
+    return None

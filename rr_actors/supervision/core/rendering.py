@@ -157,12 +157,13 @@ def svg_boxes(root: Node) -> dict[str, Box]:
 
 def _facts(node: Node) -> tuple[str, ...]:
     """Return the cells that follow the id in a line."""
+    restarts = node.get("restarts", 0)
     return (
         node["type"],
         _settings(node) or node.get("what", ""),
         _state(node),
-        _process(node),
-        _restarts(node),
+        "" if node.get("pid") is None else f"pid {node['pid']}",
+        f"{restarts} restart{'' if restarts == 1 else 's'}" if restarts else "",
         " ".join(str(node[key]) for key in ("restart", "placement") if key in node),
         "significant" if node.get("significant") else "",
     )
@@ -177,15 +178,6 @@ def _label(node: Node) -> list[str]:
 
 def _state(node: Node) -> str:
     return "unavailable" if "error" in node else node.get("state", "")
-
-
-def _process(node: Node) -> str:
-    return "" if node.get("pid") is None else f"pid {node['pid']}"
-
-
-def _restarts(node: Node) -> str:
-    count = node.get("restarts", 0)
-    return "" if not count else f"{count} restart{'' if count == 1 else 's'}"
 
 
 def _settings(node: Node) -> str:

@@ -13,9 +13,8 @@ from msgspec.structs import replace
 
 from rr_actors.base.errors import StartFailed, UsageError, text_of
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.core.child_calls import replay
-from rr_actors.supervision.core.specs import RestartType
+from rr_actors.supervision.core.specs import Backoff, RestartType
 from rr_actors.supervision.core.state import (
     Child,
     Decision,
@@ -28,7 +27,7 @@ from rr_actors.supervision.core.state import (
     Tree,
     Why,
 )
-from rr_actors.supervision.core.transition import Draft, exceeded
+from rr_actors.supervision.core.transition import Draft
 
 PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
 """The least wait after a start that failed for want of descriptors, memory or threads.
@@ -153,7 +152,11 @@ def decide_exit(tree: Tree, id: str, run: int, exit: Exit, now: float, chance: f
         case Child(phase=Phase.RUNNING):
             _exited(draft, child, exit, chance)
         case Child(phase=Phase.CONDEMNED):  # a group restart was about to stop it: its end does not count
-            _gone_early(draft, child, exit)
+            if child.spec.restart == "temporary" and child.why is Why.RESTART:
+                draft.down(child, "exited", exit)
+            else:
+                draft.report("exited", child, child.state, exit=exit)
+                draft.put(child, phase=Phase.DUE)
         case Child(phase=Phase.STARTING):
             return decide_start_failed(tree, id, run, StartFailed(f"ended before it was ready: {exit}"), now, chance)
         case _:
@@ -185,30 +188,21 @@ def _exited(draft: Draft, child: Child, exit: Exit, chance: float) -> None:
     backoff = child.spec.backoff
     if backoff and child.up_at is not None and draft.now - child.up_at >= backoff.maximum_s:
         child = draft.put(child, attempts=0)
-    if not draft.alive:
-        draft.down(child, "exited", exit)
-    elif needs_restart(child.spec.restart, exit.reason):
+    if draft.alive and needs_restart(child.spec.restart, exit.reason):
         _restart(draft, child, "exited", str(exit), chance, exit=exit)
-    else:
-        draft.down(child, "exited", exit)
+        return
+    draft.down(child, "exited", exit)
+    if draft.alive:
         _auto_shutdown(draft, child)
-
-
-def _gone_early(draft: Draft, child: Child, exit: Exit) -> None:
-    if child.spec.restart == "temporary" and child.why is Why.RESTART:
-        draft.down(child, "exited", exit)
-    else:
-        draft.report("exited", child, child.state, exit=exit)
-        draft.put(child, phase=Phase.DUE)
 
 
 def _restart(
     draft: Draft, child: Child, event: Event, reason: str, chance: float, least_s: float = 0.0, **details: Any
 ) -> None:
     """Count a restart of a child that is down, and start it or its group; give up if that restart is one too many."""
-    spec, count = draft.tree.spec, draft.count_restart(child, reason)
-    if count > spec.max_restarts:
-        error = exceeded(draft.tree.path, draft.tree.restarts, spec.max_restarts, spec.max_seconds, draft.now)
+    count = draft.count_restart(child, reason)
+    if count > draft.tree.spec.max_restarts:
+        error = draft.too_many_restarts()
         draft.down(child, event, restarts=count, **details)
         replay(draft, child.waiting)
         draft.report("gave_up", child, None if draft.forgets(child) else "stopped", error=error, restarts=count)

@@ -1,4 +1,4 @@
-"""ChildSpec and Supervisor: how to start, restart and stop children. Backoff is in backoff.py.
+"""ChildSpec, Supervisor and Backoff: how to start, restart and stop children.
 
 A specification is checked when it is made, so each one is valid. One check comes later, when the class is used: that
 it is a Manager, an Actor or a plain Pykka actor. Names and meanings are those of Erlang/OTP's supervisor. The
@@ -13,13 +13,54 @@ from typing import Any, Literal, cast, get_args
 
 from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
 from rr_actors.base.spec_files import FilePath, parse_child, read_supervisor
-from rr_actors.supervision.core.backoff import Backoff
 
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one"]
 RestartType = Literal["permanent", "transient", "temporary"]
 Shutdown = float | Literal["infinity", "brutal_kill"]
 AutoShutdown = Literal["never", "any", "all"]
 Placement = Literal["process", "thread"]
+
+
+@dataclass(frozen=True)
+class Backoff:
+    """Growing waiting times before the restarts of a child. The child's state is "restarting" meanwhile.
+
+    The n-th restart in a row (n from 0) waits ``min(maximum_s, delay_s * factor**n)``. A random part of that, up to
+    `jitter`, is taken off: children that failed together do not restart together. A child that has run for `maximum_s`
+    starts again with `delay_s`. Under one_for_all and rest_for_one the child that failed delays its group.
+    Delayed restarts count: the supervisor's max_restarts within max_seconds should leave room for the first ones.
+
+    Args:
+        delay_s: seconds before the first restart, at least 0.
+        factor: growth from one wait to the next, at least 1.
+        maximum_s: the longest wait in seconds, at least delay_s.
+        jitter: 0 (none) to 1 (anything between no wait and all of it).
+
+    Raises:
+        InvalidSpec: naming the field.
+    """
+
+    delay_s: float = 0.1
+    factor: float = 2.0
+    maximum_s: float = 30.0
+    jitter: float = 0.1
+
+    def __post_init__(self) -> None:
+        who = "Backoff"
+        check_number(self.delay_s, who, "delay_s", least=0)
+        check_number(self.factor, who, "factor", least=1)
+        check_number(self.maximum_s, who, "maximum_s", least=0)
+        check_number(self.jitter, who, "jitter", least=0, most=1)
+        if self.maximum_s < self.delay_s:
+            raise invalid(who, "maximum_s", f"at least delay_s ({self.delay_s:g})", self.maximum_s)
+
+    def delay(self, attempt: int, chance: float) -> float:
+        """Return the seconds before restart number `attempt` (from 0); `chance` is a random number in [0, 1]."""
+        try:
+            wait_s = min(self.maximum_s, self.delay_s * self.factor**attempt)
+        except OverflowError:
+            wait_s = self.maximum_s if self.delay_s else 0.0
+        return wait_s * (1 - self.jitter * chance)
 
 
 @dataclass(frozen=True)
@@ -237,11 +278,7 @@ def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]
 
 
 def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, where: str) -> None:
-    """Check that `child` may be one of `supervisor`: none is significant where auto_shutdown is "never".
-
-    Raises:
-        InvalidSpec: of the field `where`.significant.
-    """
+    """Raise InvalidSpec, of the field `where`.significant, if `child` is significant and auto_shutdown is "never"."""
     if child.significant and supervisor.auto_shutdown == "never":
         expected = f"False for {child.id!r}, as auto_shutdown is 'never'"
         raise invalid(f"Supervisor {supervisor.id!r}", f"{where}.significant", expected, True)

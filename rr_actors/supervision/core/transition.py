@@ -134,6 +134,21 @@ class Draft:
         self.tree = replace(self.tree, restarts=(*counted, Restart(self.now, child.id, reason)))
         return len(self.tree.restarts)
 
+    def too_many_restarts(self) -> RestartIntensityExceeded:
+        """Return the error for the restarts that count. It names the child of each, how many seconds ago, and why."""
+        spec = self.tree.spec
+        listed = [(restart.id, self.now - restart.at, restart.reason) for restart in self.tree.restarts]
+        text = "; ".join(f"{id} {ago:.3g} s ago: {reason}" for id, ago, reason in listed)
+        needed = f"{len(listed)} restart{'s' if len(listed) > 1 else ''}"
+        return RestartIntensityExceeded(
+            f"supervisor {self.tree.path}: {needed} needed within {spec.max_seconds:g} s, {spec.max_restarts} allowed: "
+            f"{text}",
+            supervisor=self.tree.path,
+            restarts=listed,
+            limit=spec.max_restarts,
+            max_seconds=spec.max_seconds,
+        )
+
     def restart(self, child: Child, delay_s: float) -> None:
         """Start a child that is down, or its group, again."""
         child = self.put(child, phase=Phase.DUE, why=Why.RESTART, attempts=child.attempts + 1, starters=())
@@ -237,28 +252,10 @@ class Draft:
         return not any(c.phase in coming and c.why in (Why.INIT, Why.RESTART) for c in self.children.values())
 
 
-# Restart intensity: how many restarts count, in a sliding window, and when they are too many.
-#
-# OTP's manual: more than `intensity` restarts within `period` seconds end the supervisor. Inclusive on both sides: a
-# restart exactly max_seconds old still counts, and exactly max_restarts of them are still allowed.
-
-
 def within(restarts: tuple[Restart, ...], now: float, max_seconds: float) -> tuple[Restart, ...]:
-    """Return the restarts that still count at `now`."""
+    """Return the restarts that still count at `now`, in a sliding window.
+
+    OTP's manual: more than `intensity` restarts within `period` seconds end the supervisor. Inclusive on both sides: a
+    restart exactly max_seconds old still counts, and exactly max_restarts of them are still allowed.
+    """
     return tuple(restart for restart in restarts if now <= restart.at + max_seconds)
-
-
-def exceeded(
-    path: str, restarts: tuple[Restart, ...], limit: int, max_seconds: float, now: float
-) -> RestartIntensityExceeded:
-    """Return the error for too many restarts. It names the child of each, how many seconds ago, and why."""
-    listed = [(restart.id, now - restart.at, restart.reason) for restart in restarts]
-    text = "; ".join(f"{id} {ago:.3g} s ago: {reason}" for id, ago, reason in listed)
-    needed = f"{len(restarts)} restart{'s' if len(restarts) > 1 else ''}"
-    return RestartIntensityExceeded(
-        f"supervisor {path}: {needed} needed within {max_seconds:g} s, {limit} allowed: {text}",
-        supervisor=path,
-        restarts=listed,
-        limit=limit,
-        max_seconds=max_seconds,
-    )

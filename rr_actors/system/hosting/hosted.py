@@ -26,8 +26,8 @@ from rr_actors.registrar.declarations import Declared
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.time_limits import wait_while_running
+from rr_actors.supervision.core.child_calls import check_for_actor
 from rr_actors.supervision.core.specs import Shutdown
-from rr_actors.supervision.core.supervisor_calls import check_for_actor
 from rr_actors.supervision.import_guard import in_progress
 from rr_actors.system.hosting.node import Node
 
