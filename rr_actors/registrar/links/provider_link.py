@@ -67,7 +67,8 @@ class Client:
         self._task: asyncio.Task[None] | None = None
         self._asked = False
         self._chunks: list[FetchedQuery] = []
-        self._fetching: list[Fetching] = []
+        self._fetching: list[Fetching] = []  # called fetch(), oldest first
+        self._listed_for = 0  # how many of them the last Fetch asks for: those that had called before it was sent
         self._reconciled = False
         self._known: digests.Known | None = None  # the rows held there, and their digests, when last looked at
         self._number = registrar.epoch << 32  # the number of the last Fetch
@@ -139,11 +140,10 @@ class Client:
     def fetch(self, done: Fetching) -> None:
         """Ask for the queries that this registrar holds at the provider; `done` gets them, or the error."""
         self._fetching.append(done)
-        if self.link is not None and self._reconciled and len(self._fetching) == 1:
-            self._send_fetch(resume=False)
-            self.link.flush()
-        else:
+        if self.link is None:
             self.want()
+        elif self._reconciled and len(self._fetching) == 1:  # else the next Fetch is sent when the last is answered
+            self._send_fetch(self.link, resume=False)
 
     def take_leave(self) -> None:
         """Have the provider release all queries, also those of threads, as this registrar does not come back."""
@@ -240,17 +240,17 @@ class Client:
         self._reconciled = False
         self._described.clear()
         self._chunks.clear()
-        self._send_fetch(resume=True, known=known)
+        self._send_fetch(link, resume=True, known=known)
         self.opened = self._number
-        link.flush()
 
     def _hello(self, kind: str) -> Hello:
         return Hello(kind, self.provider, self._registrar.name, self._registrar.epoch)
 
-    def _send_fetch(self, *, resume: bool, known: digests.Known | None = None) -> None:
-        assert self.link is not None
+    def _send_fetch(self, link: Link, *, resume: bool, known: digests.Known | None = None) -> None:
         self._number += 1
-        self.link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
+        self._listed_for = len(self._fetching)
+        link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
+        link.flush()
 
     def _say_releases_wait(self, entry: Entry) -> None:
         """Log that callers wait for releases at a provider that has to be started again."""
@@ -262,7 +262,9 @@ class Client:
 
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False
-        self._answer_fetching(None, error)
+        fetching, self._fetching = self._fetching, []
+        for done in fetching:
+            done(None, error)
         self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id()))
 
     @property
@@ -328,16 +330,11 @@ class Client:
             reconcile = c.Reconcile(self.provider, queries, new_id(), message.same, message.number)
             # with `more`: notices follow, which say why a query is not in the list
             self._registrar.post(reconcile, more=link.more)
-            if message.same and self._fetching:  # fetch() was called since, and needs all queries listed
-                self._send_fetch(resume=False)
-                link.flush()
-                return
-        self._answer_fetching(queries, None)
-
-    def _answer_fetching(self, queries: list[FetchedQuery] | None, error: Exception | None) -> None:
-        fetching, self._fetching = self._fetching, []
-        for done in fetching:
-            done(queries, error)
+        answered, self._fetching = self._fetching[: self._listed_for], self._fetching[self._listed_for :]
+        for done in answered:
+            done(queries, None)
+        if self._fetching and self.link is link:
+            self._send_fetch(link, resume=False)
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Note that the link is down, and connect again if anything is open at the provider."""
