@@ -114,7 +114,7 @@ class Connections:
             if kept:
                 self._idle.append(client)
         if not kept:
-            client.close()
+            client.drop()
 
     def _forget_idle(self) -> None:
         """Close the idle connections: their system has ended."""
