@@ -43,15 +43,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved
 from rr_actors.registrar.model.effects import Effect
-from rr_actors.registrar.model.messages import (
-    Gone,
-    Load,
-    Loaded,
-    Message,
-    Noticed,
-    error_of,
-    failure_of,
-)
+from rr_actors.registrar.model.messages import Gone, Load, Loaded, Message, Noticed, error_of, failure_of
 from rr_actors.registrar.model.rows import OK, OWED, PENDING, Change, Content, Drop, Held, Put, Row
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.workers import Workers
@@ -143,7 +135,8 @@ class RegistrarState:
         """Return the catalog, and roll back a decision that an interrupt left unfinished. With the lock."""
         catalog = self.catalog
         if catalog.unfinished is not None:
-            self._roll_back(catalog)
+            self._commits.restore(catalog)
+            catalog.unfinished = None
         return catalog
 
     def commit(self, items: Iterable[Item]) -> Decision:
@@ -161,9 +154,7 @@ class RegistrarState:
                     decision.undo()
                     raise
                 decision.close()
-            except CatalogError:
-                raise
-            except BaseException:  # an interrupt, or a defect: at any instruction
+            except BaseException:  # an interrupt at any instruction, or a defect: a decision that was undone is whole
                 self.whole()
                 raise
             return decision
@@ -308,10 +299,6 @@ class RegistrarState:
                 raise
             return gone
 
-    def _roll_back(self, catalog: Catalog) -> None:
-        self._commits.restore(catalog)
-        catalog.unfinished = None
-
     def down(self) -> RegistrarDown:
         """Return the error that callers of a closed registrar get."""
         return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
@@ -417,7 +404,8 @@ class Monitor:
 
     def put(self, what: Any, sender: str | None = None, *, more: bool = False) -> None:
         """Decide a message or command behind those that wait, and act; with `more`, in the loop's next turn."""
-        if not (self._waiting or self._busy or self._held_up or more or self._gathers or self._state.is_inside()):
+        later = more or self._gathers or self._state.is_inside()
+        if not (later or self._waiting or self._busy or self._held_up):
             self._busy = True
             try:
                 self._decide(((what, sender),))
@@ -430,12 +418,11 @@ class Monitor:
         self._waiting.append((what, sender))
         if self._busy or self._held_up:
             return
-        if more or self._gathers or self._state.is_inside():
-            if not self._scheduled:
-                self._scheduled = True
-                self._dispatcher.loop.call_soon(self._turn)
-        else:
+        if not later:
             self.decide_waiting()
+        elif not self._scheduled:
+            self._scheduled = True
+            self._dispatcher.loop.call_soon(self._turn)
 
     def decide_here(self, command: c.Command) -> bool:
         """Decide a command in the calling thread. Return False if the loop has to decide it.
@@ -761,14 +748,11 @@ class CommitLog:
         except Exception:  # a CatalogError, or a defect that has ended the registrar: close the store all the same
             logger.exception("%s: could not save at closing", self._name)
         finally:
-            self._close_store(erase=erase)
-
-    def _close_store(self, *, erase: bool) -> None:
-        try:
-            with self.lock:
-                self._store.close(erase=erase)
-        except CatalogError:
-            logger.exception("%s: its catalog could not be closed, or removed", self._name)
+            try:
+                with self.lock:
+                    self._store.close(erase=erase)
+            except CatalogError:
+                logger.exception("%s: its catalog could not be closed, or removed", self._name)
 
     def _save_after(self, delay_s: float) -> None:
         if not self._closed:

@@ -39,17 +39,7 @@ class Status:
         repeated: whether the status may have been heard before; a crash made that uncertain.
     """
 
-    __slots__ = (
-        "_event",
-        "_handled",
-        "_spares",
-        "message",
-        "query_id",
-        "repeated",
-        "resource_id",
-        "source",
-        "state",
-    )
+    __slots__ = ("_event", "_handled", "_spares", "message", "query_id", "repeated", "resource_id", "source", "state")
 
     def __init__(
         self,

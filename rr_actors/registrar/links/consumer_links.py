@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.registrar.links.local_line import LocalLine
+from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
     Fetch,
@@ -190,8 +191,9 @@ class Consumers:
 
     def expel(self, origin: str) -> None:
         """Close the link and the lines of a consumer that does not come back, and ignore their messages."""
-        for line in self.routes.lines_of(origin):
-            line.close()
+        for line in self.routes.lines():
+            if line.hello.origin == origin:
+                line.close()
         link = self._links.pop(origin, None)
         if link is not None:
             link.close()
@@ -205,7 +207,7 @@ class Consumers:
 
     def _lost(self, origin: str) -> None:
         self.routes.link_lost(origin)
-        self._provider.consumer_lost(origin)
+        self._provider.post(c.ConsumerLost(origin))
 
     def listens_to(self, origin: str, epoch: int) -> bool:
         """Return whether direct lines of the consumer's incarnation `epoch` may ask: as long as that has a link."""
@@ -338,11 +340,8 @@ class Routes:
             for query_id in [query_id for query_id, route in list(ways.lines.items()) if route is line]:
                 del ways.lines[query_id]
 
-    def lines_of(self, consumer: str) -> list[Any]:
-        """Return the lines of a consumer's threads that wait for an answer."""
-        return [line for line in self._lines() if line.hello.origin == consumer]
-
-    def _lines(self) -> list[Any]:
+    def lines(self) -> list[Any]:
+        """Return the lines that wait for an answer."""
         return [*self._loads.lines.values(), *self._unloads.lines.values()]
 
     def link_lost(self, consumer: str) -> None:
@@ -353,6 +352,6 @@ class Routes:
 
     def clear(self) -> list[Any]:
         """Forget all questions; return the lines that wait for an answer."""
-        lines = self._lines()
+        lines = self.lines()
         self.__init__()
         return lines
