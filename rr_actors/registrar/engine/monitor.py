@@ -84,9 +84,6 @@ def answered_by_line(_error: RrError | None) -> None:
 class RegistrarState:
     """The catalog of one registrar, in memory and on disk.
 
-    Args:
-        store: the open storage of the catalog.
-
     Attributes:
         lock: held by the thread that decides, or that reads more than one entry. enter() returns it.
         is_inside: whether the calling thread has the lock; is_deciding() asks it.
@@ -501,7 +498,7 @@ class Monitor:
             self._busy = False
 
     def _decide(self, items: Sequence[Item]) -> None:
-        failed: CatalogError | None = None
+        failure = ""
         try:
             with self._state.lock:  # held until items that were not committed wait again: no thread overtakes them
                 try:
@@ -511,9 +508,8 @@ class Monitor:
                     if decision.effects:
                         self._effects.append(decision.effects)
                 except CatalogError as error:
-                    failed = error
+                    failure = str(error)
                     self._not_committed(items, error)
-            failure = "" if failed is None else str(failed)
             if failure and failure != self._failure:
                 logger.error("%s: not committed, nothing was done: %s", self._state.name, failure)
             self._failure = failure if self._held_up else ""
@@ -707,7 +703,6 @@ class CommitLog:
             self._on_loop(self._save_after, self._delay_s)
 
     def _on_loop(self, fn: Callable[..., object], *args: Any) -> None:
-        """Schedule a call on the loop, from any thread."""
         with contextlib.suppress(RuntimeError):  # the loop has ended: close() writes the unsaved changes
             self._loop.call_soon_threadsafe(fn, *args)
 

@@ -69,8 +69,6 @@ class RegistrarActor(RegistrarState):
 
     Args:
         node: the process's runtime: dispatcher, transports, directory.
-        name: the registrar's name.
-        store: the open storage of its catalog.
     """
 
     def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
@@ -399,17 +397,15 @@ class Servers:
         """
         registrar, name = self._registrar, server.spec.name
         old = self._by_name.get(name)
-        if old is not None and old.restored:
-            self._by_name[name] = server
-            registrar.catalog.servers[name] = server.facts
-            registrar.consumers.tell_all(Described(name, server.types))
-            return
-        if old is not None:
+        if old is not None and not old.restored:
             text = f"server {server.origin}: registered already; unregister it first, or take another name"
             raise NameTaken(text, name=name)
         self._by_name[name] = server
         registrar.consumers.tell_all(Described(name, server.types))
-        registrar.post(c.Register(server.facts, new_id()))
+        if old is None:
+            registrar.post(c.Register(server.facts, new_id()))
+        else:
+            registrar.catalog.servers[name] = server.facts
 
     def register_again(self) -> None:
         """Register all servers again, in a catalog that was read anew."""

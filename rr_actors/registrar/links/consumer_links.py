@@ -57,10 +57,14 @@ class Consumers:
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
-        """Return the function that receives the link of a consumer."""
+        """Return the function that receives the link of a consumer; it replaces an older one."""
 
         def attach(link: Link) -> _Inlet:
-            self.opened(origin, link)
+            old = self._links.get(origin)
+            self._links[origin] = link
+            if old is not None:
+                old.close()
+                self._lost(origin)
             return _Inlet(functools.partial(self.received, origin), functools.partial(self.lost, origin))
 
         return attach
@@ -168,14 +172,6 @@ class Consumers:
     def link_of(self, origin: str) -> Link | None:
         """Return the link of a consumer, or None."""
         return self._links.get(origin)
-
-    def opened(self, origin: str, link: Link) -> None:
-        """Add the link of a consumer; it replaces an older one."""
-        old = self._links.get(origin)
-        self._links[origin] = link
-        if old is not None:
-            old.close()
-            self._lost(origin)
 
     def received(self, origin: str, link: Link, message: Any) -> None:
         """Pass on a message of a link. If a newer link is open, ignore it: the consumer sends it again over that."""
