@@ -89,7 +89,6 @@ class RegistrarState:
         is_inside: whether the calling thread has the lock; is_deciding() asks it.
         closed: whether the registrar is closed; then nothing is decided any more.
         waiting: the messages and commands that are not decided yet (Monitor). A new one of a thread waits behind them.
-        row_by_row: whether a message or row is committed by itself, and at once; otherwise many share a commit.
         sequence: the running numbers of queries, in the order in which they are asked for. Releases go newest first.
         loads, unloads: by query, the callback that hears how its load, or its release, ended.
     """
@@ -99,12 +98,11 @@ class RegistrarState:
     ) -> None:
         self.name = name
         self.config = config
-        self.lock = threading.RLock()
+        self._commits = CommitLog(name, config, store, loop, workers)
+        self.lock = self._commits.lock
         self.is_inside: Callable[[], bool] = self.lock._is_owned  # type: ignore[attr-defined]  # as in threading
-        self._commits = CommitLog(name, config, store, loop, workers, self.lock)
         self.catalog = Catalog(name, self._commits.content(), store.epoch)
         self.epoch = store.epoch
-        self.row_by_row = self._commits.row_by_row
         self.waiting: deque[tuple[Any, str | None]] = deque()
         self.sequence = itertools.count(self.catalog.seq + 1)
         self.loads: dict[str, LoadWaiter] = {}
@@ -331,7 +329,7 @@ class Monitor:
         self._runner = EffectRunner(registrar)
         self._effects: deque[list[Effect]] = deque()  # those of each decision, to be carried out on the loop
         self._waiting = self._state.waiting
-        self._gathers = not self._state.row_by_row
+        self._gathers = not registrar._commits.row_by_row  # many messages share a commit
         self._busy = False  # the loop is deciding or acting: a new message waits until it has finished
         self._scheduled = False  # a turn of the loop is scheduled
         self._held_up = False  # a commit failed and is tried again later; nothing is decided before that
@@ -583,15 +581,9 @@ class CommitLog:
     """
 
     def __init__(
-        self,
-        name: str,
-        config: RegistrarConfig,
-        store: Store,
-        loop: AbstractEventLoop,
-        workers: Workers,
-        lock: AbstractContextManager[Any],
+        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
     ) -> None:
-        self.lock = lock
+        self.lock = threading.RLock()
         self._name = name
         self._store = store
         self._loop = loop

@@ -84,9 +84,8 @@ class Current(msgspec.Struct, frozen=True):
         """
         number, words = checked(fraction, text)
         if self._phase is not LOADING and self._phase is not LOADED:
-            does = "unload" if self._phase is UNLOADING else "status"
-            name = f"{self._registrar.name}/{self.server}"
-            raise UsageError(f"{name}: progress() in its {does} callback: only load and recover callbacks report it")
+            name, role = f"{self._registrar.name}/{self.server}", _ROLES[self._phase]
+            raise UsageError(f"{name}: progress() in its {role} callback: only load and recover callbacks report it")
         self._registrar.progress.report(self.resource_id, number, words)
 
 
@@ -214,6 +213,9 @@ class ServerActor:
         self.spec = spec
         self.restored = False  # whether it came from the catalog; then a second registration replaces it
         self.types = types
+        has = spec.status is not None, spec.recover is not None
+        limits = spec.linger_s, spec.load_timeout_s, spec.recovery
+        self.facts = Server(spec.name, *limits, *has, types)  # what decisions need to know
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
         if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):
@@ -247,14 +249,6 @@ class ServerActor:
     def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
         """Return the failure and the trace that describe a callback's error. In the thread that ran the callback."""
         return self.load_failure(error), failure_of(error, self.origin).trace
-
-    @property
-    def facts(self) -> Server:
-        """The facts about this server that decisions need."""
-        spec = self.spec
-        has_recover = spec.recover is not None
-        has_status = spec.status is not None
-        return Server(spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, has_status, has_recover, self.types)
 
     # -- load ----------------------------------------------------------------------------------------------------
 
