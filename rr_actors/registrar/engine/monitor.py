@@ -187,11 +187,7 @@ class RegistrarState:
     def begin_directly(self, query: Any, request: bytes, ended: LoadWaiter) -> Load | None:
         """Note a load that the calling thread is about to send; return None if the loop has to send it.
 
-        The loop has to, for example, if the parent is gone.
-
-        Args:
-            query: what it asks for.
-            ended: hears how the load ends, if it ends by another way than the thread's.
+        If the load ends by another way than the thread's, `ended` hears how.
         """
         id, registrar, server, parent = query.id, query.registrar, query.server, query.parent
         attempt, seq = 0, next(self.sequence)
@@ -316,11 +312,7 @@ _RETRY_S = 0.25
 
 
 class Monitor:
-    """Decides the messages and commands of one registrar in their order. On the loop, except decide_here().
-
-    Args:
-        registrar: the registrar's actor; EffectRunner uses its servers, links and callers.
-    """
+    """Decides the messages and commands of one registrar's actor in their order. On the loop, except decide_here()."""
 
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
@@ -445,11 +437,7 @@ class Monitor:
         return True
 
     def run(self, command: c.Command) -> None:
-        """Decide a command now, before all that waits, commit it, and act.
-
-        Raises:
-            CatalogError: the command was not committed; nothing has happened.
-        """
+        """Decide a command now, before all that waits, and act; raise CatalogError if it cannot be committed."""
         with self._state.lock:
             self._effects.append(self._state.commit(((command, None),)).effects)
         if self._state.is_inside():
@@ -635,11 +623,7 @@ class CommitLog:
             self.save_soon()
 
     def commit_row(self, row: Row) -> bool:
-        """Write one row now; return False if rows are not written singly. From any thread, with the lock.
-
-        Raises:
-            CatalogError: the row was not written.
-        """
+        """Write one row now, or raise CatalogError; return False if rows are not written singly. With the lock."""
         if self.row_by_row:
             self._write([Put(row)])
             self.unsaved.row_written(row)

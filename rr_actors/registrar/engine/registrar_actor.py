@@ -44,13 +44,9 @@ logger = logging.getLogger("rr_actors.registrar")
 
 
 class Audience(Protocol):
-    """The listeners to the queries that this registrar holds.
+    """The listeners to the queries that this registrar holds."""
 
-    Attributes:
-        holder: the Registrar that users call.
-    """
-
-    holder: Any
+    holder: Any  # the Registrar that users call
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """Run the callbacks that listen to a query, for a status of it.
@@ -65,11 +61,7 @@ class Audience(Protocol):
 
 
 class RegistrarActor(RegistrarState):
-    """One registrar of this process.
-
-    Args:
-        node: the process's runtime: dispatcher, transports, directory.
-    """
+    """One registrar of this process. `node` has what all of them share: dispatcher, transports, directory."""
 
     def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
         self.node = node
@@ -180,10 +172,9 @@ class RegistrarActor(RegistrarState):
             self.monitor.put(command, more=more or self.node.dispatcher.more)
 
     def join_here(self, load: Load, epoch: int) -> Loaded | None:
-        """Decide by the fast path a Load of a thread of a consumer in this process; return None if it has to be sent.
+        """Decide a Load of a thread of this process by the fast path; return None if it has to be sent.
 
-        Args:
-            epoch: the consumer's incarnation.
+        `epoch` is the incarnation of the thread's registrar.
         """
         if self.closed or interpreter.possible() or not self.consumers.listens_to(load.origin, epoch):
             return None
@@ -226,11 +217,7 @@ class RegistrarActor(RegistrarState):
     # -- loads and unloads that a thread leaves to the loop: its line broke, or it gave up ------------------------
 
     def go_on_loading(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
-        """Go on with a load that a thread has begun by itself; `waiter` hears how it ends.
-
-        Args:
-            command: Got, SendAgain or GiveUp.
-        """
+        """Go on with a load that a thread has begun, by Got, SendAgain or GiveUp; `waiter` hears how it ends."""
         if self.closed:
             waiter(None, self.down())
             return
@@ -308,11 +295,7 @@ class RegistrarActor(RegistrarState):
             return None if self.waiting else digests.held_at(self.whole(), provider)
 
     def commit_rows(self, changes: list[Change]) -> None:
-        """Write rows that need no decision, such as stored servers. On the loop.
-
-        Raises:
-            CatalogError: the rows were not written.
-        """
+        """Write rows that need no decision, such as stored servers, as Monitor.run() does. On the loop."""
         self.monitor.run(c.SetRows(changes))
 
     def commit_counts(self) -> dict[str, int]:
@@ -321,11 +304,7 @@ class RegistrarActor(RegistrarState):
         return {"commits": log.count, "timed_commits": log.timed, "commit_us": int(log.timed_s * 1e6)}
 
     def save(self) -> None:
-        """Write the unsaved changes.
-
-        Raises:
-            CatalogError: the changes were not written.
-        """
+        """Write the unsaved changes, as CommitLog.save() does."""
         self._commits.save()
 
     def reload_catalog(self) -> None:
@@ -374,11 +353,7 @@ class RegistrarActor(RegistrarState):
 
 
 class Servers:
-    """The servers of one registrar, by name. On the loop.
-
-    Attributes:
-        get: the server of a name, or None if there is none.
-    """
+    """The servers of one registrar, by name; get() returns None if there is none. On the loop."""
 
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
@@ -390,11 +365,7 @@ class Servers:
         return list(self._by_name)
 
     def register(self, server: ServerActor) -> None:
-        """Add a server, and go on with its resources.
-
-        Raises:
-            NameTaken: there is a server of that name.
-        """
+        """Add a server, and go on with its resources; raise NameTaken if there is a server of that name."""
         registrar, name = self._registrar, server.spec.name
         old = self._by_name.get(name)
         if old is not None and not old.restored:

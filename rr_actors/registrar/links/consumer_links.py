@@ -41,19 +41,12 @@ _A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # the other message
 
 
 class Consumers:
-    """One link for each consumer, and any number of direct lines. On the loop.
-
-    Attributes:
-        routes: for each answer, the line or link by which it goes.
-
-    Args:
-        provider: the registrar's actor.
-    """
+    """One link for each consumer of a registrar's actor, and any number of direct lines. On the loop."""
 
     def __init__(self, provider: Any) -> None:
         self._provider = provider
         self._links: dict[str, Link] = {}
-        self.routes = Routes()
+        self.routes = Routes()  # for each answer, the line or link by which it goes
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
@@ -241,11 +234,7 @@ class Consumers:
 
 
 def _check(message: Any, origin: str) -> None:
-    """Check that a consumer may send this message, and that it names itself in it.
-
-    Raises:
-        Unavailable: it may not, or names another; only this link is closed.
-    """
+    """Raise Unavailable, which closes this link, if a consumer may not send this message, or names another in it."""
     if type(message) in _OF_ITSELF:
         if message.origin != origin and not (type(message) is Gone and origin == retired(message.origin)):
             raise Unavailable(f"{type(message).__name__} of {shown(message.origin)} on a link of {origin!r}")

@@ -270,11 +270,7 @@ class Client:
     # -- messages of the provider --------------------------------------------------------------------------------
 
     def received(self, link: Link, message: Any) -> None:
-        """Take a message of the provider.
-
-        Raises:
-            Unavailable: a provider does not send such a message; the link is closed.
-        """
+        """Take a message of the provider; raise Unavailable, which closes the link, if it is a consumer's."""
         kind = message.__class__
         if kind not in _A_PROVIDERS:
             raise Unavailable(f"{kind.__name__} is a consumer's to say, not a provider's")
