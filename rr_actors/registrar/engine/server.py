@@ -138,7 +138,6 @@ def status_callback_of(registrar: Any) -> str:
 
 
 _ROLES = {LOADING: "load", UNLOADING: "unload", LOADED: "recover", None: "status"}
-_DOES = {LOADING: "loads", UNLOADING: "unloads", LOADED: "recovers"}
 
 
 def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str) -> None:
@@ -162,7 +161,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
         if not is_running or (phase is LOADED and me.resource_id not in catalog.recovering) or not waits_for(me):
             return
     name = serving(me).name
-    whose = f"the callback that {_DOES[phase]} resource {me.resource_id} of {name}/{me.server}"
+    whose = f"the callback that {_ROLES[phase]}s resource {me.resource_id} of {name}/{me.server}"
     text = f"{what} waits for {whose}, and is called in it: it would wait for itself; {instead}"
     raise UsageError(text, registrar=name, server=f"{name}/{me.server}", resource_id=me.resource_id)
 
