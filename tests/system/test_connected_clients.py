@@ -305,7 +305,7 @@ def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
             worker.load("provider/camera", "front")
 
     eventually(lambda: provider.resources() == [])
-    assert worker.queries() == []
+    eventually(lambda: worker.queries() == [])
 
 
 def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
