@@ -44,3 +44,28 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
 
     asyncio.run(app.load_async("provider/thing", "x"))  # by the same link
     assert [list(resource.holders) for resource in provider.resources()] == [["app", "app"]]
+
+
+def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answered(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serve(provider, "thing")
+    first = app.load("provider/thing", "first")
+    actor = app._actor
+    client, call = actor.client("provider"), actor.node.dispatcher.call
+    fetched, waiting, heard = client._fetched, list[Any](), list[list[str]]()
+
+    def hear(queries: Any, _error: Any) -> None:
+        heard.append(sorted(query.query_id for query in queries))
+
+    monkeypatch.setattr(client, "_fetched", lambda *answer: waiting.append(answer))
+    call(client.fetch, hear)
+    eventually(lambda: waiting)
+    second = app.load("provider/thing", "second")
+    monkeypatch.undo()
+    for what in ((client.fetch, hear), (client.fetch, hear), (fetched, *waiting[0])):
+        call(*what)
+
+    eventually(lambda: len(heard) == 3)
+    assert heard == [[first.id], *[sorted((first.id, second.id))] * 2]
+    assert not client._asked  # a stopped provider is no error, as nobody asks for anything there

@@ -11,7 +11,7 @@ import pytest
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.names import ServerId
-from rr_actors.registrar.engine.server_table import ServerTypes
+from rr_actors.registrar.engine.registrar_actor import ServerTypes
 from rr_actors.registrar.model.rows import Put, ServerType
 
 

@@ -412,7 +412,7 @@ class Worker:
 @pytest.fixture
 def ledger(path: Path) -> tuple[CommitLog, Loop, JournaledStore]:
     loop, worker, store = Loop(), Worker(), journaled(path)
-    return CommitLog("app", RegistrarConfig("app"), store, loop, worker, threading.RLock()), loop, store  # type: ignore[arg-type]
+    return CommitLog("app", RegistrarConfig("app"), store, loop, worker), loop, store  # type: ignore[arg-type]
 
 
 def commit(ledger: CommitLog, *rows: Row) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -34,7 +35,7 @@ from rr_actors.system.console.client_registrars import ClientRegistrars
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
 from rr_actors.system.console.console_messages import Find, Hold, Holding
 from rr_actors.wire.unix_sockets import Peer
-from support import TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
+from support import LIMIT_S, TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
 from support_managers import Made, Order, Shop
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
@@ -302,6 +303,36 @@ def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
 
     eventually(lambda: provider.resources() == [])
     assert worker.queries() == []
+
+
+def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
+    client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker = client.open_registrar("worker")
+
+    def interrupted(connection: ConsoleClient, _timeout_s: float) -> None:
+        assert select.select([connection._socket], [], [], LIMIT_S)[0]
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ConsoleClient, "_receive", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            worker.load("provider/camera", "front")
+
+    eventually(lambda: provider.resources() == [])
+    eventually(lambda: worker.queries() == [])
+
+
+def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
+    client: rr.Client, provider: rr.Registrar
+) -> None:
+    worker, connection = client.open_registrar("worker"), client._connections.open()
+    held = connection.ask(Hold("client.worker", "provider/camera", encode("front")), Holding)
+    connection.close()
+
+    worker.queries()  # the console reads this after the end of the other connection
+    worker.load("provider/camera", "rear").unload()  # and a worker does this after it had released the query
+    assert [row.id for row in worker.queries()] == [held.query_id]
 
 
 def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(

@@ -158,7 +158,7 @@ def committed(registrars: tuple[rr.Registrar, rr.Registrar], monkeypatch: pytest
 
     async def begin() -> None:
         for noted in range(5):  # what the fixture has begun comes to an end
-            await actor.next_change(0.01 * noted)
+            await actor.monitor.next_change(0.01 * noted)
         monkeypatch.setattr(actor._commits._store, "commit", counted)
 
     actor.node.dispatcher.run(begin(), timeout_s=30.0)
@@ -173,7 +173,7 @@ def arrive(actor: RegistrarActor, loads: int) -> int:
             for number, load in enumerate(itertools.islice(warm_loads(), loads)):
                 actor.monitor.receive(load, load.origin, more=number < loads - 1)
             while actor.waiting:
-                await actor.next_change(1.0)
+                await actor.monitor.next_change(1.0)
             return link.flushed
 
     return actor.node.dispatcher.run(run(), timeout_s=30.0)

@@ -43,15 +43,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved
 from rr_actors.registrar.model.effects import Effect
-from rr_actors.registrar.model.messages import (
-    Gone,
-    Load,
-    Loaded,
-    Message,
-    Noticed,
-    error_of,
-    failure_of,
-)
+from rr_actors.registrar.model.messages import Gone, Load, Loaded, Message, Noticed, error_of, failure_of
 from rr_actors.registrar.model.rows import OK, OWED, PENDING, Change, Content, Drop, Held, Put, Row
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.workers import Workers
@@ -92,15 +84,11 @@ def answered_by_line(_error: RrError | None) -> None:
 class RegistrarState:
     """The catalog of one registrar, in memory and on disk.
 
-    Args:
-        store: the open storage of the catalog.
-
     Attributes:
         lock: held by the thread that decides, or that reads more than one entry. enter() returns it.
         is_inside: whether the calling thread has the lock; is_deciding() asks it.
         closed: whether the registrar is closed; then nothing is decided any more.
         waiting: the messages and commands that are not decided yet (Monitor). A new one of a thread waits behind them.
-        row_by_row: whether a message or row is committed by itself, and at once; otherwise many share a commit.
         sequence: the running numbers of queries, in the order in which they are asked for. Releases go newest first.
         loads, unloads: by query, the callback that hears how its load, or its release, ended.
     """
@@ -110,12 +98,11 @@ class RegistrarState:
     ) -> None:
         self.name = name
         self.config = config
-        self.lock = threading.RLock()
+        self._commits = CommitLog(name, config, store, loop, workers)
+        self.lock = self._commits.lock
         self.is_inside: Callable[[], bool] = self.lock._is_owned  # type: ignore[attr-defined]  # as in threading
-        self._commits = CommitLog(name, config, store, loop, workers, self.lock)
         self.catalog = Catalog(name, self._commits.content(), store.epoch)
         self.epoch = store.epoch
-        self.row_by_row = self._commits.row_by_row
         self.waiting: deque[tuple[Any, str | None]] = deque()
         self.sequence = itertools.count(self.catalog.seq + 1)
         self.loads: dict[str, LoadWaiter] = {}
@@ -143,7 +130,8 @@ class RegistrarState:
         """Return the catalog, and roll back a decision that an interrupt left unfinished. With the lock."""
         catalog = self.catalog
         if catalog.unfinished is not None:
-            self._roll_back(catalog)
+            self._commits.restore(catalog)
+            catalog.unfinished = None
         return catalog
 
     def commit(self, items: Iterable[Item]) -> Decision:
@@ -161,9 +149,7 @@ class RegistrarState:
                     decision.undo()
                     raise
                 decision.close()
-            except CatalogError:
-                raise
-            except BaseException:  # an interrupt, or a defect: at any instruction
+            except BaseException:  # an interrupt at any instruction, or a defect: a decision that was undone is whole
                 self.whole()
                 raise
             return decision
@@ -201,11 +187,7 @@ class RegistrarState:
     def begin_directly(self, query: Any, request: bytes, ended: LoadWaiter) -> Load | None:
         """Note a load that the calling thread is about to send; return None if the loop has to send it.
 
-        The loop has to, for example, if the parent is gone.
-
-        Args:
-            query: what it asks for.
-            ended: hears how the load ends, if it ends by another way than the thread's.
+        If the load ends by another way than the thread's, `ended` hears how.
         """
         id, registrar, server, parent = query.id, query.registrar, query.server, query.parent
         attempt, seq = 0, next(self.sequence)
@@ -308,10 +290,6 @@ class RegistrarState:
                 raise
             return gone
 
-    def _roll_back(self, catalog: Catalog) -> None:
-        self._commits.restore(catalog)
-        catalog.unfinished = None
-
     def down(self) -> RegistrarDown:
         """Return the error that callers of a closed registrar get."""
         return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
@@ -334,11 +312,7 @@ _RETRY_S = 0.25
 
 
 class Monitor:
-    """Decides the messages and commands of one registrar in their order. On the loop, except decide_here().
-
-    Args:
-        registrar: the registrar's actor; EffectRunner uses its servers, links and callers.
-    """
+    """Decides the messages and commands of one registrar's actor in their order. On the loop, except decide_here()."""
 
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
@@ -347,7 +321,7 @@ class Monitor:
         self._runner = EffectRunner(registrar)
         self._effects: deque[list[Effect]] = deque()  # those of each decision, to be carried out on the loop
         self._waiting = self._state.waiting
-        self._gathers = not self._state.row_by_row
+        self._gathers = not registrar._commits.row_by_row  # many messages share a commit
         self._busy = False  # the loop is deciding or acting: a new message waits until it has finished
         self._scheduled = False  # a turn of the loop is scheduled
         self._held_up = False  # a commit failed and is tried again later; nothing is decided before that
@@ -417,7 +391,8 @@ class Monitor:
 
     def put(self, what: Any, sender: str | None = None, *, more: bool = False) -> None:
         """Decide a message or command behind those that wait, and act; with `more`, in the loop's next turn."""
-        if not (self._waiting or self._busy or self._held_up or more or self._gathers or self._state.is_inside()):
+        later = more or self._gathers or self._state.is_inside()
+        if not (later or self._waiting or self._busy or self._held_up):
             self._busy = True
             try:
                 self._decide(((what, sender),))
@@ -430,12 +405,11 @@ class Monitor:
         self._waiting.append((what, sender))
         if self._busy or self._held_up:
             return
-        if more or self._gathers or self._state.is_inside():
-            if not self._scheduled:
-                self._scheduled = True
-                self._dispatcher.loop.call_soon(self._turn)
-        else:
+        if not later:
             self.decide_waiting()
+        elif not self._scheduled:
+            self._scheduled = True
+            self._dispatcher.loop.call_soon(self._turn)
 
     def decide_here(self, command: c.Command) -> bool:
         """Decide a command in the calling thread. Return False if the loop has to decide it.
@@ -463,11 +437,7 @@ class Monitor:
         return True
 
     def run(self, command: c.Command) -> None:
-        """Decide a command now, before all that waits, commit it, and act.
-
-        Raises:
-            CatalogError: the command was not committed; nothing has happened.
-        """
+        """Decide a command now, before all that waits, and act; raise CatalogError if it cannot be committed."""
         with self._state.lock:
             self._effects.append(self._state.commit(((command, None),)).effects)
         if self._state.is_inside():
@@ -514,7 +484,7 @@ class Monitor:
             self._busy = False
 
     def _decide(self, items: Sequence[Item]) -> None:
-        failed: CatalogError | None = None
+        failure = ""
         try:
             with self._state.lock:  # held until items that were not committed wait again: no thread overtakes them
                 try:
@@ -524,9 +494,8 @@ class Monitor:
                     if decision.effects:
                         self._effects.append(decision.effects)
                 except CatalogError as error:
-                    failed = error
+                    failure = str(error)
                     self._not_committed(items, error)
-            failure = "" if failed is None else str(failed)
             if failure and failure != self._failure:
                 logger.error("%s: not committed, nothing was done: %s", self._state.name, failure)
             self._failure = failure if self._held_up else ""
@@ -600,15 +569,9 @@ class CommitLog:
     """
 
     def __init__(
-        self,
-        name: str,
-        config: RegistrarConfig,
-        store: Store,
-        loop: AbstractEventLoop,
-        workers: Workers,
-        lock: AbstractContextManager[Any],
+        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
     ) -> None:
-        self.lock = lock
+        self.lock = threading.RLock()
         self._name = name
         self._store = store
         self._loop = loop
@@ -660,11 +623,7 @@ class CommitLog:
             self.save_soon()
 
     def commit_row(self, row: Row) -> bool:
-        """Write one row now; return False if rows are not written singly. From any thread, with the lock.
-
-        Raises:
-            CatalogError: the row was not written.
-        """
+        """Write one row now, or raise CatalogError; return False if rows are not written singly. With the lock."""
         if self.row_by_row:
             self._write([Put(row)])
             self.unsaved.row_written(row)
@@ -720,7 +679,6 @@ class CommitLog:
             self._on_loop(self._save_after, self._delay_s)
 
     def _on_loop(self, fn: Callable[..., object], *args: Any) -> None:
-        """Schedule a call on the loop, from any thread."""
         with contextlib.suppress(RuntimeError):  # the loop has ended: close() writes the unsaved changes
             self._loop.call_soon_threadsafe(fn, *args)
 
@@ -761,14 +719,11 @@ class CommitLog:
         except Exception:  # a CatalogError, or a defect that has ended the registrar: close the store all the same
             logger.exception("%s: could not save at closing", self._name)
         finally:
-            self._close_store(erase=erase)
-
-    def _close_store(self, *, erase: bool) -> None:
-        try:
-            with self.lock:
-                self._store.close(erase=erase)
-        except CatalogError:
-            logger.exception("%s: its catalog could not be closed, or removed", self._name)
+            try:
+                with self.lock:
+                    self._store.close(erase=erase)
+            except CatalogError:
+                logger.exception("%s: its catalog could not be closed, or removed", self._name)
 
     def _save_after(self, delay_s: float) -> None:
         if not self._closed:

@@ -51,11 +51,7 @@ def shown_progress(fraction: float, text: str) -> str:
 
 
 def checked(fraction: object, text: object) -> tuple[float, str]:
-    """Return the fraction and text of a report in a form that can be sent.
-
-    Raises:
-        UsageError: the fraction is no number from 0 to 1, or the text is no str or too long.
-    """
+    """Return the fraction and text of a report in a form that can be sent; raise UsageError if they cannot be."""
     number = math.nan
     if is_a(fraction, (int, float)) and not is_a(fraction, bool):
         number = exact_number(cast("float", fraction))

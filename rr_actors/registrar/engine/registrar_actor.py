@@ -1,6 +1,7 @@
 """RegistrarActor: has one catalog, and all other parts of one registrar. Its Monitor decides messages and commands.
 
-It lives on the process's loop, with its servers and clients. Nothing here blocks except a commit.
+It lives on the process's loop, with its servers and clients. Nothing here blocks except a commit. Two of its parts are
+in this file: the servers that are registered here (Servers), and the types of providers' servers (ServerTypes).
 """
 
 from __future__ import annotations
@@ -10,31 +11,34 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from rr_actors.base.config import RegistrarConfig
-from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, RrError, UsageError
-from rr_actors.base.names import new_id
+from rr_actors.base.errors import (
+    CatalogError,
+    MailboxFull,
+    NameTaken,
+    NotSerializable,
+    RegistrarDown,
+    RrError,
+    UsageError,
+)
+from rr_actors.base.names import ServerId, new_id
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.engine.monitor import LoadWaiter, Monitor, RegistrarState, UnloadWaiter, answered_by_line
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
-from rr_actors.registrar.engine.server_table import Servers, ServerTypes
+from rr_actors.registrar.engine.server import ServerActor
 from rr_actors.registrar.links.consumer_links import Consumers
-from rr_actors.registrar.links.provider_link import Client
+from rr_actors.registrar.links.provider_link import THREADS, Client
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.messages import (
-    Failure,
-    Load,
-    Loaded,
-    LoadRefused,
-    error_of,
-    failure_of,
-)
-from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice
+from rr_actors.registrar.model.messages import Described, Failure, Load, Loaded, LoadRefused, error_of, failure_of
+from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice, Put, ServerType
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.storage.store import Store
 from rr_actors.wire.transport import Attach, Hello, Welcome
+
+_RETRY_S = 0.25
 
 logger = logging.getLogger("rr_actors.registrar")
 
@@ -42,10 +46,7 @@ logger = logging.getLogger("rr_actors.registrar")
 class Audience(Protocol):
     """The listeners to the queries that this registrar holds."""
 
-    @property
-    def holder(self) -> Any:
-        """The Registrar that users call."""
-        ...
+    holder: Any  # the Registrar that users call
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """Run the callbacks that listen to a query, for a status of it.
@@ -60,13 +61,7 @@ class Audience(Protocol):
 
 
 class RegistrarActor(RegistrarState):
-    """One registrar of this process.
-
-    Args:
-        node: the process's runtime: dispatcher, transports, directory.
-        name: the registrar's name.
-        store: the open storage of its catalog.
-    """
+    """One registrar of this process. `node` has what all of them share: dispatcher, transports, directory."""
 
     def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
         self.node = node
@@ -105,17 +100,13 @@ class RegistrarActor(RegistrarState):
         for provider in providers:
             self.client(provider).want()
 
-    async def next_change(self, timeout_s: float) -> None:
-        """Wait until something has been decided, or for `timeout_s` seconds."""
-        await self.monitor.next_change(timeout_s)
-
     def serve(self) -> None:
         """Let in consumers from now on, and decide the statuses that waited."""
         self.serving = True
         self.monitor.hear_held_back()
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
-        """Let in the link of a consumer.
+        """Let in the link of a consumer, or the direct line of a thread of a consumer that has a link already.
 
         Raises:
             RegistrarDown: the registrar is closed, or not serving yet; its own loads are let in before it serves.
@@ -123,16 +114,8 @@ class RegistrarActor(RegistrarState):
         if self.closed or not (self.serving or hello.origin == self.name):
             status = "stopped" if self.closed else "starting"
             raise RegistrarDown(f"registrar {self.name!r}: {status}", registrar=self.name, status=status)
-        return Welcome(self.epoch), self.consumers.attach(hello.origin)
-
-    def accept_direct(self, hello: Hello) -> tuple[Welcome, Attach]:
-        """Let in the direct line of a thread of a consumer that has a link already.
-
-        Raises:
-            RegistrarDown: the registrar is closed, or not serving yet.
-        """
-        welcome, _ = self.accept(hello)
-        return welcome, self.consumers.attach_direct(hello.origin)
+        attach = self.consumers.attach_direct if hello.kind == THREADS else self.consumers.attach
+        return Welcome(self.epoch), attach(hello.origin)
 
     def leave_to_parent(self) -> None:
         """Stop using this registrar in a forked child: its links and its catalog belong to the parent process."""
@@ -189,10 +172,9 @@ class RegistrarActor(RegistrarState):
             self.monitor.put(command, more=more or self.node.dispatcher.more)
 
     def join_here(self, load: Load, epoch: int) -> Loaded | None:
-        """Decide by the fast path a Load of a thread of a consumer in this process; return None if it has to be sent.
+        """Decide a Load of a thread of this process by the fast path; return None if it has to be sent.
 
-        Args:
-            epoch: the consumer's incarnation.
+        `epoch` is the incarnation of the thread's registrar.
         """
         if self.closed or interpreter.possible() or not self.consumers.listens_to(load.origin, epoch):
             return None
@@ -235,11 +217,7 @@ class RegistrarActor(RegistrarState):
     # -- loads and unloads that a thread leaves to the loop: its line broke, or it gave up ------------------------
 
     def go_on_loading(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
-        """Go on with a load that a thread has begun by itself; `waiter` hears how it ends.
-
-        Args:
-            command: Got, SendAgain or GiveUp.
-        """
+        """Go on with a load that a thread has begun, by Got, SendAgain or GiveUp; `waiter` hears how it ends."""
         if self.closed:
             waiter(None, self.down())
             return
@@ -317,17 +295,8 @@ class RegistrarActor(RegistrarState):
             return None if self.waiting else digests.held_at(self.whole(), provider)
 
     def commit_rows(self, changes: list[Change]) -> None:
-        """Write rows that need no decision, such as stored servers. On the loop.
-
-        Raises:
-            CatalogError: the rows were not written.
-        """
+        """Write rows that need no decision, such as stored servers, as Monitor.run() does. On the loop."""
         self.monitor.run(c.SetRows(changes))
-
-    def consumer_lost(self, origin: str) -> None:
-        """Note that a consumer's link is down, or that another has taken its place."""
-        if not self.closed:
-            self.post(c.ConsumerLost(origin))
 
     def commit_counts(self) -> dict[str, int]:
         """Return the number of commits, the number of timed commits, and the microseconds that these took."""
@@ -335,11 +304,7 @@ class RegistrarActor(RegistrarState):
         return {"commits": log.count, "timed_commits": log.timed, "commit_us": int(log.timed_s * 1e6)}
 
     def save(self) -> None:
-        """Write the unsaved changes.
-
-        Raises:
-            CatalogError: the changes were not written.
-        """
+        """Write the unsaved changes, as CommitLog.save() does."""
         self._commits.save()
 
     def reload_catalog(self) -> None:
@@ -368,10 +333,6 @@ class RegistrarActor(RegistrarState):
         """Unload a resource that others may hold; `waiter` hears how it ended. On the loop."""
         self.post(c.ForceUnload(target, new_id(), waiter))
 
-    def force_at_stop(self, resource_id: str, waiter: UnloadWaiter, why: str) -> None:
-        """Unload a resource as force() does, because this registrar is being closed."""
-        self.post(c.ForceUnload(resource_id, new_id(), waiter, f"unloaded, as {why}"))
-
     def newest_first(self) -> list[str]:
         """Return the queries that this registrar holds, newest first."""
         with self.lock:
@@ -389,3 +350,79 @@ class RegistrarActor(RegistrarState):
             catalog = self.whole()
         waits = self.waiting or self.loads or self.unloads or catalog.in_flight
         return bool(waits or catalog.closings or catalog.recovering or catalog.moving or catalog.unsettled)
+
+
+class Servers:
+    """The servers of one registrar, by name; get() returns None if there is none. On the loop."""
+
+    def __init__(self, registrar: Any) -> None:
+        self._registrar = registrar
+        self._by_name: dict[str, ServerActor] = {}
+        self.get: Callable[[str], ServerActor | None] = self._by_name.get
+
+    def names(self) -> list[str]:
+        """Return the names of all servers, in the order in which they were registered."""
+        return list(self._by_name)
+
+    def register(self, server: ServerActor) -> None:
+        """Add a server, and go on with its resources; raise NameTaken if there is a server of that name."""
+        registrar, name = self._registrar, server.spec.name
+        old = self._by_name.get(name)
+        if old is not None and not old.restored:
+            text = f"server {server.origin}: registered already; unregister it first, or take another name"
+            raise NameTaken(text, name=name)
+        self._by_name[name] = server
+        registrar.consumers.tell_all(Described(name, server.types))
+        if old is None:
+            registrar.post(c.Register(server.facts, new_id()))
+        else:
+            registrar.catalog.servers[name] = server.facts
+
+    def register_again(self) -> None:
+        """Register all servers again, in a catalog that was read anew."""
+        for server in self._by_name.values():
+            self._registrar.post(c.Register(server.facts, new_id()))
+
+    def unregister(self, name: str, done: Callable[[RrError | None], None]) -> None:
+        """Remove a server when all its resources are released; `done` hears how that ended."""
+        registrar = self._registrar
+
+        def ended(error: RrError | None) -> None:
+            if name not in registrar.catalog.servers:
+                self._by_name.pop(name, None)
+            done(error)
+
+        registrar.post(c.Unregister(name, new_id(), ended))
+
+
+class ServerTypes:
+    """The types of the servers of one registrar's providers; its catalog keeps them. On the loop."""
+
+    def __init__(self, registrar: Any) -> None:
+        self._registrar = registrar
+        self._wanting: dict[str, list[Callable[[], None]]] = {}
+
+    def tell(self, server: ServerId, told: Callable[[], None]) -> None:
+        """Call `told` when the types of a provider's server are known."""
+        if str(server) in self._registrar.catalog.server_types:
+            told()
+            return
+        self._wanting.setdefault(str(server), []).append(told)
+        self._registrar.client(server.registrar).describe(server.server, at_once=True)
+
+    def described(self, server: str, blob: bytes) -> None:
+        """Keep the types that a provider has sent, and call the callers that wait for them."""
+        registrar = self._registrar
+        if registrar.closed:
+            return
+        known = registrar.catalog.server_types.get(server)
+        if known is None or known.blob != blob:
+            row = ServerType(server, blob)  # written now: after a respawn, on_start reads queries before a link is up
+            try:
+                registrar.commit_rows([Put(row)])
+            except CatalogError as error:  # a full disk, for instance: the callers wait, within their time limits
+                logger.warning("%s: the types of %s are written later: %s", registrar.name, server, error)
+                registrar.node.dispatcher.loop.call_later(_RETRY_S, self.described, server, blob)
+                return
+        for told in self._wanting.pop(server, ()):
+            told()

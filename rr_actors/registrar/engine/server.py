@@ -84,9 +84,8 @@ class Current(msgspec.Struct, frozen=True):
         """
         number, words = checked(fraction, text)
         if self._phase is not LOADING and self._phase is not LOADED:
-            does = "unload" if self._phase is UNLOADING else "status"
-            name = f"{self._registrar.name}/{self.server}"
-            raise UsageError(f"{name}: progress() in its {does} callback: only load and recover callbacks report it")
+            name, role = f"{self._registrar.name}/{self.server}", _ROLES[self._phase]
+            raise UsageError(f"{name}: progress() in its {role} callback: only load and recover callbacks report it")
         self._registrar.progress.report(self.resource_id, number, words)
 
 
@@ -139,7 +138,6 @@ def status_callback_of(registrar: Any) -> str:
 
 
 _ROLES = {LOADING: "load", UNLOADING: "unload", LOADED: "recover", None: "status"}
-_DOES = {LOADING: "loads", UNLOADING: "unloads", LOADED: "recovers"}
 
 
 def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str) -> None:
@@ -158,19 +156,14 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
     if me is None or (phase := _phase_of(me)) is None or serving(me).closed:
         return
     with serving(me).lock:
-        if not (_is_running(me, phase) and waits_for(me)):
+        catalog = serving(me).whole()
+        is_running = running(catalog, me.resource_id, phase, me.attempt) is not None
+        if not is_running or (phase is LOADED and me.resource_id not in catalog.recovering) or not waits_for(me):
             return
     name = serving(me).name
-    whose = f"the callback that {_DOES[phase]} resource {me.resource_id} of {name}/{me.server}"
+    whose = f"the callback that {_ROLES[phase]}s resource {me.resource_id} of {name}/{me.server}"
     text = f"{what} waits for {whose}, and is called in it: it would wait for itself; {instead}"
     raise UsageError(text, registrar=name, server=f"{name}/{me.server}", resource_id=me.resource_id)
-
-
-def _is_running(me: Current, phase: Phase) -> bool:
-    catalog = serving(me).whole()
-    if running(catalog, me.resource_id, phase, me.attempt) is None:
-        return False
-    return phase is not LOADED or me.resource_id in catalog.recovering
 
 
 # -- the server --------------------------------------------------------------------------------------------------------
@@ -219,6 +212,9 @@ class ServerActor:
         self.spec = spec
         self.restored = False  # whether it came from the catalog; then a second registration replaces it
         self.types = types
+        has = spec.status is not None, spec.recover is not None
+        limits = spec.linger_s, spec.load_timeout_s, spec.recovery
+        self.facts = Server(spec.name, *limits, *has, types)  # what decisions need to know
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
         if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):
@@ -227,9 +223,10 @@ class ServerActor:
         self.request = Codec(spec.request_type, f"{self.origin}: request")
         self.response = Codec(spec.response_type, f"{self.origin}: response")
         load, one, both = spec.load, self._request_of, self._request_and_response_of
-        self._load = self._described(load, "load", one, self._encoded)
+        encoded = self.response.encode
+        self._load = self._described(load, "load", one, encoded)
         self._unload = self._described(_or(spec.unload, _nothing), "unload", both, _nothing)
-        self._recover = self._described(_or(spec.recover, load), "recover", both, self._encoded)
+        self._recover = self._described(_or(spec.recover, load), "recover", both, encoded)
         self._status = self._described(_or(spec.status, _nothing), "status", one, _nothing)
 
     def _described(
@@ -251,14 +248,6 @@ class ServerActor:
     def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
         """Return the failure and the trace that describe a callback's error. In the thread that ran the callback."""
         return self.load_failure(error), failure_of(error, self.origin).trace
-
-    @property
-    def facts(self) -> Server:
-        """The facts about this server that decisions need."""
-        spec = self.spec
-        has_recover = spec.recover is not None
-        has_status = spec.status is not None
-        return Server(spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, has_status, has_recover, self.types)
 
     # -- load ----------------------------------------------------------------------------------------------------
 
@@ -301,10 +290,8 @@ class ServerActor:
         size = len(resource.request) + len(response or b"")
         if size + _ROW_BYTES <= limit:
             return None
-        text = (
-            f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
-        )
-        return NotSerializable(f"{text}: give the name of a file, say, or raise the limit", path="response")
+        why = f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
+        return NotSerializable(f"{why}: give the name of a file, say, or raise the limit", path="response")
 
     def load_failure(self, error: BaseException) -> Failure:
         """Return the failure that consumers hear if a load callback raises; a group of one error is that error."""
@@ -328,13 +315,12 @@ class ServerActor:
         if self.spec.unload is None:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
-        done = functools.partial(self._unload_ended, resource)
-        at_once = functools.partial(self._unloaded, resource)
-        self._submit(self._unload, resource, resource.tries, done, patient=True, at_once=at_once)
 
-    def _unloaded(self, resource: Resource, _result: None) -> bool:
-        """Decide UnloadDone in the thread that ran the callback; return False if the loop has to."""
-        return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
+        def at_once(_result: None) -> bool:
+            return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
+
+        done = functools.partial(self._unload_ended, resource)
+        self._submit(self._unload, resource, resource.tries, done, patient=True, at_once=at_once)
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:
@@ -414,9 +400,6 @@ class ServerActor:
         if resource.response is None:
             return request, None
         return request, self.response.decode(resource.response, self.origin, "response")
-
-    def _encoded(self, response: Any) -> bytes:
-        return self.response.encode(response)
 
 
 def _recorded(

@@ -39,17 +39,7 @@ class Status:
         repeated: whether the status may have been heard before; a crash made that uncertain.
     """
 
-    __slots__ = (
-        "_event",
-        "_handled",
-        "_spares",
-        "message",
-        "query_id",
-        "repeated",
-        "resource_id",
-        "source",
-        "state",
-    )
+    __slots__ = ("_event", "_handled", "_spares", "message", "query_id", "repeated", "resource_id", "source", "state")
 
     def __init__(
         self,
@@ -84,10 +74,6 @@ class Status:
         """Whether handled() was called."""
         return self._handled
 
-    def _next_spare(self) -> str:
-        """Return a name for the next spare part that this status needs: the same if a crash repeats the status."""
-        return f"{self._event} {next(self._spares)}"
-
     def __repr__(self) -> str:
         source = f" from {self.source}" if self.source else ""
         return f"<Status {self.state}{source}: {self.message}>"
@@ -116,8 +102,9 @@ def status_of(notice: Notice, *, repeated: bool = False) -> Status:
     return status
 
 
-# For the package's own modules. Editors do not offer it to users, as the method's name is private.
-next_spare = Status._next_spare  # pyright: ignore[reportPrivateUsage]  # same file
+def next_spare(status: Status) -> str:
+    """Return a name for the next spare part that a status needs: the same if a crash repeats the status."""
+    return f"{status._event} {next(status._spares)}"  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def message_text(message: object) -> str:

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.registrar.links.local_line import LocalLine
+from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
     Fetch,
@@ -40,26 +41,23 @@ _A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # the other message
 
 
 class Consumers:
-    """One link for each consumer, and any number of direct lines. On the loop.
-
-    Attributes:
-        routes: for each answer, the line or link by which it goes.
-
-    Args:
-        provider: the registrar's actor.
-    """
+    """One link for each consumer of a registrar's actor, and any number of direct lines. On the loop."""
 
     def __init__(self, provider: Any) -> None:
         self._provider = provider
         self._links: dict[str, Link] = {}
-        self.routes = Routes()
+        self.routes = Routes()  # for each answer, the line or link by which it goes
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
-        """Return the function that receives the link of a consumer."""
+        """Return the function that receives the link of a consumer; it replaces an older one."""
 
         def attach(link: Link) -> _Inlet:
-            self.opened(origin, link)
+            old = self._links.get(origin)
+            self._links[origin] = link
+            if old is not None:
+                old.close()
+                self._lost(origin)
             return _Inlet(functools.partial(self.received, origin), functools.partial(self.lost, origin))
 
         return attach
@@ -168,14 +166,6 @@ class Consumers:
         """Return the link of a consumer, or None."""
         return self._links.get(origin)
 
-    def opened(self, origin: str, link: Link) -> None:
-        """Add the link of a consumer; it replaces an older one."""
-        old = self._links.get(origin)
-        self._links[origin] = link
-        if old is not None:
-            old.close()
-            self._lost(origin)
-
     def received(self, origin: str, link: Link, message: Any) -> None:
         """Pass on a message of a link. If a newer link is open, ignore it: the consumer sends it again over that."""
         _check(message, origin)
@@ -190,8 +180,9 @@ class Consumers:
 
     def expel(self, origin: str) -> None:
         """Close the link and the lines of a consumer that does not come back, and ignore their messages."""
-        for line in self.routes.lines_of(origin):
-            line.close()
+        for line in self.routes.lines():
+            if line.hello.origin == origin:
+                line.close()
         link = self._links.pop(origin, None)
         if link is not None:
             link.close()
@@ -205,7 +196,7 @@ class Consumers:
 
     def _lost(self, origin: str) -> None:
         self.routes.link_lost(origin)
-        self._provider.consumer_lost(origin)
+        self._provider.post(c.ConsumerLost(origin))
 
     def listens_to(self, origin: str, epoch: int) -> bool:
         """Return whether direct lines of the consumer's incarnation `epoch` may ask: as long as that has a link."""
@@ -243,11 +234,7 @@ class Consumers:
 
 
 def _check(message: Any, origin: str) -> None:
-    """Check that a consumer may send this message, and that it names itself in it.
-
-    Raises:
-        Unavailable: it may not, or names another; only this link is closed.
-    """
+    """Raise Unavailable, which closes this link, if a consumer may not send this message, or names another in it."""
     if type(message) in _OF_ITSELF:
         if message.origin != origin and not (type(message) is Gone and origin == retired(message.origin)):
             raise Unavailable(f"{type(message).__name__} of {shown(message.origin)} on a link of {origin!r}")
@@ -338,11 +325,8 @@ class Routes:
             for query_id in [query_id for query_id, route in list(ways.lines.items()) if route is line]:
                 del ways.lines[query_id]
 
-    def lines_of(self, consumer: str) -> list[Any]:
-        """Return the lines of a consumer's threads that wait for an answer."""
-        return [line for line in self._lines() if line.hello.origin == consumer]
-
-    def _lines(self) -> list[Any]:
+    def lines(self) -> list[Any]:
+        """Return the lines that wait for an answer."""
         return [*self._loads.lines.values(), *self._unloads.lines.values()]
 
     def link_lost(self, consumer: str) -> None:
@@ -353,6 +337,6 @@ class Routes:
 
     def clear(self) -> list[Any]:
         """Forget all questions; return the lines that wait for an answer."""
-        lines = self._lines()
+        lines = self.lines()
         self.__init__()
         return lines

@@ -45,11 +45,8 @@ class LocalLine:
             raise ConnectionResetError("the registrar was closed")
         return answer
 
-    def send(self, message: Message) -> None:
-        """Give the answer to the waiting thread."""
-        self._tell(message)
-
-    def _tell(self, answer: Message | None) -> None:
+    def send(self, answer: Message | None) -> None:
+        """Give the answer to the waiting thread; with None, its exchange() fails."""
         try:
             self._unanswered.pop()
         except IndexError:  # there is an answer already, and no thread waits
@@ -62,7 +59,7 @@ class LocalLine:
 
     def answering(self, message: Message) -> Callable[[], None]:
         """Return a function that gives the answer to the waiting thread."""
-        return functools.partial(self._tell, message)
+        return functools.partial(self.send, message)
 
     send_now = send
 
@@ -71,9 +68,9 @@ class LocalLine:
 
     def cut(self) -> None:
         """Have exchange() of the waiting thread fail."""
-        self._tell(None)
+        self.send(None)
 
     def close(self) -> None:
         """Close the line: exchange() fails if it waits, and the link carries answers that are still to come."""
-        self._tell(None)
+        self.send(None)
         self._node.dispatcher.call(self._registrar.consumers.lost_directly, self, None)

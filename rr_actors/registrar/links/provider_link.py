@@ -67,14 +67,14 @@ class Client:
         self._task: asyncio.Task[None] | None = None
         self._asked = False
         self._chunks: list[FetchedQuery] = []
-        self._fetching: list[Fetching] = []
+        self._fetching: list[Fetching] = []  # called fetch(), oldest first
+        self._listed_for = 0  # how many of them the last Fetch asks for: those that had called before it was sent
         self._reconciled = False
         self._known: digests.Known | None = None  # the rows held there, and their digests, when last looked at
         self._number = registrar.epoch << 32  # the number of the last Fetch
         self._linked = False  # whether there was ever a link
         self._described: set[str] = set()
         self._undescribed: set[str] = set()
-        self._closed = False
         self._connections: ThreadConnections[Exchange] = ThreadConnections(self._dial_for_thread)
 
     # -- for threads ---------------------------------------------------------------------------------------------
@@ -86,10 +86,11 @@ class Client:
         There are none before the provider is reconciled over the present link. By then its Peer row is on disk, by
         which it is found after a crash.
         """
-        catalog = self._registrar.catalog
+        registrar = self._registrar
+        catalog = registrar.catalog
         if catalog.up.get(self.provider) != self.opened or self.provider not in catalog.peers:
             return None
-        if self._closed or self._node.dispatcher.closed:  # in a forked child, all of this belongs to the parent
+        if registrar.closed or self._node.dispatcher.closed:  # in a forked child, all of this belongs to the parent
             return None
         return self._connections
 
@@ -114,7 +115,7 @@ class Client:
     def want(self) -> None:
         """Open a link if there is none; if that is impossible, post PeerGone with the reason."""
         self._asked = True
-        if self.link is None and self._task is None and not self._closed:
+        if self.link is None and self._task is None and not self._registrar.closed:
             self._task = self._node.dispatcher.loop.create_task(self._connect())
 
     def link_again(self) -> None:
@@ -139,11 +140,10 @@ class Client:
     def fetch(self, done: Fetching) -> None:
         """Ask for the queries that this registrar holds at the provider; `done` gets them, or the error."""
         self._fetching.append(done)
-        if self.link is not None and self._reconciled and len(self._fetching) == 1:
-            self._send_fetch(resume=False)
-            self.link.flush()
-        else:
+        if self.link is None:
             self.want()
+        elif self._reconciled and len(self._fetching) == 1:  # else the next Fetch is sent when the last is answered
+            self._send_fetch(self.link, resume=False)
 
     def take_leave(self) -> None:
         """Have the provider release all queries, also those of threads, as this registrar does not come back."""
@@ -154,8 +154,7 @@ class Client:
                 logger.warning("%s: could not take leave of %s: %s", self._registrar.name, self.provider, error)
 
     def close(self) -> None:
-        """Close the link, and do not connect again."""
-        self._closed = True
+        """Close the link, as the registrar is closed."""
         self._connections.close()
         if self._task is not None:
             self._task.cancel()
@@ -168,8 +167,8 @@ class Client:
 
     async def _connect(self) -> None:
         try:
-            delay = _FIRST_RETRY_S
-            while not self._closed and (self._asked or self._registrar.catalog.needs(self.provider) or self._fetching):
+            delay, registrar = _FIRST_RETRY_S, self._registrar
+            while not registrar.closed and (self._asked or registrar.catalog.needs(self.provider) or self._fetching):
                 wait = await self._try_once(delay)
                 if wait is None:
                     return
@@ -226,31 +225,29 @@ class Client:
     async def _dial(self, address: str) -> None:
         transport = self._node.local if address == self._node.local.address else self._node.transport
         link = await transport.connect(address, self._hello("registrar"), self._attach)
-        known: digests.Known | None = None
-        if not self._closed and not self._fetching:  # fetch() needs all queries listed
-            rows = self._registrar.held_at(self.provider)
-            known = None if rows is None else digests.known(rows, self._known)
-        self._known = None
-        if self._closed:
+        if self._registrar.closed:
             link.close()
             return
+        rows = None if self._fetching else self._registrar.held_at(self.provider)  # fetch() needs all queries listed
+        known = None if rows is None else digests.known(rows, self._known)
+        self._known = None
         self.link = link
         self._connections = ThreadConnections(self._dial_for_thread)
         self._asked = False
         self._reconciled = False
         self._described.clear()
         self._chunks.clear()
-        self._send_fetch(resume=True, known=known)
+        self._send_fetch(link, resume=True, known=known)
         self.opened = self._number
-        link.flush()
 
     def _hello(self, kind: str) -> Hello:
         return Hello(kind, self.provider, self._registrar.name, self._registrar.epoch)
 
-    def _send_fetch(self, *, resume: bool, known: digests.Known | None = None) -> None:
-        assert self.link is not None
+    def _send_fetch(self, link: Link, *, resume: bool, known: digests.Known | None = None) -> None:
         self._number += 1
-        self.link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
+        self._listed_for = len(self._fetching)
+        link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
+        link.flush()
 
     def _say_releases_wait(self, entry: Entry) -> None:
         """Log that callers wait for releases at a provider that has to be started again."""
@@ -262,12 +259,10 @@ class Client:
 
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False
-        self._answer_fetching(None, error)
+        fetching, self._fetching = self._fetching, []
+        for done in fetching:
+            done(None, error)
         self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id()))
-
-    @property
-    def _types(self) -> dict[str, Any]:
-        return self._registrar.catalog.server_types
 
     def _attach(self, _link: Link) -> Client:
         return self
@@ -275,11 +270,7 @@ class Client:
     # -- messages of the provider --------------------------------------------------------------------------------
 
     def received(self, link: Link, message: Any) -> None:
-        """Take a message of the provider.
-
-        Raises:
-            Unavailable: a provider does not send such a message; the link is closed.
-        """
+        """Take a message of the provider; raise Unavailable, which closes the link, if it is a consumer's."""
         kind = message.__class__
         if kind not in _A_PROVIDERS:
             raise Unavailable(f"{kind.__name__} is a consumer's to say, not a provider's")
@@ -298,7 +289,7 @@ class Client:
     def _take_types(self, message: Described) -> None:
         """Keep the types of a server, if they were asked for or an older version of them is known."""
         server = f"{self.provider}/{message.server}"
-        if message.server in self._undescribed or server in self._types:
+        if message.server in self._undescribed or server in self._registrar.catalog.server_types:
             self._described.add(message.server)
             self._undescribed.discard(message.server)
             self._registrar.types.described(server, message.blob)
@@ -312,42 +303,37 @@ class Client:
         queries, self._chunks = self._chunks, []
         if not self._reconciled:
             self._reconciled = True
-            servers = {query.server for query in queries}
-            if message.same and not self._linked:  # and those of queries that agree, and so are not listed
-                with self._registrar.lock:
-                    catalog = self._registrar.whole()
-                    servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
-            self._linked = True
+            self._undescribed.update(query.server for query in queries)
             prefix = f"{self.provider}/"
-            with self._registrar.lock:  # the types that an earlier incarnation was sent
-                known = {server for server in self._types if server.startswith(prefix)}
-            self._undescribed |= servers | {server.removeprefix(prefix) for server in known}
+            with self._registrar.lock:
+                catalog = self._registrar.whole()
+                if message.same and not self._linked:  # and those of queries that agree, and so are not listed
+                    self._undescribed.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
+                known = [server for server in catalog.server_types if server.startswith(prefix)]
+            self._linked = True
+            self._undescribed.update(server.removeprefix(prefix) for server in known)  # sent to an earlier incarnation
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()
             reconcile = c.Reconcile(self.provider, queries, new_id(), message.same, message.number)
             # with `more`: notices follow, which say why a query is not in the list
             self._registrar.post(reconcile, more=link.more)
-            if message.same and self._fetching:  # fetch() was called since, and needs all queries listed
-                self._send_fetch(resume=False)
-                link.flush()
-                return
-        self._answer_fetching(queries, None)
-
-    def _answer_fetching(self, queries: list[FetchedQuery] | None, error: Exception | None) -> None:
-        fetching, self._fetching = self._fetching, []
-        for done in fetching:
-            done(queries, error)
+        answered, self._fetching = self._fetching[: self._listed_for], self._fetching[self._listed_for :]
+        for done in answered:
+            done(queries, None)
+        if self._fetching and self.link is link:
+            self._send_fetch(link, resume=False)
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Note that the link is down, and connect again if anything is open at the provider."""
-        if reason is not None and not self._closed:
+        closed = self._registrar.closed
+        if reason is not None and not closed:
             logger.info("%s: link to %s lost: %s", self._registrar.name, self.provider, reason)
         if self.link is not link and self.link is not None:
             return
         self.link = None
         self._connections.close()
-        if self._closed:
+        if closed:
             return
         self._registrar.post(c.LinkLost(self.provider))
         if self._registrar.catalog.needs(self.provider) or self._fetching:

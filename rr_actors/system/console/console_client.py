@@ -177,7 +177,11 @@ class ConsoleClient:
         self._socket.close()
 
     def drop(self) -> None:
-        """Close the copy of the connection in a forked child, and leave the connection itself to the parent."""
+        """Close this process's copy of the connection, on which no thread waits.
+
+        A forked child leaves the connection to its parent so. After the last copy is closed, the kernel tells the
+        system if the last answer was not read. After shutdown() it might not.
+        """
         self._socket.close()
 
     def __enter__(self) -> Self:
@@ -348,7 +352,7 @@ class Connections:
             if kept:
                 self._idle.append(client)
         if not kept:
-            client.close()
+            client.drop()
 
 
 def _forked() -> None:

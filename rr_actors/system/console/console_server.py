@@ -186,6 +186,7 @@ class Connection(asyncio.Protocol):
         self._looks = False  # whether the loop will look for the client
         self._reader: Reader | None = None
         self._has_registrars = False
+        self._unheard: tuple[str, ...] = ()  # the registrar and query of the last answer, until the next request
 
     # -- called by asyncio -------------------------------------------------------------------------------------------
 
@@ -267,8 +268,14 @@ class Connection(asyncio.Protocol):
         self._console.connections.discard(self)
         if self._reader is not None:
             self._console.feed.remove(self._reader)
+        if exc is not None or self._blocked:  # the client has closed, and has not read the last answer
+            self._release_unheard()
         if self._has_registrars:
             self._clean_up(self._console.commands.clients.close, self)
+
+    def _release_unheard(self) -> None:
+        if self._unheard:
+            self._clean_up(self._console.commands.clients.release_unheard, *self._unheard)
 
     def _clean_up(self, fn: Callable[..., None], *args: Any) -> None:
         """Have a worker release what the client has left, after an opening that may still be in progress."""
@@ -315,6 +322,7 @@ class Connection(asyncio.Protocol):
 
     def _begin(self, request: Request) -> None:
         self._busy = True
+        self._unheard = ()
         workers = self._console.node.dispatcher.workers
         answer = self._console.answered, request, lambda: self._ended, self
         try:
@@ -329,11 +337,12 @@ class Connection(asyncio.Protocol):
     def _answered(self, request: Request, answer: tuple[bytes, str] | None, error: BaseException | None) -> None:
         self._busy = False
         frame, query_id = answer or (refusal(error or Unavailable("it was not answered")), "")
-        if not self._ended:
+        self._unheard = (request.registrar, query_id) if query_id and isinstance(request, Hold) else ()
+        if self._ended:
+            self._release_unheard()
+        else:
             self._transport.write(frame)
             self._next()
-        elif query_id and isinstance(request, Hold):
-            self._clean_up(self._console.commands.clients.release_unheard, request.registrar, query_id)
 
     # -- the feed ----------------------------------------------------------------------------------------------------
 

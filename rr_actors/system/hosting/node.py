@@ -31,11 +31,12 @@ from rr_actors.base.errors import (
     UnknownRegistrar,
     shown,
 )
+from rr_actors.base.names import new_id
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.links.provider_link import THREADS
-from rr_actors.registrar.model.commands import GiveUp
+from rr_actors.registrar.model.commands import ForceUnload, GiveUp
 from rr_actors.registrar.model.messages import Failure, Gone, Message, retired
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
 from rr_actors.runtime.garbage import left_alone
@@ -165,10 +166,8 @@ class Node:
             return self.hub.accept(hello)
         registrar = self.registrars.get(hello.to)
         if registrar is not None:
-            if hello.kind == "registrar":
+            if hello.kind != KIND:
                 return registrar.accept(hello)
-            if hello.kind == THREADS:
-                return registrar.accept_direct(hello)
             if registrar.audience is not None:
                 return Welcome(0), functools.partial(Door, self, registrar.audience.holder)
         raise UnknownRegistrar(f"registrar {hello.to!r}: not in this process", registrar=hello.to)
@@ -265,7 +264,7 @@ class Node:
     async def settle(self, registrar: RegistrarActor) -> None:
         """Wait until every recover callback has ended, and at most 1 s for the lists of providers that are up."""
         while registrar.catalog.recovering and not registrar.closed:
-            await registrar.next_change(_LOOK_AGAIN_S)
+            await registrar.monitor.next_change(_LOOK_AGAIN_S)
         deadline = time.monotonic() + _RECONCILE_S
         while time.monotonic() < deadline and not registrar.closed:
             with registrar.lock:
@@ -273,7 +272,7 @@ class Node:
                 waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
             if not any(self._is_up(peer) for peer in waiting):
                 return
-            await registrar.next_change(_LOOK_AGAIN_S)
+            await registrar.monitor.next_change(_LOOK_AGAIN_S)
         logger.info("%s: not all providers have answered within %g s", registrar.name, _RECONCILE_S)
 
     def _is_up(self, registrar: str) -> bool:
@@ -385,7 +384,8 @@ class Node:
             tried.update(resources)
             unloaded = _AllDone(self.dispatcher.loop, len(resources), registrar.name)
             for resource_id in resources:
-                registrar.force_at_stop(resource_id, unloaded, self._why_closing(registrar))
+                why = f"unloaded, as {self._why_closing(registrar)}"
+                registrar.post(ForceUnload(resource_id, new_id(), unloaded, why))
             await unloaded.future
 
     async def retire(self, name: str) -> None:
