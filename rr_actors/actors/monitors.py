@@ -17,6 +17,7 @@ from rr_actors.actors.messaging.exit_reports import Down
 from rr_actors.actors.messaging.mailbox import Mailbox, Notice
 from rr_actors.actors.refs import DistantRef, local_of, ref_in, watch
 from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import Flag
@@ -110,8 +111,10 @@ class Monitor:
         self._told.set()
         try:
             self._deliver(self, down)
-        except (ActorDeadError, Unavailable):
-            logger.debug("nobody is left to hear that %s", down)
+        except (ActorDeadError, Unavailable) as error:
+            level = logging.ERROR if wanted_by(error) else logging.DEBUG  # without a reason like that nobody is left
+            logger.log(level, "a monitor could not report that %s: %s", down, error)
+            self.demonitor()
 
     def __enter__(self) -> Monitor:
         return self
@@ -181,16 +184,13 @@ def _call_back(
         return
     try:
         result = callback(down)
+        if is_coroutine(result):
+            dispatcher.workers.start_coroutine(result, done, Context())
+            return
     except Exception as error:
         done(None, error)
-        return
-    if not is_coroutine(result):
+    else:
         done(None, None)
-        return
-    try:
-        dispatcher.workers.start_coroutine(result, done, Context())
-    except Unavailable:
-        logger.debug("the callback of %r came after its loop", monitor)
 
 
 def _ref_of(what: Any) -> pykka.ActorRef[Any]:

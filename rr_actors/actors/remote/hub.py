@@ -211,8 +211,11 @@ class ActorHub:
             except _Cut:
                 if pid is None or self._closed:
                     gone(False)
-                else:  # the sockets of a process close a moment before it is dead
+                    return
+                try:  # the sockets of a process close a moment before it is dead
                     self._dispatcher.workers.submit(lifeline.wait_gone, (pid,), CUT_S, done=gone, patient=True)
+                except Unavailable:
+                    gone(False)
             except Exception as error:
                 fire("noproc", str(error))
             else:
