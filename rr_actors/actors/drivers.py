@@ -20,6 +20,9 @@ from rr_actors.runtime.user_loop import start_task
 
 logger = logging.getLogger("rr_actors")
 
+RETRY_S = 0.1
+"""How long a life that can go on waits if the machine gives no thread for it."""
+
 
 class Request:
     """A request that a life awaits from its driver."""
@@ -124,8 +127,12 @@ class Driver:
             return
         try:
             self._dispatcher.workers.in_thread(self.drive, result, error, beyond_limit=True)
-        except Unavailable:
-            self._cut_off()
+        except Unavailable as refusal:
+            if wanted_by(refusal):
+                loop = self._dispatcher.loop
+                self._dispatcher.call(lambda: loop.call_later(RETRY_S, self._resume, result, error))
+            else:
+                self._cut_off()
 
     def _await(self, request: Await) -> None:
         try:
