@@ -98,8 +98,10 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 return False
             self._cancelled = True
             callbacks = self._put(None, concurrent.futures.CancelledError(f"cancelled: {self._whose()}"), None)
-        withdraw()
-        self._call_back(callbacks)
+        try:
+            withdraw()
+        finally:  # an interrupt must not keep the waiting threads waiting
+            self._call_back(callbacks)
         return True
 
     def set_running_or_notify_cancel(self) -> bool:
@@ -327,8 +329,8 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         with self._lock:
             if self._hook_lock is None or self._hook_runs:
                 return
-            self._hook_runs = True
-        threading.Thread(target=self._finish_hook, name="rr-future", daemon=True).start()
+            threading.Thread(target=self._finish_hook, name="rr-future", daemon=True).start()
+            self._hook_runs = True  # last: start() raises if the machine gives no thread
 
     def _finish_hook(self) -> None:
         try:
@@ -406,6 +408,9 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     def overdue(self, timeout_s: float | None) -> pykka.Timeout:
         """Return the error for a caller that has waited `timeout_s` seconds without a reply."""
         return pykka.Timeout(f"no reply after {timeout_s} seconds: {self._whose()}")
+
+    def __repr__(self) -> str:
+        return f"<Reply: {self._whose()}, {self._state.lower()}>"
 
     def _whose(self) -> str:
         return "a future" if self.target is None else f"the reply of {self.target.name}"
