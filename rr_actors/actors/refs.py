@@ -388,7 +388,12 @@ class DistantRef(ActorRef[A]):
 
     def _inquire(self, what: str) -> Any:
         event_loop.check_may_block(f"asking about {self._target.name}")
-        return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
+        limit_s = ask_timeout_s()
+        reply = self._hub().inquire(self._where, what)
+        try:
+            return reply.get(timeout=limit_s)
+        except pykka.Timeout:
+            raise pykka.Timeout(f"no reply after {limit_s} seconds: the {what} of {self._target.name}") from None
 
     def _local(self) -> pykka.ActorRef[A] | None:
         process = hub(self.path)

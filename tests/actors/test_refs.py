@@ -7,6 +7,7 @@ import functools
 import gc
 import logging
 import multiprocessing
+import os
 import pickle
 import signal
 import subprocess
@@ -293,6 +294,17 @@ def test_ask_has_a_time_out_by_default(ours: ActorRef[Any], home: Home) -> None:
         ours.ask(lambda _: time.sleep(0.5))
     home.hub.ask_timeout_s = 30.0
     assert ours.ask("alive") == "alive"
+
+
+def test_a_process_that_does_not_say_what_an_actor_is_is_named(ours: ActorRef[Any], home: Home) -> None:
+    pid = ours.ask("pid")
+    home.hub.ask_timeout_s = 0.02
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(pykka.Timeout, match=rf"no reply after 0\.02 seconds: the class of {ours.path}"):
+            _ = ref_to(str(ours.path)).actor_class
+    finally:
+        os.kill(pid, signal.SIGCONT)
 
 
 def test_a_full_mailbox_of_another_process_is_the_askers_error(make: Make) -> None:

@@ -271,10 +271,10 @@ class Line:
                     self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._try_again)
                 break
             except RrError as error:  # too long for a frame
-                if call is None:
-                    logger.error("a message to the process at %s was not sent: %s", self.address, error)
-                else:
+                if call is not None:
                     fail(call.reply, error)
+                elif isinstance(letter, Tell):
+                    _record_lost(letter.to, [letter], str(error))
             else:
                 if call is not None:
                     self._calls[call.number] = call
@@ -312,18 +312,17 @@ class Line:
             self._close_line(line)
         calls = list(self._calls.values())
         self._calls.clear()
-        untold: dict[str, list[dead_letters.Lost]] = {}
+        untold: dict[str, list[Tell]] = {}
         while self._waiting:  # one by one: other threads still append
             letter, call = self._waiting.popleft()
             if isinstance(letter, Tell):
-                untold.setdefault(letter.to, []).append(dead_letters.Lost(f"{len(letter.body)} bytes"))
+                untold.setdefault(letter.to, []).append(letter)
             elif call is not None:
                 calls.append(call)
         for call in calls:
             self.cut_off(call, reason)
-        for urn, lost in untold.items():
-            name = urn.removeprefix("urn:rr-actor:")
-            dead_letters.office.record(name, lost, f"lost with its process at {self.address}", unheard=len(lost))
+        for urn, letters in untold.items():
+            _record_lost(urn, letters, f"lost with its process at {self.address}")
 
     def cut_off(self, call: Call, reason: Exception | None) -> None:
         """Fail a call whose link or connection is lost. From any thread."""
@@ -371,6 +370,11 @@ class Line:
             self._left.discard(line)
             asyncio.get_running_loop().remove_reader(line.fileno())
             line.close()
+
+
+def _record_lost(urn: str, letters: list[Tell], why: str) -> None:
+    lost = [dead_letters.Lost(f"{len(letter.body)} bytes") for letter in letters]
+    dead_letters.office.record(urn.removeprefix("urn:rr-actor:"), lost, why, unheard=len(lost))
 
 
 def _reraise(raised: Raised, origin: str) -> Any:
