@@ -14,7 +14,6 @@ from pykka import ActorDeadError
 
 from rr_actors.actors.messaging import death_watch
 from rr_actors.actors.messaging.exit_reports import Down
-from rr_actors.actors.messaging.mailbox import Mailbox, Notice
 from rr_actors.actors.refs import DistantRef, local_of, ref_in, watch
 from rr_actors.base.errors import RrError, Unavailable, UsageError
 from rr_actors.base.scarcity import wanted_by
@@ -164,11 +163,6 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     made = Monitor(ref, deliver, over)
     begin(made)
     return made
-
-
-def deliver_to(mailbox: Mailbox) -> Deliver:
-    """Return a function that delivers a Down to an actor, as a message in its mailbox."""
-    return lambda monitor, down: mailbox.put(Notice(down, monitor))
 
 
 def _call_back(

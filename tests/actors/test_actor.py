@@ -14,9 +14,8 @@ from typing import Any
 import pykka
 import pytest
 
-from rr_actors.actors.actor import IGNORE, Actor, ExitReport, LoopActor
+from rr_actors.actors.actor import BATCH, IGNORE, Actor, ExitReport, LoopActor
 from rr_actors.actors.drivers import Driver
-from rr_actors.actors.lifecycle import BATCH
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.errors import MailboxFull, StartFailed, UsageError
 from rr_actors.runtime.event_loop import Dispatcher, acquire, current, release
