@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 
 import pykka
 from pykka import CallableProxy
+from pykka._envelope import Envelope
 from pykka._introspection import AttrInfo, introspect_attrs
 from pykka.messages import ProxyCall, ProxyGetAttr, ProxySetAttr
 
@@ -38,12 +39,8 @@ def _ask(proxy: Any, name: str, args: tuple[Any, ...]) -> Any:
     return proxy.actor_ref.ask(ProxyCall(attr_path=(*proxy._attr_path, name), args=args, kwargs={}))
 
 
-def _iter(self: Any) -> Iterator[Any]:
-    return iter(_ask(self, "__iter__", ()))
-
-
-def _reversed(self: Any) -> Iterator[Any]:
-    return iter(_ask(self, "__reversed__", ()))
+def _iterating(name: str) -> Callable[[Any], Iterator[Any]]:
+    return lambda self: iter(_ask(self, name, ()))
 
 
 def _enter(self: Any) -> Any:
@@ -64,8 +61,7 @@ _WAITING = ("__len__", "__bool__", "__contains__", "__getitem__", "__setitem__",
 
 OPERATORS: dict[str, Callable[..., Any]] = {
     **{name: _asking(name) for name in _WAITING},
-    "__iter__": _iter,
-    "__reversed__": _reversed,
+    **{name: _iterating(name) for name in ("__iter__", "__reversed__")},
     "__enter__": _enter,
     "__exit__": _exit,
     "__call__": _call,
@@ -184,6 +180,30 @@ class Mirror(_Stub):
 
     def __str__(self) -> str:
         return str(self._ref)
+
+
+class DistantInbox:
+    """The DistantRef.actor_inbox of an actor in another process, to which Pykka's own code sends envelopes."""
+
+    def __init__(self, ref: pykka.ActorRef[Any]) -> None:
+        self._ref = ref
+
+    def put(self, envelope: Envelope[Any], /) -> None:
+        """Send the envelope's message; get() of its future returns the reply."""
+        wanted = envelope.reply_to
+        if wanted is None:
+            self._ref.tell(envelope.message)
+            return
+        reply = self._ref.ask(envelope.message, block=False)
+        wanted.set_get_hook(lambda timeout: reply.get(timeout=timeout))
+
+    def get(self) -> Envelope[Any]:
+        """Raise LookupError: another process's messages cannot be taken."""
+        raise LookupError(f"the mailbox of {self._ref} is in another process")
+
+    def empty(self) -> bool:
+        """Return True: no message can be taken from here."""
+        return True
 
 
 # -- proxies -----------------------------------------------------------------------------------------------------------
