@@ -12,8 +12,6 @@ import msgspec
 from rr_actors.base.errors import StartFailed, text_of
 from rr_actors.runtime.callback_errors import Raised
 
-# The special result of on_start, and the report of an exit.
-
 Reason = Literal["normal", "shutdown", "abnormal", "killed"]
 
 
