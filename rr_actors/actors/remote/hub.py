@@ -159,16 +159,12 @@ class ActorHub:
         except OSError as error:
             line.cut_off(call, error)
             return True
-        if answer is None or (type(answer) is Dead and not answer.taken and self._has_moved(where, line)):
+        if answer is None:
             return False
+        if type(answer) is Dead and not answer.taken and self._address(where) not in ("", self.address, line.address):
+            return False  # it has moved
         line.answer(call, answer)
         return True
-
-    def _has_moved(self, where: Whereabouts, line: Line) -> bool:
-        try:
-            return self._locate(where) != line.address
-        except (ActorDeadError, ActorUnavailable):
-            return False
 
     def tell(self, where: Whereabouts, message: Any) -> None:
         """Send the message. If the actor ends before it arrives, the message is lost, and logged."""
@@ -232,10 +228,7 @@ class ActorHub:
 
     def pid(self, where: Whereabouts) -> int | None:
         """Return the id of the actor's process; None if the actor is not up, or the process is not known."""
-        if where.path is None:
-            return pid_of(where.address)
-        entry = self._directory.lookup(actor_key(where.path))
-        return None if entry is None or entry.status is not Status.UP else pid_of(entry.address)
+        return pid_of(self._address(where))
 
     def kill(self, where: Whereabouts) -> bool:
         """Kill the actor's process (SIGKILL); return False if the actor is not up.
@@ -281,11 +274,7 @@ class ActorHub:
 
     def may_be_alive(self, where: Whereabouts) -> bool:
         """Return False if the directory says that the actor is not up, else True; its process is not asked."""
-        try:
-            self._locate(where)
-        except (ActorDeadError, ActorUnavailable):
-            return False
-        return True
+        return self._address(where) not in ("", self.address)
 
     def close(self) -> None:
         """Close all links of kind "actors"; open calls fail. On the loop."""
@@ -308,12 +297,16 @@ class ActorHub:
     def _new_call(self, line: Line, where: Whereabouts, reply: Reply[Any]) -> Call:
         return Call(line.next_number(), reply, where.target.name, lambda: self.missing(where))
 
-    def _locate(self, where: Whereabouts) -> str:
+    def _address(self, where: Whereabouts) -> str:
+        """Return the address of the actor's process; "" if the actor is not up."""
         if where.path is None:
-            address = where.address
-        else:
-            entry = self._directory.lookup(actor_key(where.path))
-            address = entry.address if entry is not None and entry.status is Status.UP else ""
+            return where.address
+        entry = self._directory.lookup(actor_key(where.path))
+        return entry.address if entry is not None and entry.status is Status.UP else ""
+
+    def _locate(self, where: Whereabouts) -> str:
+        """Return the address of the actor's process, or raise the error for a missing actor."""
+        address = self._address(where)
         if not address or address == self.address:  # an actor of this process would have been found before
             raise self.missing(where)
         return address
