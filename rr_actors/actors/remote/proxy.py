@@ -87,15 +87,10 @@ def as_answer(actor: pykka.Actor, ref: pykka.ActorRef[Any], message: object, res
     Args:
         ref: the reference to the actor, for any process.
     """
-    if isinstance(message, ProxyCall):
-        match message.attr_path[-1]:
-            case "__enter__" if result is actor:
-                return ref
-            case "__iter__" | "__reversed__":
-                return list(result)
-            case _:
-                return result
-    return result
+    name = message.attr_path[-1] if isinstance(message, ProxyCall) else ""
+    if name == "__enter__" and result is actor:
+        return ref
+    return list(result) if name in ("__iter__", "__reversed__") else result
 
 
 @functools.lru_cache(256)
@@ -252,7 +247,7 @@ class DistantProxy(_Proxy[A]):
     Args:
         inquire: asks the actor's process for its attributes; may raise ActorDeadError. In an `async def` handler,
             which must not wait, a name is taken as a method when it is called, as an attribute when it is awaited.
-        known: the attributes, if they are known; else the proxy asks now, or, if `later`, on first use.
+        known: the attributes, if they are known. If None, the proxy asks now; if empty, when a name is first used.
     """
 
     # Pykka looks for these two names in each attribute of an actor, and an attribute may be this proxy.
@@ -266,13 +261,12 @@ class DistantProxy(_Proxy[A]):
         inquire: Callable[[], Attributes],
         attr_path: AttrPath = (),
         known: Attributes | None = None,
-        later: bool = False,
     ) -> None:
         self.actor_ref = actor_ref
         self._attr_path = attr_path
         self._inquire = inquire
         self._known: Attributes | None = None
-        self._learn(_if_allowed(inquire) if known is None and not later else known)
+        self._learn(_if_allowed(inquire) if known is None else known)
 
     def _learn(self, known: Attributes | None) -> None:
         self._known = known
@@ -329,7 +323,7 @@ def _arrive(ref: Any, attr_path: AttrPath, known: Attributes | None) -> pykka.Ac
     inquire = getattr(ref, "attributes", None)
     if inquire is None:  # a copy, within its process, of the proxy of a plain Pykka actor
         return pykka.ActorProxy(actor_ref=ref, attr_path=attr_path)
-    return DistantProxy(actor_ref=ref, inquire=inquire, attr_path=attr_path, known=known, later=True)
+    return DistantProxy(actor_ref=ref, inquire=inquire, attr_path=attr_path, known=known or {})
 
 
 copyreg.pickle(pykka.ActorProxy, _reduce)  # for proxies that a user makes from a reference
