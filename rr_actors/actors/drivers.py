@@ -12,6 +12,8 @@ from collections.abc import Callable, Coroutine, Generator
 from contextvars import Context
 from typing import Any, cast
 
+import msgspec
+
 from rr_actors.actors.messaging.mailbox import Mailbox
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.scarcity import wanted_by
@@ -24,19 +26,18 @@ RETRY_S = 0.1
 """How long a life that can go on waits if the machine gives no thread for it."""
 
 
-class Request:
+class Request(msgspec.Struct, frozen=True, eq=False):
     """A request that a life awaits from its driver."""
 
     def __await__(self) -> Generator[Request, Any, Any]:
         return (yield self)
 
 
-class Await(Request):
+class Await(Request, frozen=True, eq=False):
     """The request to run a coroutine: on the framework's loop for hooks and LoopActors, else on the users' loop."""
 
-    def __init__(self, coroutine: Coroutine[Any, Any, Any], *, on_loop: bool = False) -> None:
-        self.coroutine = coroutine
-        self.on_loop = on_loop
+    coroutine: Coroutine[Any, Any, Any]
+    on_loop: bool = False
 
 
 REST = Request()

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from contextvars import Context
 from typing import Any, cast
 
-import pykka
 from pykka import ActorDeadError
 
 from rr_actors.actors.messaging import death_watch
@@ -40,7 +39,10 @@ class Monitor:
     """
 
     def __init__(self, ref: Any, deliver: Deliver, over: Callable[[Monitor], object]) -> None:
-        self.ref = _ref_of(ref)
+        found = ref_in(ref)
+        if found is None:
+            raise UsageError(f"monitor: expected a reference to an actor, got {type(ref).__name__}")
+        self.ref = found
         self.number = next(_numbers)
         self._deliver = deliver
         self._called_off = over
@@ -143,9 +145,7 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     """
     if callback is not None and not callable(cast(object, callback)):
         raise UsageError(f"monitor: callback: expected a callable, got {type(callback).__name__}")
-    _ref_of(ref)
     call_back = None if callback is None else described(callback, "monitor: callback")
-    dispatcher = acquire()  # released when the monitor is over
 
     def over(monitor: Monitor) -> None:
         try:
@@ -161,6 +161,7 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
             dispatcher.workers.in_thread(_call_back, monitor, call_back, dispatcher, over, beyond_limit=True)
 
     made = Monitor(ref, deliver, over)
+    dispatcher = acquire()  # released when the monitor is over
     begin(made)
     return made
 
@@ -185,10 +186,3 @@ def _call_back(
         done(None, error)
     else:
         done(None, None)
-
-
-def _ref_of(what: Any) -> pykka.ActorRef[Any]:
-    ref = ref_in(what)
-    if ref is None:
-        raise UsageError(f"monitor: expected a reference to an actor, got {type(what).__name__}")
-    return ref

@@ -430,9 +430,6 @@ class DistantRef(ActorRef[A]):
             )
         return process
 
-    def __repr__(self) -> str:
-        return f"<ActorRef for {self}>"
-
     def __reduce__(self) -> tuple[Any, ...]:
         return _restore, (self._target, self.path, self._where.address)
 

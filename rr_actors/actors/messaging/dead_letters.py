@@ -158,11 +158,10 @@ class Collection:
         return DeadLetters(here.count + sum(list(self._counts.values())), letters[-KEPT:])
 
 
-class Lost:
+class Lost(msgspec.Struct, frozen=True):
     """Stands for a message without a text, such as a packed one; `what` describes it: "12 bytes"."""
 
-    def __init__(self, what: str) -> None:
-        self.what = what
+    what: str
 
     def __repr__(self) -> str:
         return f"<{self.what}>"

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 from pykka import ActorDeadError, Future
 from pykka._envelope import Envelope as PykkaEnvelope
 from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPrivateUsage]
@@ -82,14 +83,11 @@ def has_ended(error: BaseException, name: str) -> bool:
     return isinstance(error, ActorDeadError) and error.__traceback__ is None
 
 
-class Packed:
+class Packed(msgspec.Struct, frozen=True, eq=False):
     """A pickled message, which is unpickled where its actor runs, never on the loop. `size` in bytes."""
 
-    __slots__ = ("open", "size")
-
-    def __init__(self, open: Callable[[], Any], size: int) -> None:
-        self.open = open
-        self.size = size
+    open: Callable[[], Any]
+    size: int
 
     def __repr__(self) -> str:
         return f"<{self.size} bytes>"

@@ -299,9 +299,6 @@ class DistantProxy(_Proxy[A]):
         else:
             self.actor_ref.ask(ProxySetAttr(attr_path=(*self._attr_path, name), value=value))
 
-    def __repr__(self) -> str:
-        return f"<ActorProxy for {self.actor_ref}, attr_path={self._attr_path!r}>"
-
     def __dir__(self) -> list[str]:
         depth = len(self._attr_path)
         known = self._known or ()
