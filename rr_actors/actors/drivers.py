@@ -54,9 +54,7 @@ class Driver:
     loop has ended.
 
     Args:
-        life: the coroutine to drive; it begins with start().
         mailbox: the actor's mailbox; its `schedule` should be the driver's.
-        name: the actor's name, for the log.
         on_loop: whether the life runs on the framework's loop, and must not block. Otherwise it runs in whichever
             worker thread is free.
     """

@@ -485,12 +485,7 @@ def ref_in(what: Any) -> pykka.ActorRef[Any] | None:
 
 
 def _put(ref: pykka.ActorRef[Any], envelope: Envelope, name: str) -> None:
-    """Put an envelope into the mailbox of an actor of this process.
-
-    Raises:
-        Ended: the actor is dead.
-        MailboxFull: the mailbox is full.
-    """
+    """Put an envelope into the mailbox of an actor of this process, or raise Ended or MailboxFull."""
     if ref.actor_stopped.is_set():
         raise Ended(f"{name} not found", name)
     ref.actor_inbox.put(envelope)

@@ -74,13 +74,7 @@ A = TypeVar("A")
 
 
 class Birth(msgspec.Struct, frozen=True):
-    """The values that an actor's creator gives to it; none by default, as in an ordinary call of its class.
-
-    Attributes:
-        path: the actor's path in its tree.
-        place: an object of its host, for the hook _before_start.
-        on_exit: called on the loop, once, when the actor has ended.
-    """
+    """The values that launch() gives to the actor; none by default, as in an ordinary call of its class."""
 
     path: str | None = None
     place: Any = None

@@ -317,8 +317,7 @@ class ActorHub:
                 raise Unavailable("this process's system is stopping")
             line = self._lines.get(address)
             if line is None:
-                hello = Hello(KIND, address, self.name, 0)
-                line = Line(self._dispatcher, self._transport, address, hello, self._forget)
+                line = Line(self._dispatcher, self._transport, Hello(KIND, address, self.name, 0), self._forget)
                 self._lines[address] = line
             return line
 

@@ -88,19 +88,14 @@ class Line:
     """The messages for one address. Call its methods on the loop, except where they say otherwise.
 
     Args:
-        hello: the Hello with which the link is opened.
+        hello: the Hello with which the link is opened; its `to` is the address.
         forget: called with the line when its link is lost, before its calls fail.
     """
 
     def __init__(
-        self,
-        dispatcher: Dispatcher,
-        transport: UnixTransport,
-        address: str,
-        hello: Hello,
-        forget: Callable[[Line], None],
+        self, dispatcher: Dispatcher, transport: UnixTransport, hello: Hello, forget: Callable[[Line], None]
     ) -> None:
-        self.address = address
+        self.address = hello.to
         self._dispatcher = dispatcher
         self._transport = transport
         self._hello = hello
@@ -110,7 +105,7 @@ class Line:
         self._turn = 0  # how often _pump() has run
         self._woken_for = -1  # the turn that the loop was last asked for
         self._link: Link | None = None
-        self._peer = address
+        self._peer = hello.to
         self._connecting: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
         self._asks = ThreadConnections(self._dial)
