@@ -187,7 +187,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         """Set the value. After cancel(), this and the other methods that set it do nothing.
 
         Raises:
-            queue.Full: it is set already, or has a get hook.
+            queue.Full: it is set already, or has a get hook; as for the other methods that set it.
         """
         self._settle(value, None, None)
 
@@ -198,11 +198,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     def set_exception(  # pyright: ignore[reportIncompatibleMethodOverride]  # takes what both bases take
         self, exc_info: ExcInfo | BaseException | None = None
     ) -> None:
-        """Set the exception that get() raises; if None, the exception that is being handled.
-
-        Raises:
-            queue.Full: it is set already, or has a get hook.
-        """
+        """Set the exception that get() raises; if None, the exception that is being handled."""
         self._settle(None, error_of(exc_info), None)
 
     def set_unopened(self, unpack: Callable[[], T], *, raises: bool = False) -> None:
@@ -212,9 +208,6 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
 
         Args:
             raises: whether `unpack` raises an exception.
-
-        Raises:
-            queue.Full: it is set already, or has a get hook.
         """
         self._settle(None, None, unpack, raises=raises)
 

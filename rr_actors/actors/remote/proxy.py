@@ -155,17 +155,14 @@ class Mirror(_Stub):
         self._inquire = inquire
 
     def __dir__(self) -> list[str]:
-        """Ask for the attributes again, and return their names: Pykka calls this for a name that it does not know."""
-        self._copy()
-        return list(vars(self))
-
-    def _copy(self) -> None:
+        """Copy the attributes again, and return their names: Pykka calls this for a name that it does not know."""
         parts: dict[AttrPath, _Stub] = {(): self}
         for path, (is_callable, is_traversable) in sorted(self._inquire().items(), key=lambda item: len(item[0])):
             stub = _Method() if is_callable else _Stub()
             vars(stub)["_pykka_traversable"] = is_traversable
             parts[path] = stub
             vars(parts[path[:-1]])[path[-1]] = stub
+        return list(vars(self))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Mirror) and other._ref == self._ref
