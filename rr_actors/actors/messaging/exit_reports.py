@@ -89,16 +89,15 @@ class Birth(msgspec.Struct, frozen=True):
         return cls(*args, **kwargs)
 
 
-_given: ContextVar[Birth | None] = ContextVar("rr_actors_birth", default=None)
 _ORDINARY = Birth()
+_given: ContextVar[Birth] = ContextVar("rr_actors_birth", default=_ORDINARY)
 
 
 def take() -> Birth:
     """Return the Birth of the actor that is being made now, for its __new__; a second call returns an empty one."""
     birth = _given.get()
-    if birth is None:
-        return _ORDINARY
-    _given.set(None)  # not for an actor that this one's __init__ starts
+    if birth is not _ORDINARY:
+        _given.set(_ORDINARY)  # not for an actor that this one's __init__ starts
     return birth
 
 

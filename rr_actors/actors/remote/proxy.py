@@ -214,8 +214,16 @@ class _Proxy(pykka.ActorProxy[A]):
         return hash((self.actor_ref, self._attr_path))
 
 
+def _reduce(self: Any) -> tuple[Any, ...]:
+    actor = self._actor
+    known = attributes_of(actor) if isinstance(actor, pykka.Actor) else None
+    return _arrive, (self.actor_ref, self._attr_path, known)
+
+
 class LocalProxy(_Proxy[A]):
     """Pykka's own proxy, of an actor of this process."""
+
+    __reduce__ = _reduce
 
     def __getattr__(self, name: str) -> Any:
         found: Any = super().__getattr__(name)
@@ -223,9 +231,6 @@ class LocalProxy(_Proxy[A]):
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *vars(pykka.ActorProxy)})
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _reduce(self)
 
 
 def local_proxy(ref: pykka.ActorRef[A], path: AttrPath = ()) -> pykka.ActorProxy[A]:
@@ -304,12 +309,6 @@ class DistantProxy(_Proxy[A]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _arrive, (self.actor_ref, self._attr_path, self._known)
-
-
-def _reduce(proxy: Any) -> tuple[Any, ...]:
-    actor = proxy._actor
-    known = attributes_of(actor) if isinstance(actor, pykka.Actor) else None
-    return _arrive, (proxy.actor_ref, proxy._attr_path, known)
 
 
 def _arrive(ref: Any, attr_path: AttrPath, known: Attributes | None) -> pykka.ActorProxy[Any]:
