@@ -327,7 +327,8 @@ class DistantRef(ActorRef[A]):
         except (ActorDeadError, Unavailable, pykka.Timeout):
             return False
         except UsageError:  # waiting is refused here: only the directory can be asked
-            return self._hub().may_be_alive(self._where)
+            process = hub(self.path)
+            return process is not None and process.may_be_alive(self._where)
 
     @property
     def pid(self) -> int | None:

@@ -455,6 +455,20 @@ def test_without_a_system_a_local_reference_does_not_pickle_and_says_why(home: H
         set_hub(home.hub)
 
 
+def test_without_a_system_no_actor_elsewhere_is_alive_in_an_async_handler_either(home: Home) -> None:
+    class Looks(Actor):
+        async def on_receive(self, message: Any) -> Any:
+            return ref_to("root/a").is_alive()
+
+    here = Looks.start()
+    set_hub(None)
+    try:
+        assert ref_to("root/a").is_alive() is False
+        assert here.ask("look") is False
+    finally:
+        set_hub(home.hub)
+
+
 @pytest.mark.parametrize("limit", [-1, float("nan"), "1", True])
 def test_a_time_limit_that_is_none_is_refused_before_anything_is_sent(ref: ActorRef[Any], limit: Any) -> None:
     here = Remote.start()
