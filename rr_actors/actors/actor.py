@@ -1,14 +1,415 @@
-"""Actor: the two Pykka actor types of rr_actors. LoopActor's handlers run on the loop, Actor's in worker threads."""
+"""Actor: the two Pykka actor types of rr_actors. LoopActor's handlers run on the loop, Actor's in worker threads.
+
+The life of an actor is one coroutine: it begins, handles messages until the actor is stopped, and ends.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+import logging
+import threading
+import uuid
+from collections.abc import Callable, Coroutine
+from contextvars import Context
+from types import TracebackType
+from typing import Any, ClassVar, Literal, Self, cast
 
-from rr_actors.actors.lifecycle import BaseActor
-from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, Reason
+import pykka
+from pykka import ActorRegistry
+from pykka._envelope import Envelope as PykkaEnvelope
+
+from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
+from rr_actors.actors.messaging import death_watch, exit_reports
+from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity
+from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, Reason, abnormal
+from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.actors.messaging.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
+from rr_actors.actors.monitors import Monitor, begin, take
+from rr_actors.actors.refs import ActorRef, urn_of_path
+from rr_actors.actors.remote.hub import running
+from rr_actors.actors.remote.proxy import as_answer
+from rr_actors.base.errors import Unavailable
+from rr_actors.runtime.callback_errors import log_raised, raised_by
+from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
+from rr_actors.runtime.shielding import shielded
+from rr_actors.runtime.user_loop import is_coroutine
 from rr_actors.supervision.core.child_calls import check_for_actor
 
 __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit", "Reason"]
+
+logger = logging.getLogger("rr_actors")
+
+MAILBOX_LIMIT = 100_000
+BATCH = 256
+"""How many messages an actor on the loop handles before other callbacks have their turn."""
+
+
+class BaseActor(pykka.Actor):
+    """The base of both actor types: life, mailbox, exit report. Pykka documents how actors behave."""
+
+    mailbox_limit: ClassVar[int] = MAILBOX_LIMIT
+    """How many messages may wait; the sender of one more gets MailboxFull."""
+
+    _lives_on_loop: ClassVar[bool] = False
+    """Whether its handlers run on the framework's loop, and not in worker threads."""
+
+    _on_exit: OnExit | None
+    """Called on the loop, once, when the actor has ended. Not if it never started: the call that starts it raises."""
+
+    _place: Any
+    _target: Target
+    _mailbox: Mailbox
+    _dispatcher: Dispatcher
+    _life_driver: Driver
+    _started: Reply[Any]
+    _begun = False
+    _report = ExitReport("normal")
+    _final = False
+    _stop_replies: list[pykka.Future[Any]]
+    _monitors: set[Monitor]  # the monitors that this actor has set
+
+    def __new__(cls, *_args: Any, **_kwargs: Any) -> Self:
+        # In __new__, and not in __init__: so a subclass's __init__ need not call this one.
+        self = super().__new__(cls)
+        birth = exit_reports.take()
+        self.actor_urn = uuid.uuid4().urn if birth.path is None else urn_of_path(birth.path)
+        self._place = birth.place
+        self._on_exit = birth.on_exit
+        self._target = Target(self.actor_urn, birth.path or f"{cls.__name__} ({self.actor_urn})")
+        self._mailbox = Mailbox(self._target.name, cls.mailbox_limit, opens_packed=not cls._lives_on_loop)
+        self.actor_inbox = self._mailbox
+        self.actor_stopped = threading.Event()
+        self._actor_ref = ActorRef(self, self._target, birth.path)
+        self._started = Reply(self._target)
+        self._stop_replies = []
+        self._monitors = set()
+        return self
+
+    def __init__(self, *_args: Any, **_kwargs: Any) -> None:
+        """Accept any arguments and do nothing: a subclass may call this, and need not."""
+
+    @classmethod
+    def start(  # pyright: ignore[reportIncompatibleMethodOverride]  # ActorRef is invariant; Pykka's own is no better
+        cls, *args: Any, **kwargs: Any
+    ) -> ActorRef[Self]:
+        """Make an actor and wait until its on_start has returned. `__init__` runs in the calling thread.
+
+        If on_start returns IGNORE, the reference is to an actor that has ended.
+
+        Raises:
+            UsageError: called on the loop, or in an `async def` callback, where waiting would delay all others.
+            BaseException: the error that `__init__` or on_start raised; the actor has ended then.
+        """
+        check_may_block(f"{cls.__name__}.start()")
+        actor = cls(*args, **kwargs)
+        actor._start_actor_loop()
+        actor._started.get()
+        return actor.actor_ref
+
+    @classmethod
+    async def launch(
+        cls,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+        *,
+        path: str | None = None,
+        place: Any = None,
+        on_exit: OnExit | None = None,
+    ) -> ActorRef[Self] | Ignore:
+        """Start an actor from the loop, and wait until its on_start has returned; for code that hosts actors.
+
+        If this call is cancelled, it stops the actor as soon as possible, and on_exit is not called.
+
+        Args:
+            path: the actor's path in its tree; its URN follows from it and stays the same after a restart.
+            place: handed to the hook _before_start.
+            on_exit: called on the loop, once, when the actor has ended.
+
+        Raises:
+            Exception: the error that `__init__` or on_start raised.
+        """
+        dispatcher = acquire()
+        try:
+            birth = exit_reports.Birth(path, place, on_exit)
+            if cls._lives_on_loop:
+                actor = Context().run(birth.of, cls, args, kwargs or {})
+            else:
+                actor = await dispatcher.workers.run(birth.of, cls, args, kwargs or {})
+            actor._start_actor_loop()
+        finally:
+            release()
+        try:
+            answer = await actor._started
+        except asyncio.CancelledError:
+            actor._on_exit = None
+            actor.actor_ref.stop(block=False, reason="shutdown")
+            raise
+        return IGNORE if answer is IGNORE else actor.actor_ref
+
+    def on_start(self) -> Any:
+        """Override this to act before the first message. It may be `async def`, and may return IGNORE."""
+
+    def on_stop(self) -> Any:
+        """Override this to act when the actor has been asked to stop. It may be `async def`."""
+
+    def on_failure(
+        self,
+        exception_type: type[BaseException] | None,
+        exception_value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> Any:
+        """Override this to act, in place of on_stop, when an exception ends the actor. It may be `async def`."""
+
+    def monitor(self, ref: Any) -> Monitor:
+        """Send the message Down to this actor, once, when the actor of `ref` has ended.
+
+        The monitor is of the actor's present life. An actor that is dead, or is being respawned, is down at once
+        ("noproc"). Down overtakes the waiting messages; each of several monitors sends one. In an `async def` handler,
+        the watch of an actor in another process begins a moment later; if it ends before, it is "noproc", too.
+
+        Args:
+            ref: a reference or proxy, or a SupervisorRef, to an actor in any process of the system.
+        """
+        mailbox = self._mailbox  # not self: a monitor does not keep its actor
+        made = Monitor(ref, lambda monitor, down: mailbox.put(Notice(down, monitor)), self._monitors.discard)
+        self._monitors.add(made)  # first: its Down removes it
+        begin(made)
+        return made
+
+    def stop(self, reason: Literal["normal", "shutdown"] = "normal") -> None:
+        """Stop this actor when it has handled the waiting messages; with "shutdown", before it handles them."""
+        self._mailbox.put(Envelope(Stop(reason)))
+
+    # -- hooks for hosts: a subclass overrides them to do more than the user's on_start and on_stop --------------------
+
+    async def _before_start(self, place: Any) -> None:
+        """Prepare the start, on the loop, before on_start."""
+
+    async def _after_start(self) -> None:
+        """Complete the start, on the loop, when on_start has succeeded; the creator gets the reference after this."""
+
+    async def _after_stop(self, final: bool) -> None:
+        """Clean up, on the loop, after on_stop or on_failure, if _before_start succeeded. `final`: no restart."""
+
+    # -- methods that Pykka calls --------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _create_actor_inbox() -> Mailbox:
+        return Mailbox("an actor", MAILBOX_LIMIT)
+
+    @staticmethod
+    def _create_future() -> Reply[Any]:
+        return Reply()
+
+    # -- life ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def actor_ref(  # pyright: ignore[reportIncompatibleMethodOverride]  # as start()
+        self,
+    ) -> ActorRef[Self]:
+        """The reference to this actor: for messages to itself, and to give to others in any process."""
+        return cast("ActorRef[Self]", self._actor_ref)
+
+    def _start_actor_loop(self) -> None:  # Pykka's name
+        shielded(self._enter_life)
+
+    def _enter_life(self) -> None:
+        self._dispatcher = acquire()  # released when the actor has ended
+        self._life_driver = Driver(
+            self._dispatcher, self._live(), self._mailbox, self._target.name, on_loop=self._lives_on_loop
+        )
+        self._mailbox.begin(self._life_driver.schedule)
+        death_watch.begin(self.actor_stopped)
+        running[self.actor_urn] = self.actor_ref  # this reference keeps the actor alive while it has no thread
+        if self.actor_ref.path is None:  # ActorRegistry.stop_all() must not stop a supervised actor
+            ActorRegistry.register(self.actor_ref)
+        try:
+            self._life_driver.start()
+        except BaseException:
+            self._life_driver.close()
+            self._vanish()
+            refuse_all(self._mailbox.close(), self._target.name)
+            death_watch.ended(self.actor_stopped, self._report)
+            release()
+            raise
+
+    async def _live(self) -> None:
+        if await self._begin():
+            handled = 0
+            while not self.actor_stopped.is_set():
+                envelope = self._mailbox.next()
+                if envelope is None:
+                    handled = 0
+                    await REST
+                    continue
+                await self._handle(envelope)
+                handled += 1
+                if handled == BATCH:
+                    handled = 0
+                    await PAUSE
+            await self._end()
+
+    async def _begin(self) -> bool:
+        doing = Activity(self._target, ())
+        activity.set(doing)
+        failure: BaseException | None = None
+        answer: Any = None
+        try:
+            await self._hook(BaseActor._before_start, self._place)
+            self._begun = True
+            answer = await self._user(self.on_start)
+            if answer is not IGNORE:
+                await self._hook(BaseActor._after_start)
+        except BaseException as error:
+            failure = error
+        finally:
+            doing.active = False
+        if failure is None and answer is not IGNORE:
+            self._started.set(None)
+            return True
+        self._vanish()
+        self._on_exit = None
+        if failure is not None:
+            self._report = abnormal(raised_by(failure))
+        await self._end()
+        if failure is None:
+            self._started.set(IGNORE)
+        else:
+            fail(self._started, exit_reports.as_heard(failure, self._target.name))
+        return False
+
+    async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
+        message, reply = envelope.message, envelope.reply_to
+        if isinstance(envelope, Notice):
+            monitor = cast("Monitor", envelope.claim)
+            self._monitors.discard(monitor)
+            if take(monitor) is None:
+                return
+        doing = Activity(self._target, getattr(envelope, "chain", ()))
+        activity.set(doing)
+        failure: BaseException | None = None
+        try:
+            if type(message) is Packed:
+                try:
+                    message = message.open()
+                except Exception as error:  # an error of the sender, not of this actor
+                    self._not_opened(error, reply)
+                    return
+            if is_stop(message):
+                await self._stop_now(message, reply)
+                return
+            if isinstance(reply, Reply) and not reply.set_running_or_notify_cancel():
+                return
+            result = self._handle_receive(message)
+            if is_coroutine(result):
+                result = await Await(result)
+            if reply is not None:
+                reply.set(as_answer(self, self.actor_ref, message, result))
+        except BaseException as error:
+            failure = error
+        finally:
+            doing.active = False
+        if failure is None:
+            return
+        if not isinstance(failure, Exception):
+            await self._leave(failure, reply)
+        elif reply is None:
+            await self._fail(failure)
+        else:
+            logger.info("Exception returned from %s to caller:", self, exc_info=failure)
+            fail(reply, failure)
+
+    def _not_opened(self, error: Exception, reply: pykka.Future[Any] | None) -> None:
+        if reply is None:
+            logger.error("a message for %s cannot be opened here, and is dropped", self, exc_info=error)
+        else:
+            fail(reply, error)
+
+    async def _stop_now(self, message: object, reply: pykka.Future[Any] | None) -> None:
+        if reply is not None:
+            self._stop_replies.append(reply)
+        self._final = getattr(message, "final", False)
+        await self._stop_gracefully(ExitReport(getattr(message, "reason", "normal"), "stopped"))
+
+    async def _stop_gracefully(self, report: ExitReport) -> None:
+        self._vanish()
+        self._report = report
+        logger.debug("Stopped %s", self)
+        try:
+            await self._user(self.on_stop)
+        except BaseException as error:
+            self._note_failure(error)
+
+    async def _leave(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
+        """End this actor, and no other, after SystemExit or the like in a handler."""
+        if reply is not None:
+            dead = Ended(f"{self._target.name} ended while it handled the message: {error!r}", self._target.name)
+            dead.__cause__ = error
+            reply.set_exception((Ended, dead, None))
+        if isinstance(error, SystemExit) and not error.code:
+            await self._stop_gracefully(ExitReport("normal", "SystemExit"))
+        else:
+            await self._fail(error)
+
+    async def _fail(self, error: BaseException) -> None:
+        self._vanish()
+        self._note_failure(error)
+        try:
+            await self._user(self.on_failure, type(error), error, error.__traceback__)
+        except BaseException as another:
+            log_raised(logger, raised_by(another), "on_failure of %s raised:", self)
+
+    async def _end(self) -> None:
+        left: list[PykkaEnvelope[Any]] = []
+        for envelope in self._mailbox.close():
+            if envelope.reply_to is not None and is_stop(envelope.message):
+                self._stop_replies.append(envelope.reply_to)
+            else:
+                left.append(envelope)
+        refuse_all(left, self._target.name)
+        for monitor in list(self._monitors):
+            monitor.demonitor()
+        if self._begun:
+            try:
+                await self._hook(BaseActor._after_stop, self._final)
+            except BaseException as error:
+                self._note_failure(error)
+        death_watch.ended(self.actor_stopped, self._report)
+        try:
+            self._dispatcher.call(self._ended, self._on_exit, self._report)
+        except Unavailable:
+            logger.debug("%s ended after its loop", self)
+        for reply in self._stop_replies:
+            reply.set(None)
+
+    @staticmethod
+    def _ended(on_exit: OnExit | None, report: ExitReport) -> None:
+        try:
+            if on_exit is not None:
+                on_exit(report)
+        finally:
+            release()
+
+    def _vanish(self) -> None:
+        if running.get(self.actor_urn) is self.actor_ref:
+            del running[self.actor_urn]
+        if self.actor_ref.path is None:
+            ActorRegistry.unregister(self.actor_ref)
+        self.actor_stopped.set()
+
+    def _note_failure(self, error: BaseException) -> None:
+        raised = raised_by(error)
+        log_raised(logger, raised, "Unhandled exception in %s:", self)
+        self._report = abnormal(raised)
+
+    async def _user(self, fn: Callable[..., Any], *args: Any) -> Any:
+        result = fn(*args)
+        return await Await(result) if is_coroutine(result) else result
+
+    async def _hook(self, hook: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
+        mine = getattr(type(self), hook.__name__)
+        if mine is not hook:  # go to the loop only if a subclass has overridden the hook
+            await Await(mine(self, *args), on_loop=True)
 
 
 class LoopActor(BaseActor):

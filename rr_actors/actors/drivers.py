@@ -12,6 +12,8 @@ from collections.abc import Callable, Coroutine, Generator
 from contextvars import Context
 from typing import Any, cast
 
+import msgspec
+
 from rr_actors.actors.messaging.mailbox import Mailbox
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.scarcity import wanted_by
@@ -20,20 +22,22 @@ from rr_actors.runtime.user_loop import start_task
 
 logger = logging.getLogger("rr_actors")
 
+RETRY_S = 0.1
+"""How long a life that can go on waits if the machine gives no thread for it."""
 
-class Request:
+
+class Request(msgspec.Struct, frozen=True, eq=False):
     """A request that a life awaits from its driver."""
 
     def __await__(self) -> Generator[Request, Any, Any]:
         return (yield self)
 
 
-class Await(Request):
+class Await(Request, frozen=True, eq=False):
     """The request to run a coroutine: on the framework's loop for hooks and LoopActors, else on the users' loop."""
 
-    def __init__(self, coroutine: Coroutine[Any, Any, Any], *, on_loop: bool = False) -> None:
-        self.coroutine = coroutine
-        self.on_loop = on_loop
+    coroutine: Coroutine[Any, Any, Any]
+    on_loop: bool = False
 
 
 REST = Request()
@@ -50,9 +54,7 @@ class Driver:
     loop has ended.
 
     Args:
-        life: the coroutine to drive; it begins with start().
         mailbox: the actor's mailbox; its `schedule` should be the driver's.
-        name: the actor's name, for the log.
         on_loop: whether the life runs on the framework's loop, and must not block. Otherwise it runs in whichever
             worker thread is free.
     """
@@ -124,8 +126,12 @@ class Driver:
             return
         try:
             self._dispatcher.workers.in_thread(self.drive, result, error, beyond_limit=True)
-        except Unavailable:
-            self._cut_off()
+        except Unavailable as refusal:
+            if wanted_by(refusal):
+                loop = self._dispatcher.loop
+                self._dispatcher.call(lambda: loop.call_later(RETRY_S, self._resume, result, error))
+            else:
+                self._cut_off()
 
     def _await(self, request: Await) -> None:
         try:

@@ -9,14 +9,13 @@ from collections.abc import Callable
 from contextvars import Context
 from typing import Any, cast
 
-import pykka
 from pykka import ActorDeadError
 
 from rr_actors.actors.messaging import death_watch
 from rr_actors.actors.messaging.exit_reports import Down
-from rr_actors.actors.messaging.mailbox import Mailbox, Notice
 from rr_actors.actors.refs import DistantRef, local_of, ref_in, watch
 from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import Flag
@@ -40,7 +39,10 @@ class Monitor:
     """
 
     def __init__(self, ref: Any, deliver: Deliver, over: Callable[[Monitor], object]) -> None:
-        self.ref = _ref_of(ref)
+        found = ref_in(ref)
+        if found is None:
+            raise UsageError(f"monitor: expected a reference to an actor, got {type(ref).__name__}")
+        self.ref = found
         self.number = next(_numbers)
         self._deliver = deliver
         self._called_off = over
@@ -110,8 +112,10 @@ class Monitor:
         self._told.set()
         try:
             self._deliver(self, down)
-        except (ActorDeadError, Unavailable):
-            logger.debug("nobody is left to hear that %s", down)
+        except (ActorDeadError, Unavailable) as error:
+            level = logging.ERROR if wanted_by(error) else logging.DEBUG  # without a reason like that nobody is left
+            logger.log(level, "a monitor could not report that %s: %s", down, error)
+            self.demonitor()
 
     def __enter__(self) -> Monitor:
         return self
@@ -141,9 +145,7 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     """
     if callback is not None and not callable(cast(object, callback)):
         raise UsageError(f"monitor: callback: expected a callable, got {type(callback).__name__}")
-    _ref_of(ref)
     call_back = None if callback is None else described(callback, "monitor: callback")
-    dispatcher = acquire()  # released when the monitor is over
 
     def over(monitor: Monitor) -> None:
         try:
@@ -159,13 +161,9 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
             dispatcher.workers.in_thread(_call_back, monitor, call_back, dispatcher, over, beyond_limit=True)
 
     made = Monitor(ref, deliver, over)
+    dispatcher = acquire()  # released when the monitor is over
     begin(made)
     return made
-
-
-def deliver_to(mailbox: Mailbox) -> Deliver:
-    """Return a function that delivers a Down to an actor, as a message in its mailbox."""
-    return lambda monitor, down: mailbox.put(Notice(down, monitor))
 
 
 def _call_back(
@@ -181,20 +179,10 @@ def _call_back(
         return
     try:
         result = callback(down)
+        if is_coroutine(result):
+            dispatcher.workers.start_coroutine(result, done, Context())
+            return
     except Exception as error:
         done(None, error)
-        return
-    if not is_coroutine(result):
+    else:
         done(None, None)
-        return
-    try:
-        dispatcher.workers.start_coroutine(result, done, Context())
-    except Unavailable:
-        logger.debug("the callback of %r came after its loop", monitor)
-
-
-def _ref_of(what: Any) -> pykka.ActorRef[Any]:
-    ref = ref_in(what)
-    if ref is None:
-        raise UsageError(f"monitor: expected a reference to an actor, got {type(what).__name__}")
-    return ref

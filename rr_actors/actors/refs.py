@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from types import EllipsisType
+from types import EllipsisType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import pykka
@@ -13,12 +13,11 @@ from pykka import ActorDeadError
 
 from rr_actors.actors.messaging import ask_cycles, dead_letters
 from rr_actors.actors.messaging.ask_cycles import Target
-from rr_actors.actors.messaging.futures import Reply, StopReply
-from rr_actors.actors.messaging.mailbox import Ended, Envelope, Stop, is_stop
+from rr_actors.actors.messaging.futures import ExcInfo, Reply, StopReply, error_of
+from rr_actors.actors.messaging.mailbox import Ended, Envelope, Stop, has_ended, is_stop
 from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.remote.peer import Line, Whereabouts
-from rr_actors.actors.remote.proxy import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
-from rr_actors.actors.remote.stubs import DistantInbox, DistantReply, DistantStopped, as_directory_says
+from rr_actors.actors.remote.proxy import Attributes, DistantInbox, DistantProxy, Mirror, attributes_of, local_proxy
 from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError, is_a, shown
 from rr_actors.base.values.codecs import NoForm, codec, codec_of_subclass
 from rr_actors.runtime import event_loop
@@ -84,12 +83,10 @@ class ActorRef(pykka.ActorRef[A]):
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
         event_loop.check_may_block(f"asking {self._target.name}")
         ask_cycles.check_ring(self._target)
-        return self._ask(message, reply, limit_s)
+        return self._ask(message, reply, limit_s, limit_s)
 
-    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
-        return self._ask_within(message, reply, limit_s, limit_s)
-
-    def _ask_within(self, message: Any, reply: Reply[Any], limit_s: float | None, left_s: float | None) -> Any:
+    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None, left_s: float | None) -> Any:
+        """Send the message and wait for `left_s` seconds, what is left of `limit_s`."""
         give_up = self._send(message, reply, ask_cycles.chain())
         try:
             return reply.get(timeout=left_s)
@@ -231,6 +228,30 @@ class ActorRef(pykka.ActorRef[A]):
         return _restore, (self._target, self.path, "" if process is None else process.address)
 
 
+class DistantReply(Reply[Any]):
+    """The reply of an actor that may be respawned: if it dies first, its entry in the directory decides the error.
+
+    For map() and join(), Pykka calls the class without arguments; such a future itself waits for no actor.
+    """
+
+    def __init__(self, where: Whereabouts | None = None) -> None:
+        super().__init__(None if where is None else where.target)
+        self._where = where
+
+    def set_exception(self, exc_info: ExcInfo | BaseException | None = None) -> None:
+        """Set the exception that get() raises; for a dead actor, the error from the directory."""
+        error = error_of(exc_info)
+        if self._where is not None and has_ended(error, self._where.target.name):
+            error = _as_directory_says(self._where, error)
+        super().set_exception(error)
+
+
+def _as_directory_says(where: Whereabouts, dead: BaseException) -> BaseException:
+    """Return the error for an actor that its last process reported `dead`: it may be being respawned."""
+    process = hub(where.path)
+    return dead if where.path is None or process is None else process.missing(where)
+
+
 class DistantRef(ActorRef[A]):
     """A reference that looks for the actor each time: in this process, or in another one.
 
@@ -272,7 +293,7 @@ class DistantRef(ActorRef[A]):
     def actor_stopped(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """An object whose is_set() returns whether the actor has ended."""
         local = self._local()
-        return DistantStopped(self) if local is None else local.actor_stopped
+        return SimpleNamespace(is_set=lambda: not self.is_alive()) if local is None else local.actor_stopped
 
     @property
     def _actor_weakref(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -289,7 +310,7 @@ class DistantRef(ActorRef[A]):
                 return
             _put(local, Envelope(message), self._target.name)
         except (ActorDeadError, ActorUnavailable) as error:
-            said = as_directory_says(self._where, error) if isinstance(error, Ended) else error
+            said = _as_directory_says(self._where, error) if isinstance(error, Ended) else error
             _note_dead(self, message, said)
             raise said from None
 
@@ -306,7 +327,8 @@ class DistantRef(ActorRef[A]):
         except (ActorDeadError, Unavailable, pykka.Timeout):
             return False
         except UsageError:  # waiting is refused here: only the directory can be asked
-            return self._hub().may_be_alive(self._where)
+            process = hub(self.path)
+            return process is not None and process.may_be_alive(self._where)
 
     @property
     def pid(self) -> int | None:
@@ -338,10 +360,10 @@ class DistantRef(ActorRef[A]):
     def _new_reply(self) -> Reply[Any]:
         return DistantReply(self._where)
 
-    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
+    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None, left_s: float | None) -> Any:
         process = hub(self.path)
         if process is None or process.local(self._target.urn) is not None:
-            return self._ask_within(message, reply, limit_s, limit_s)
+            return super()._ask(message, reply, limit_s, left_s)
         began = time.monotonic()
         waiting = ask_cycles.begin_wait(reply)
         try:
@@ -349,7 +371,7 @@ class DistantRef(ActorRef[A]):
                 return reply.get()
         finally:
             ask_cycles.end_wait(waiting, reply)
-        return self._ask_within(message, reply, limit_s, left_of(limit_s, began))
+        return super()._ask(message, reply, limit_s, left_of(left_s, began))
 
     def _ask_now(self, process: ActorHub, message: Any, reply: Reply[Any], limit_s: float | None) -> bool:
         try:
@@ -388,7 +410,12 @@ class DistantRef(ActorRef[A]):
 
     def _inquire(self, what: str) -> Any:
         event_loop.check_may_block(f"asking about {self._target.name}")
-        return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
+        limit_s = ask_timeout_s()
+        reply = self._hub().inquire(self._where, what)
+        try:
+            return reply.get(timeout=limit_s)
+        except pykka.Timeout:
+            raise pykka.Timeout(f"no reply after {limit_s} seconds: the {what} of {self._target.name}") from None
 
     def _local(self) -> pykka.ActorRef[A] | None:
         process = hub(self.path)
@@ -403,9 +430,6 @@ class DistantRef(ActorRef[A]):
                 f"{self._target.name} is in another process, and no System runs in this one", id=self._target.name
             )
         return process
-
-    def __repr__(self) -> str:
-        return f"<ActorRef for {self}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restore, (self._target, self.path, self._where.address)
@@ -462,12 +486,7 @@ def ref_in(what: Any) -> pykka.ActorRef[Any] | None:
 
 
 def _put(ref: pykka.ActorRef[Any], envelope: Envelope, name: str) -> None:
-    """Put an envelope into the mailbox of an actor of this process.
-
-    Raises:
-        Ended: the actor is dead.
-        MailboxFull: the mailbox is full.
-    """
+    """Put an envelope into the mailbox of an actor of this process, or raise Ended or MailboxFull."""
     if ref.actor_stopped.is_set():
         raise Ended(f"{name} not found", name)
     ref.actor_inbox.put(envelope)

@@ -64,8 +64,8 @@ class Timer:
             return
         try:
             self._dispatcher.workers.in_thread(self._send, beyond_limit=True)  # pickling runs users' code
-        except Unavailable:
-            logger.debug("%r: its loop has ended", self)
+        except Unavailable as error:
+            logger.warning("the message of a timer was not sent to %s: %s", self._ref, error)
             release()
 
     def _send(self) -> None:

@@ -14,12 +14,12 @@ from typing import Any
 import pykka
 import pytest
 
-from rr_actors.actors.actor import IGNORE, Actor, ExitReport, LoopActor
+from rr_actors.actors.actor import BATCH, IGNORE, Actor, ExitReport, LoopActor
 from rr_actors.actors.drivers import Driver
-from rr_actors.actors.lifecycle import BATCH
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.errors import MailboxFull, StartFailed, UsageError
 from rr_actors.runtime.event_loop import Dispatcher, acquire, current, release
+from rr_actors.runtime.workers import Workers
 from support import REPOSITORY, Calls, Gate, eventually
 
 
@@ -365,6 +365,22 @@ def test_async_handlers_run_on_the_user_loop_one_message_at_a_time() -> None:
         ref.tell(number)
     assert ref.proxy().method(1).get(timeout=10) == 2
     assert ref.proxy().seen.get() == list(range(100))
+
+
+def test_an_async_handler_goes_on_although_for_a_moment_there_was_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    ref = AsyncEcho.start()
+    in_thread = Workers.in_thread
+    refused: list[Any] = []
+
+    def refuse_once(workers: Workers, fn: Any, *args: Any, beyond_limit: bool = False) -> None:
+        if args and fn.__name__ == "drive" and not refused:
+            refused.append(fn)
+            raise MailboxFull("no thread") from RuntimeError("can't start new thread")
+        in_thread(workers, fn, *args, beyond_limit=beyond_limit)
+
+    monkeypatch.setattr(Workers, "in_thread", refuse_once)
+    assert ref.ask("through", timeout=10) == "through"
+    assert refused
 
 
 def test_all_hooks_may_be_async_and_errors_in_them_are_like_any_other() -> None:

@@ -153,6 +153,17 @@ def test_letters_lost_between_processes_are_noted_where_they_are_lost(start: Sta
     assert why == f"sent by root/a (pid {a.ask('pid')}), found nobody"
 
 
+def test_a_message_that_is_too_long_for_its_connection_is_one(start: Start) -> None:
+    system = start(rr.ChildSpec(Worker, id="a"), config=rr.SystemConfig(frame_limit_bytes=100_000))
+    system.ref("a").tell(b"x" * 200_000)
+
+    eventually(lambda: system.dead_letters().count == 1)
+    ((to, message, why),) = letters(system)
+    assert to == "root/a"
+    assert message.endswith("bytes>")
+    assert "over the limit of 100000" in why
+
+
 def test_those_of_all_processes_are_told_as_events_and_shown(start: Start) -> None:
     system = start(rr.ChildSpec(Worker, id="a"), rr.ChildSpec(Worker, id="b"))
     events = Calls()

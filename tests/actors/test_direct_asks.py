@@ -17,8 +17,7 @@ import pykka
 import pytest
 
 from rr_actors.actors.actor import Actor
-from rr_actors.actors.refs import ActorRef, ref_to
-from rr_actors.actors.remote.stubs import DistantReply
+from rr_actors.actors.refs import ActorRef, DistantReply, ref_to
 from rr_actors.base.errors import MailboxFull, NotSerializable, UsageError
 from rr_actors.wire.name_service import StateDir, Status, open_state_dir
 from support import Workshop, eventually, hang

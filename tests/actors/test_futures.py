@@ -198,6 +198,43 @@ def test_exception_of_what_map_returns_raises_a_ring_of_asks() -> None:
     ref.stop()
 
 
+def test_a_cancel_that_is_interrupted_wakes_all_that_wait() -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    reply: Reply[int] = Reply()
+    reply.withdraw = interrupted
+    seen = Calls()
+    reply.add_done_callback(seen)
+    with pytest.raises(KeyboardInterrupt):
+        reply.cancel()
+    assert reply.cancelled()
+    assert seen.items == [reply]
+
+
+def test_what_map_returns_is_computed_later_if_there_was_no_thread_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    source: Reply[int] = Reply()
+    mapped: Any = source.map(str)
+    source.set(1)
+    seen = Calls()
+    with monkeypatch.context() as scarce:
+        scarce.setattr(threading.Thread, "start", no_thread)
+        with pytest.raises(RuntimeError, match="can't start new thread"):
+            mapped.add_done_callback(seen)
+    assert concurrent.futures.wait([mapped], LIMIT_S).done == {mapped}
+    assert seen.wait() == [mapped]
+
+
+def test_a_future_shows_its_actor_and_its_state(ref: rr.ActorRef[Any]) -> None:
+    asked = ref.ask("good", block=False)
+    assert asked.get() == "good"
+    assert repr(asked) == f"<Reply: the reply of {ref}, finished>"
+    assert repr(Reply()) == "<Reply: a future, pending>"
+
+
 def test_a_cancelled_load_is_withdrawn(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
     served = serve(provider, "slow", load=gate)
     future: Any = app.load("provider/slow", "x", block=False)

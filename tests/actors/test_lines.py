@@ -78,7 +78,7 @@ class Bench:
         self.link = self.transport.link
         self.forgotten: list[Line] = []
         transport: Any = self.transport
-        self.line = Line(self.dispatcher, transport, "there.sock", HELLO, self.forgotten.append)
+        self.line = Line(self.dispatcher, transport, HELLO, self.forgotten.append)
         self._numbers = itertools.count(1)
         self.put_ask()
         self.settle()
@@ -163,7 +163,7 @@ def test_a_thread_asks_by_a_connection_of_its_own_and_the_next_uses_it_again(ben
 def test_nothing_is_asked_so_before_there_is_a_link() -> None:
     dispatcher = Dispatcher()
     transport: Any = FakeTransport()
-    line = Line(dispatcher, transport, "there.sock", HELLO, lambda _: None)
+    line = Line(dispatcher, transport, HELLO, lambda _: None)
     assert not line.may_ask
     assert line.ask(Ask(1, URN, b"", []), None) is None
     assert not transport.made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import signal
 import threading
@@ -15,7 +16,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors.messaging import death_watch
-from rr_actors.runtime import event_loop
+from rr_actors.runtime import event_loop, user_loop
+from rr_actors.runtime.processes import lifeline
 from support import Calls, Gate, eventually, serve
 
 Start = Callable[..., rr.System]
@@ -266,6 +268,52 @@ def test_a_callback_may_be_a_coroutine_and_may_raise(caplog: pytest.LogCaptureFi
     assert {record.exc_info[0] for record in caplog.records if record.exc_info} == {LookupError, ArithmeticError}
 
 
+@pytest.fixture
+def dead() -> Iterator[rr.ActorRef[Any]]:
+    """An actor that has ended; the loop runs, and has no workers yet."""
+    ref = Worker.start()
+    ref.stop()
+    eventually(lambda: event_loop.current() is None)
+    event_loop.acquire()
+    yield ref
+    event_loop.release()
+    eventually(lambda: event_loop.current() is None)  # no monitor holds it any more
+
+
+def no_thread(_thread: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_a_callback_for_which_there_is_no_thread_is_logged_and_holds_nothing(
+    dead: rr.ActorRef[Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls = Calls()
+    with monkeypatch.context() as scarce:
+        scarce.setattr(threading.Thread, "start", no_thread)
+        monitor = rr.monitor(dead, calls)
+    assert not monitor.demonitor()
+    assert not calls.items
+    [line] = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert f"{dead} is down" in line
+    assert "can't start new thread" in line
+
+
+def test_a_coroutine_for_which_there_is_no_loop_is_logged_and_holds_nothing(
+    dead: rr.ActorRef[Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def none_left() -> asyncio.AbstractEventLoop:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    async def never(_down: rr.Down) -> None: ...
+
+    with monkeypatch.context() as scarce:
+        scarce.setattr(user_loop, "new_loop", none_left)
+        rr.monitor(dead, never)
+        eventually(lambda: "the callback of <Monitor" in caplog.text)
+    assert "EMFILE" in caplog.text
+    settle()
+
+
 def test_waiting_has_a_limit() -> None:
     watched = Worker.start()
     with rr.monitor(watched) as monitor:
@@ -479,6 +527,27 @@ def test_a_process_that_lives_but_cannot_be_reached_is_told_from_a_dead_one(star
     (line,) = node.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
 
     node.dispatcher.call(line.close)
+
+    assert [down.reason for down in calls.wait()] == ["noconnection"]
+
+
+def test_a_death_that_no_worker_can_wait_for_is_heard_of_as_a_lost_connection(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = start(rr.ChildSpec(Worker, id="a", restart="temporary"))
+    calls = Calls()
+    rr.monitor(system.ref("a"), calls)
+    node = system._node  # pyright: ignore[reportPrivateUsage]
+    assert node is not None
+    submit = node.dispatcher.workers.submit
+
+    def refuse(fn: Any, *args: Any, **options: Any) -> None:
+        if fn is lifeline.wait_gone:
+            raise rr.MailboxFull("no thread is left")
+        submit(fn, *args, **options)
+
+    monkeypatch.setattr(node.dispatcher.workers, "submit", refuse)
+    system.ref("a").kill()
 
     assert [down.reason for down in calls.wait()] == ["noconnection"]
 

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import pykka
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors.refs import ref_to
+from rr_actors.runtime import event_loop
 from support import eventually
 from support_pykka import (
     Carrier,
@@ -329,6 +332,24 @@ def test_a_timer_for_an_actor_that_has_ended_harms_nobody(caplog: pytest.LogCapt
     for delay, whom in wrong:
         with pytest.raises(rr.UsageError, match="send_after"):
             rr.send_after(delay, whom, "x")  # type: ignore[arg-type]
+
+
+def test_a_timer_for_which_there_is_no_thread_logs_that_its_message_is_lost(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    eventually(lambda: event_loop.current() is None)
+    event_loop.acquire()
+    ref = ref_to("root/nobody")
+    with monkeypatch.context() as scarce:
+        scarce.setattr(threading.Thread, "start", no_thread)
+        rr.send_after(0, ref, "late")
+        eventually(lambda: "was not sent to root/nobody" in caplog.text)
+    assert "can't start new thread" in caplog.text
+    event_loop.release()
+    eventually(lambda: event_loop.current() is None)
 
 
 def test_which_child_tells_of_one_child(start: Start) -> None:

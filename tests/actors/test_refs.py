@@ -7,6 +7,7 @@ import functools
 import gc
 import logging
 import multiprocessing
+import os
 import pickle
 import signal
 import subprocess
@@ -295,6 +296,17 @@ def test_ask_has_a_time_out_by_default(ours: ActorRef[Any], home: Home) -> None:
     assert ours.ask("alive") == "alive"
 
 
+def test_a_process_that_does_not_say_what_an_actor_is_is_named(ours: ActorRef[Any], home: Home) -> None:
+    pid = ours.ask("pid")
+    home.hub.ask_timeout_s = 0.02
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(pykka.Timeout, match=rf"no reply after 0\.02 seconds: the class of {ours.path}"):
+            _ = ref_to(str(ours.path)).actor_class
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
 def test_a_full_mailbox_of_another_process_is_the_askers_error(make: Make) -> None:
     ref = make("RemoteSmall")
     gate = ref.ask(lambda _: time.sleep(0.5), block=False)
@@ -439,6 +451,20 @@ def test_without_a_system_a_local_reference_does_not_pickle_and_says_why(home: H
             pickle.dumps(here)
         with pytest.raises(ActorUnavailable, match="no System runs"):
             ref_to("root/a").ask("anybody")
+    finally:
+        set_hub(home.hub)
+
+
+def test_without_a_system_no_actor_elsewhere_is_alive_in_an_async_handler_either(home: Home) -> None:
+    class Looks(Actor):
+        async def on_receive(self, message: Any) -> Any:
+            return ref_to("root/a").is_alive()
+
+    here = Looks.start()
+    set_hub(None)
+    try:
+        assert ref_to("root/a").is_alive() is False
+        assert here.ask("look") is False
     finally:
         set_hub(home.hub)
 

@@ -12,6 +12,8 @@ import threading
 from contextvars import ContextVar
 from typing import NamedTuple, Protocol
 
+import msgspec
+
 from rr_actors.base.errors import UsageError
 
 
@@ -26,15 +28,12 @@ Chain = tuple[Target, ...]
 """The actors that are blocked until the message is answered, the first asker first."""
 
 
-class Activity:
+class Activity(msgspec.Struct, eq=False):
     """One run of a handler. It is not `active` once the handler has returned: a task left behind blocks no actor."""
 
-    __slots__ = ("active", "chain", "target")
-
-    def __init__(self, target: Target, chain: Chain) -> None:
-        self.target = target
-        self.chain = chain
-        self.active = True
+    target: Target
+    chain: Chain
+    active: bool = True
 
 
 class Awaited(Protocol):
@@ -104,29 +103,20 @@ def _check(me: Activity, target: Target) -> None:
 
 def _path(start: Target, goal_urn: str) -> list[str] | None:
     """Return the names from `start` to the goal, where each actor waits for the next; None if there is no path."""
-    came_from: dict[str, Target | None] = {start.urn: None}
-    to_visit = [start]
+    seen = {start.urn}
+    to_visit = [(start.urn, [start.name])]
     while to_visit:
-        here = to_visit.pop()
-        for awaited in _waits.get(here.urn, ()):
+        here_urn, names = to_visit.pop()
+        for awaited in _waits.get(here_urn, ()):
             following = awaited.target
             if following is None or awaited.done():  # answered: the waiting handler has not woken up yet
                 continue
             if following.urn == goal_urn:
-                return [*_names_to(here, came_from), following.name]
-            if following.urn not in came_from:
-                came_from[following.urn] = here
-                to_visit.append(following)
+                return [*names, following.name]
+            if following.urn not in seen:
+                seen.add(following.urn)
+                to_visit.append((following.urn, [*names, following.name]))
     return None
-
-
-def _names_to(end: Target, came_from: dict[str, Target | None]) -> list[str]:
-    names: list[str] = []
-    here: Target | None = end
-    while here is not None:
-        names.append(here.name)
-        here = came_from[here.urn]
-    return names[::-1]
 
 
 def _ring_error(ring: list[str]) -> UsageError:

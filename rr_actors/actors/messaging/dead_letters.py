@@ -90,10 +90,10 @@ class Office:
         if process is not None and process.is_loop_thread():
             try:
                 process.workers.serial("dead letters", self._record, to, messages, why, unheard, at)
+                return
             except Unavailable:  # no thread is free, or the process ends: letters without texts are better than none
-                self._record(to, [Lost(type(message).__name__) for message in messages], why, unheard, at)
-        else:
-            self._record(to, messages, why, unheard, at)
+                messages = [Lost(type(message).__name__) for message in messages]
+        self._record(to, messages, why, unheard, at)
 
     def _record(self, to: str, messages: Sequence[Any], why: str, unheard: int, at: float) -> None:
         letters = [DeadLetter(to, shown(message), why, at, os.getpid()) for message in messages[-KEPT:]]
@@ -158,11 +158,10 @@ class Collection:
         return DeadLetters(here.count + sum(list(self._counts.values())), letters[-KEPT:])
 
 
-class Lost:
+class Lost(msgspec.Struct, frozen=True):
     """Stands for a message without a text, such as a packed one; `what` describes it: "12 bytes"."""
 
-    def __init__(self, what: str) -> None:
-        self.what = what
+    what: str
 
     def __repr__(self) -> str:
         return f"<{self.what}>"

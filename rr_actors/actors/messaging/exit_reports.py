@@ -12,8 +12,6 @@ import msgspec
 from rr_actors.base.errors import StartFailed, text_of
 from rr_actors.runtime.callback_errors import Raised
 
-# The special result of on_start, and the report of an exit.
-
 Reason = Literal["normal", "shutdown", "abnormal", "killed"]
 
 
@@ -76,13 +74,7 @@ A = TypeVar("A")
 
 
 class Birth(msgspec.Struct, frozen=True):
-    """The values that an actor's creator gives to it; none by default, as in an ordinary call of its class.
-
-    Attributes:
-        path: the actor's path in its tree.
-        place: an object of its host, for the hook _before_start.
-        on_exit: called on the loop, once, when the actor has ended.
-    """
+    """The values that launch() gives to the actor; none by default, as in an ordinary call of its class."""
 
     path: str | None = None
     place: Any = None
@@ -97,16 +89,15 @@ class Birth(msgspec.Struct, frozen=True):
         return cls(*args, **kwargs)
 
 
-_given: ContextVar[Birth | None] = ContextVar("rr_actors_birth", default=None)
 _ORDINARY = Birth()
+_given: ContextVar[Birth] = ContextVar("rr_actors_birth", default=_ORDINARY)
 
 
 def take() -> Birth:
     """Return the Birth of the actor that is being made now, for its __new__; a second call returns an empty one."""
     birth = _given.get()
-    if birth is None:
-        return _ORDINARY
-    _given.set(None)  # not for an actor that this one's __init__ starts
+    if birth is not _ORDINARY:
+        _given.set(_ORDINARY)  # not for an actor that this one's __init__ starts
     return birth
 
 

@@ -98,8 +98,10 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 return False
             self._cancelled = True
             callbacks = self._put(None, concurrent.futures.CancelledError(f"cancelled: {self._whose()}"), None)
-        withdraw()
-        self._call_back(callbacks)
+        try:
+            withdraw()
+        finally:  # an interrupt must not keep the waiting threads waiting
+            self._call_back(callbacks)
         return True
 
     def set_running_or_notify_cancel(self) -> bool:
@@ -185,7 +187,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         """Set the value. After cancel(), this and the other methods that set it do nothing.
 
         Raises:
-            queue.Full: it is set already, or has a get hook.
+            queue.Full: it is set already, or has a get hook; as for the other methods that set it.
         """
         self._settle(value, None, None)
 
@@ -196,11 +198,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     def set_exception(  # pyright: ignore[reportIncompatibleMethodOverride]  # takes what both bases take
         self, exc_info: ExcInfo | BaseException | None = None
     ) -> None:
-        """Set the exception that get() raises; if None, the exception that is being handled.
-
-        Raises:
-            queue.Full: it is set already, or has a get hook.
-        """
+        """Set the exception that get() raises; if None, the exception that is being handled."""
         self._settle(None, error_of(exc_info), None)
 
     def set_unopened(self, unpack: Callable[[], T], *, raises: bool = False) -> None:
@@ -210,9 +208,6 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
 
         Args:
             raises: whether `unpack` raises an exception.
-
-        Raises:
-            queue.Full: it is set already, or has a get hook.
         """
         self._settle(None, None, unpack, raises=raises)
 
@@ -327,8 +322,8 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         with self._lock:
             if self._hook_lock is None or self._hook_runs:
                 return
-            self._hook_runs = True
-        threading.Thread(target=self._finish_hook, name="rr-future", daemon=True).start()
+            threading.Thread(target=self._finish_hook, name="rr-future", daemon=True).start()
+            self._hook_runs = True  # last: start() raises if the machine gives no thread
 
     def _finish_hook(self) -> None:
         try:
@@ -406,6 +401,9 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     def overdue(self, timeout_s: float | None) -> pykka.Timeout:
         """Return the error for a caller that has waited `timeout_s` seconds without a reply."""
         return pykka.Timeout(f"no reply after {timeout_s} seconds: {self._whose()}")
+
+    def __repr__(self) -> str:
+        return f"<Reply: {self._whose()}, {self._state.lower()}>"
 
     def _whose(self) -> str:
         return "a future" if self.target is None else f"the reply of {self.target.name}"

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 from pykka import ActorDeadError, Future
 from pykka._envelope import Envelope as PykkaEnvelope
 from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPrivateUsage]
@@ -82,14 +83,11 @@ def has_ended(error: BaseException, name: str) -> bool:
     return isinstance(error, ActorDeadError) and error.__traceback__ is None
 
 
-class Packed:
+class Packed(msgspec.Struct, frozen=True, eq=False):
     """A pickled message, which is unpickled where its actor runs, never on the loop. `size` in bytes."""
 
-    __slots__ = ("open", "size")
-
-    def __init__(self, open: Callable[[], Any], size: int) -> None:
-        self.open = open
-        self.size = size
+    open: Callable[[], Any]
+    size: int
 
     def __repr__(self) -> str:
         return f"<{self.size} bytes>"
@@ -130,7 +128,8 @@ class Mailbox:
         message = envelope.message
         notice = type(envelope) is Notice
         urgent = notice or is_stop(message)
-        lane = self._control if notice or (urgent and _overtakes(message)) else self._messages
+        overtakes = notice or (urgent and getattr(message, "reason", "normal") == "shutdown")
+        lane = self._control if overtakes else self._messages
         schedule: Callable[[bool], None] | None = None
         queued = False
         try:
@@ -237,14 +236,14 @@ class Mailbox:
         return len(self._messages) + len(self._control)
 
 
-def _overtakes(stop: object) -> bool:
-    return getattr(stop, "reason", "normal") == "shutdown"
-
-
 def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
     """Answer the messages that an ended actor has not handled, and record them as dead letters."""
     for envelope in envelopes:
-        _refuse(envelope, name)
+        reply = envelope.reply_to
+        if reply is not None and is_stop(envelope.message):
+            reply.set(None)  # as the actor has ended
+        elif reply is not None:
+            reply.set_exception((Ended, Ended(f"{name} stopped before handling the message", name), None))
     letters = [envelope for envelope in envelopes if type(envelope) is not Notice and not is_stop(envelope.message)]
     if letters:
         dead_letters.office.record(
@@ -253,14 +252,3 @@ def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
             "stopped before handling it",
             unheard=sum(letter.reply_to is None for letter in letters),
         )
-
-
-def _refuse(envelope: PykkaEnvelope[Any], name: str) -> None:
-    """Fail the reply that a message waits for; a stop message succeeds, as the actor has ended."""
-    reply = envelope.reply_to
-    if reply is None:
-        return
-    if is_stop(envelope.message):
-        reply.set(None)
-    else:
-        reply.set_exception((Ended, Ended(f"{name} stopped before handling the message", name), None))

@@ -159,16 +159,12 @@ class ActorHub:
         except OSError as error:
             line.cut_off(call, error)
             return True
-        if answer is None or (type(answer) is Dead and not answer.taken and self._has_moved(where, line)):
+        if answer is None:
             return False
+        if type(answer) is Dead and not answer.taken and self._address(where) not in ("", self.address, line.address):
+            return False  # it has moved
         line.answer(call, answer)
         return True
-
-    def _has_moved(self, where: Whereabouts, line: Line) -> bool:
-        try:
-            return self._locate(where) != line.address
-        except (ActorDeadError, ActorUnavailable):
-            return False
 
     def tell(self, where: Whereabouts, message: Any) -> None:
         """Send the message. If the actor ends before it arrives, the message is lost, and logged."""
@@ -211,8 +207,11 @@ class ActorHub:
             except _Cut:
                 if pid is None or self._closed:
                     gone(False)
-                else:  # the sockets of a process close a moment before it is dead
+                    return
+                try:  # the sockets of a process close a moment before it is dead
                     self._dispatcher.workers.submit(lifeline.wait_gone, (pid,), CUT_S, done=gone, patient=True)
+                except Unavailable:
+                    gone(False)
             except Exception as error:
                 fire("noproc", str(error))
             else:
@@ -229,10 +228,7 @@ class ActorHub:
 
     def pid(self, where: Whereabouts) -> int | None:
         """Return the id of the actor's process; None if the actor is not up, or the process is not known."""
-        if where.path is None:
-            return pid_of(where.address)
-        entry = self._directory.lookup(actor_key(where.path))
-        return None if entry is None or entry.status is not Status.UP else pid_of(entry.address)
+        return pid_of(self._address(where))
 
     def kill(self, where: Whereabouts) -> bool:
         """Kill the actor's process (SIGKILL); return False if the actor is not up.
@@ -278,11 +274,7 @@ class ActorHub:
 
     def may_be_alive(self, where: Whereabouts) -> bool:
         """Return False if the directory says that the actor is not up, else True; its process is not asked."""
-        try:
-            self._locate(where)
-        except (ActorDeadError, ActorUnavailable):
-            return False
-        return True
+        return self._address(where) not in ("", self.address)
 
     def close(self) -> None:
         """Close all links of kind "actors"; open calls fail. On the loop."""
@@ -305,12 +297,16 @@ class ActorHub:
     def _new_call(self, line: Line, where: Whereabouts, reply: Reply[Any]) -> Call:
         return Call(line.next_number(), reply, where.target.name, lambda: self.missing(where))
 
-    def _locate(self, where: Whereabouts) -> str:
+    def _address(self, where: Whereabouts) -> str:
+        """Return the address of the actor's process; "" if the actor is not up."""
         if where.path is None:
-            address = where.address
-        else:
-            entry = self._directory.lookup(actor_key(where.path))
-            address = entry.address if entry is not None and entry.status is Status.UP else ""
+            return where.address
+        entry = self._directory.lookup(actor_key(where.path))
+        return entry.address if entry is not None and entry.status is Status.UP else ""
+
+    def _locate(self, where: Whereabouts) -> str:
+        """Return the address of the actor's process, or raise the error for a missing actor."""
+        address = self._address(where)
         if not address or address == self.address:  # an actor of this process would have been found before
             raise self.missing(where)
         return address
@@ -321,8 +317,7 @@ class ActorHub:
                 raise Unavailable("this process's system is stopping")
             line = self._lines.get(address)
             if line is None:
-                hello = Hello(KIND, address, self.name, 0)
-                line = Line(self._dispatcher, self._transport, address, hello, self._forget)
+                line = Line(self._dispatcher, self._transport, Hello(KIND, address, self.name, 0), self._forget)
                 self._lines[address] = line
             return line
 

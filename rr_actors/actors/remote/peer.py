@@ -88,19 +88,14 @@ class Line:
     """The messages for one address. Call its methods on the loop, except where they say otherwise.
 
     Args:
-        hello: the Hello with which the link is opened.
+        hello: the Hello with which the link is opened; its `to` is the address.
         forget: called with the line when its link is lost, before its calls fail.
     """
 
     def __init__(
-        self,
-        dispatcher: Dispatcher,
-        transport: UnixTransport,
-        address: str,
-        hello: Hello,
-        forget: Callable[[Line], None],
+        self, dispatcher: Dispatcher, transport: UnixTransport, hello: Hello, forget: Callable[[Line], None]
     ) -> None:
-        self.address = address
+        self.address = hello.to
         self._dispatcher = dispatcher
         self._transport = transport
         self._hello = hello
@@ -110,7 +105,7 @@ class Line:
         self._turn = 0  # how often _pump() has run
         self._woken_for = -1  # the turn that the loop was last asked for
         self._link: Link | None = None
-        self._peer = address
+        self._peer = hello.to
         self._connecting: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
         self._asks = ThreadConnections(self._dial)
@@ -271,10 +266,10 @@ class Line:
                     self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._try_again)
                 break
             except RrError as error:  # too long for a frame
-                if call is None:
-                    logger.error("a message to the process at %s was not sent: %s", self.address, error)
-                else:
+                if call is not None:
                     fail(call.reply, error)
+                elif isinstance(letter, Tell):
+                    _record_lost(letter.to, [letter], str(error))
             else:
                 if call is not None:
                     self._calls[call.number] = call
@@ -312,18 +307,17 @@ class Line:
             self._close_line(line)
         calls = list(self._calls.values())
         self._calls.clear()
-        untold: dict[str, list[dead_letters.Lost]] = {}
+        untold: dict[str, list[Tell]] = {}
         while self._waiting:  # one by one: other threads still append
             letter, call = self._waiting.popleft()
             if isinstance(letter, Tell):
-                untold.setdefault(letter.to, []).append(dead_letters.Lost(f"{len(letter.body)} bytes"))
+                untold.setdefault(letter.to, []).append(letter)
             elif call is not None:
                 calls.append(call)
         for call in calls:
             self.cut_off(call, reason)
-        for urn, lost in untold.items():
-            name = urn.removeprefix("urn:rr-actor:")
-            dead_letters.office.record(name, lost, f"lost with its process at {self.address}", unheard=len(lost))
+        for urn, letters in untold.items():
+            _record_lost(urn, letters, f"lost with its process at {self.address}")
 
     def cut_off(self, call: Call, reason: Exception | None) -> None:
         """Fail a call whose link or connection is lost. From any thread."""
@@ -371,6 +365,11 @@ class Line:
             self._left.discard(line)
             asyncio.get_running_loop().remove_reader(line.fileno())
             line.close()
+
+
+def _record_lost(urn: str, letters: list[Tell], why: str) -> None:
+    lost = [dead_letters.Lost(f"{len(letter.body)} bytes") for letter in letters]
+    dead_letters.office.record(urn.removeprefix("urn:rr-actor:"), lost, why, unheard=len(lost))
 
 
 def _reraise(raised: Raised, origin: str) -> Any:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 
 import pykka
 from pykka import CallableProxy
+from pykka._envelope import Envelope
 from pykka._introspection import AttrInfo, introspect_attrs
 from pykka.messages import ProxyCall, ProxyGetAttr, ProxySetAttr
 
@@ -38,12 +39,8 @@ def _ask(proxy: Any, name: str, args: tuple[Any, ...]) -> Any:
     return proxy.actor_ref.ask(ProxyCall(attr_path=(*proxy._attr_path, name), args=args, kwargs={}))
 
 
-def _iter(self: Any) -> Iterator[Any]:
-    return iter(_ask(self, "__iter__", ()))
-
-
-def _reversed(self: Any) -> Iterator[Any]:
-    return iter(_ask(self, "__reversed__", ()))
+def _iterating(name: str) -> Callable[[Any], Iterator[Any]]:
+    return lambda self: iter(_ask(self, name, ()))
 
 
 def _enter(self: Any) -> Any:
@@ -64,8 +61,7 @@ _WAITING = ("__len__", "__bool__", "__contains__", "__getitem__", "__setitem__",
 
 OPERATORS: dict[str, Callable[..., Any]] = {
     **{name: _asking(name) for name in _WAITING},
-    "__iter__": _iter,
-    "__reversed__": _reversed,
+    **{name: _iterating(name) for name in ("__iter__", "__reversed__")},
     "__enter__": _enter,
     "__exit__": _exit,
     "__call__": _call,
@@ -91,15 +87,10 @@ def as_answer(actor: pykka.Actor, ref: pykka.ActorRef[Any], message: object, res
     Args:
         ref: the reference to the actor, for any process.
     """
-    if isinstance(message, ProxyCall):
-        match message.attr_path[-1]:
-            case "__enter__" if result is actor:
-                return ref
-            case "__iter__" | "__reversed__":
-                return list(result)
-            case _:
-                return result
-    return result
+    name = message.attr_path[-1] if isinstance(message, ProxyCall) else ""
+    if name == "__enter__" and result is actor:
+        return ref
+    return list(result) if name in ("__iter__", "__reversed__") else result
 
 
 @functools.lru_cache(256)
@@ -164,17 +155,14 @@ class Mirror(_Stub):
         self._inquire = inquire
 
     def __dir__(self) -> list[str]:
-        """Ask for the attributes again, and return their names: Pykka calls this for a name that it does not know."""
-        self._copy()
-        return list(vars(self))
-
-    def _copy(self) -> None:
+        """Copy the attributes again, and return their names: Pykka calls this for a name that it does not know."""
         parts: dict[AttrPath, _Stub] = {(): self}
         for path, (is_callable, is_traversable) in sorted(self._inquire().items(), key=lambda item: len(item[0])):
             stub = _Method() if is_callable else _Stub()
             vars(stub)["_pykka_traversable"] = is_traversable
             parts[path] = stub
             vars(parts[path[:-1]])[path[-1]] = stub
+        return list(vars(self))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Mirror) and other._ref == self._ref
@@ -184,6 +172,30 @@ class Mirror(_Stub):
 
     def __str__(self) -> str:
         return str(self._ref)
+
+
+class DistantInbox:
+    """The DistantRef.actor_inbox of an actor in another process, to which Pykka's own code sends envelopes."""
+
+    def __init__(self, ref: pykka.ActorRef[Any]) -> None:
+        self._ref = ref
+
+    def put(self, envelope: Envelope[Any], /) -> None:
+        """Send the envelope's message; get() of its future returns the reply."""
+        wanted = envelope.reply_to
+        if wanted is None:
+            self._ref.tell(envelope.message)
+            return
+        reply = self._ref.ask(envelope.message, block=False)
+        wanted.set_get_hook(lambda timeout: reply.get(timeout=timeout))
+
+    def get(self) -> Envelope[Any]:
+        """Raise LookupError: another process's messages cannot be taken."""
+        raise LookupError(f"the mailbox of {self._ref} is in another process")
+
+    def empty(self) -> bool:
+        """Return True: no message can be taken from here."""
+        return True
 
 
 # -- proxies -----------------------------------------------------------------------------------------------------------
@@ -202,8 +214,16 @@ class _Proxy(pykka.ActorProxy[A]):
         return hash((self.actor_ref, self._attr_path))
 
 
+def _reduce(self: Any) -> tuple[Any, ...]:
+    actor = self._actor
+    known = attributes_of(actor) if isinstance(actor, pykka.Actor) else None
+    return _arrive, (self.actor_ref, self._attr_path, known)
+
+
 class LocalProxy(_Proxy[A]):
     """Pykka's own proxy, of an actor of this process."""
+
+    __reduce__ = _reduce
 
     def __getattr__(self, name: str) -> Any:
         found: Any = super().__getattr__(name)
@@ -211,9 +231,6 @@ class LocalProxy(_Proxy[A]):
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *vars(pykka.ActorProxy)})
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _reduce(self)
 
 
 def local_proxy(ref: pykka.ActorRef[A], path: AttrPath = ()) -> pykka.ActorProxy[A]:
@@ -232,7 +249,7 @@ class DistantProxy(_Proxy[A]):
     Args:
         inquire: asks the actor's process for its attributes; may raise ActorDeadError. In an `async def` handler,
             which must not wait, a name is taken as a method when it is called, as an attribute when it is awaited.
-        known: the attributes, if they are known; else the proxy asks now, or, if `later`, on first use.
+        known: the attributes, if they are known. If None, the proxy asks now; if empty, when a name is first used.
     """
 
     # Pykka looks for these two names in each attribute of an actor, and an attribute may be this proxy.
@@ -246,13 +263,12 @@ class DistantProxy(_Proxy[A]):
         inquire: Callable[[], Attributes],
         attr_path: AttrPath = (),
         known: Attributes | None = None,
-        later: bool = False,
     ) -> None:
         self.actor_ref = actor_ref
         self._attr_path = attr_path
         self._inquire = inquire
         self._known: Attributes | None = None
-        self._learn(_if_allowed(inquire) if known is None and not later else known)
+        self._learn(_if_allowed(inquire) if known is None else known)
 
     def _learn(self, known: Attributes | None) -> None:
         self._known = known
@@ -285,9 +301,6 @@ class DistantProxy(_Proxy[A]):
         else:
             self.actor_ref.ask(ProxySetAttr(attr_path=(*self._attr_path, name), value=value))
 
-    def __repr__(self) -> str:
-        return f"<ActorProxy for {self.actor_ref}, attr_path={self._attr_path!r}>"
-
     def __dir__(self) -> list[str]:
         depth = len(self._attr_path)
         known = self._known or ()
@@ -298,18 +311,12 @@ class DistantProxy(_Proxy[A]):
         return _arrive, (self.actor_ref, self._attr_path, self._known)
 
 
-def _reduce(proxy: Any) -> tuple[Any, ...]:
-    actor = proxy._actor
-    known = attributes_of(actor) if isinstance(actor, pykka.Actor) else None
-    return _arrive, (proxy.actor_ref, proxy._attr_path, known)
-
-
 def _arrive(ref: Any, attr_path: AttrPath, known: Attributes | None) -> pykka.ActorProxy[Any]:
     """Make an unpickled proxy, without asking the actor: this runs while a message is opened."""
     inquire = getattr(ref, "attributes", None)
     if inquire is None:  # a copy, within its process, of the proxy of a plain Pykka actor
         return pykka.ActorProxy(actor_ref=ref, attr_path=attr_path)
-    return DistantProxy(actor_ref=ref, inquire=inquire, attr_path=attr_path, known=known, later=True)
+    return DistantProxy(actor_ref=ref, inquire=inquire, attr_path=attr_path, known=known or {})
 
 
 copyreg.pickle(pykka.ActorProxy, _reduce)  # for proxies that a user makes from a reference
