@@ -26,7 +26,7 @@ _CELL = 400  # characters of a request or response
 _PREFIX = 4  # characters that a search for the beginning of an id needs
 _FOUND = 20
 
-_VALUE = re.compile(r"""["'{}()\[\],:]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
+_VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
 
 _Row = TypeVar("_Row", Resource, Held)
 _Found = TypeVar("_Found")
@@ -140,20 +140,20 @@ def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
 def _chosen(rows: list[_Row], wanted: Wanted, name: str) -> tuple[list[_Row], int]:
     if wanted.match:
         text, raw = wanted.match, wanted.match.encode("utf-8", "replace")
-        decodes = _may_be_more_than_a_string(text)
+        in_json = _json_of(text)[1:-1]
+        # To decode a request takes 5 us. It must be done if the text may be in it though its bytes are not.
+        decodes = _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
         def matches(row: Resource | Held) -> bool:
-            if raw in row.request or any(text in value for value in _texts(row, name)):
+            if any(text in value for value in _texts(row, name)):
                 return True
-            return decodes and text in text_of_value(row.request)
+            if not (decodes or raw in row.request):
+                return False
+            request = _json_of(shown_plain(row.request))  # a number or a length may be the same byte as a letter
+            return text in request or in_json in request
 
         rows = [row for row in rows if matches(row)]
     return rows[wanted.offset : wanted.offset + wanted.limit], len(rows)
-
-
-def _may_be_more_than_a_string(text: str) -> bool:
-    """Return whether the text of a request may contain `text` though its bytes do not. To decode one takes 5 us."""
-    return _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
 
 def _texts(row: Resource | Held, name: str) -> tuple[str, ...]:
@@ -230,9 +230,12 @@ def text_of_value(raw: bytes | None) -> str:
 
 def shortened_json(value: Any, limit: int) -> str:
     """Return a value as JSON of at most `limit` characters; what JSON does not have is shown as in Python."""
-    try:
-        text = msgspec.json.encode(value, enc_hook=repr).decode()
-    except Exception:  # a key is no text, a number is too long, or the nesting is too deep
-        text = repr(value)
-    text = readable(text)
+    text = readable(_json_of(value))
     return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def _json_of(value: Any) -> str:
+    try:
+        return msgspec.json.encode(value, enc_hook=repr).decode()
+    except Exception:  # a key is no text, a number is too long, or the nesting is too deep
+        return repr(value)
