@@ -79,7 +79,7 @@ class Manager(Actor):
             await node.dispatcher.workers.run(self._register_servers, actor)
             await node.settle(actor)
         except BaseException:
-            node.close_registrar(place.id, None)
+            self._close_registrar(None)
             raise
 
     def _register_servers(self, actor: RegistrarActor) -> None:
