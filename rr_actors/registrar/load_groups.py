@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self, cast
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import RrError, Unavailable, UnknownQuery, UsageError, shown
-from rr_actors.base.names import ServerId, parse_server
+from rr_actors.base.names import ServerId
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.loads import Loads, Unloads, with_notes
 from rr_actors.registrar.queries import Query, StatusCallback
@@ -65,23 +65,28 @@ class Wanted(NamedTuple):
     shown: str
 
 
-def wanted(requests: Iterable[tuple[str, Any]]) -> list[Wanted]:
+def wanted(requests: Iterable[tuple[str, Any]], target: Callable[[object], ServerId]) -> list[Wanted]:
     """Return the requests of a group, checked and ready to be sent.
 
     Raises:
         UsageError, InvalidName, NotSerializable: one of them is no pair of a server and a request that can be sent.
     """
     found: list[Wanted] = []
-    for number, pair in enumerate(_iterated(requests), 1):
+    for number, pair in enumerate(iterated(requests), 1):
         if not isinstance(pair, (tuple, list)) or len(cast("tuple[Any, ...]", pair)) != 2:
             expected = 'expected a pair ("registrar/server", request)'
             raise UsageError(f"load_all: request {number}: {expected}, got {shown(cast('object', pair))}")
         server, request = cast("tuple[Any, Any]", pair)
-        found.append(Wanted(parse_server(server), encode(request), shown(request)))
+        found.append(Wanted(target(server), encode(request), shown(request)))
     return found
 
 
-def _iterated(requests: Any) -> Iterable[Any]:
+def iterated(requests: Any) -> Iterable[Any]:
+    """Return an iterator over the requests of a group.
+
+    Raises:
+        UsageError: they are not iterable.
+    """
     try:
         return iter(requests)
     except TypeError:

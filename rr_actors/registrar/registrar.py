@@ -479,7 +479,7 @@ class Registrar:
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
-        target = parse_server(server) if type(server) is str else self._target(server)
+        target = parse_server(server) if type(server) is str and "/" in server else self._target(server)
         hearer = None if progress is False else hearer_of(progress, owner._actor)
         loaded = way(target, encode(request), parent_id, on_status, limit_s, hearer)
         if codec is None:
@@ -547,7 +547,7 @@ class Registrar:
         warnings.warn(f"registrar {self.name!r}: {text}", RuntimeWarning, stacklevel=3)
 
     def _target(self, server: object) -> ServerId:
-        return server_target(server, self._node.directory)
+        return server_target(server, self._node)
 
     def load_all(
         self,
@@ -575,7 +575,7 @@ class Registrar:
         """
         if asyncio._get_running_loop() is not None:
             self._warn_in_event_loop("load_all", "load_all_async")
-        asked = load_groups.wanted(requests)
+        asked = load_groups.wanted(requests, self._target)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all")
         owner, parent_id = self._holder(parent)
@@ -590,7 +590,7 @@ class Registrar:
         parent: Any = None,
     ) -> Queries:
         """Load as load_all() does, awaited. If it is cancelled, all loads are released or withdrawn."""
-        asked = load_groups.wanted(requests)
+        asked = load_groups.wanted(requests, self._target)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all")
         owner, parent_id = self._holder(parent)
@@ -707,7 +707,7 @@ class Registrar:
             The errors of unload(), after all queries have been tried.
         """
         self._calls.check_open()
-        reply = self._unloads.at_server(parse_server(server), time_limit(timeout_s))
+        reply = self._unloads.at_server(self._target(server), time_limit(timeout_s))
         return reply.get() if block else reply
 
     @overload
@@ -873,7 +873,7 @@ class Registrar:
 
         As in a load's `on_status`, `status.handled()` stops the status from going further up.
         """
-        key = str(parse_server(server))
+        key = str(self._target(server))
         own = status_callback(callback, "on_status", "callback")
         if own is None:
             raise UsageError("on_status: callback: expected a callable, got None")
