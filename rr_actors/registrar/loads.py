@@ -333,8 +333,6 @@ class Loads:
             RrError: how the load ended.
         """
         query = self.views.new(new_id(), target, request, parent)
-        self._listen(query, on_status)
-        ask = self._ask(query, request)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[None] = loop.create_future()
 
@@ -348,12 +346,15 @@ class Loads:
             except RuntimeError:  # the event loop is closed, with the task that waited
                 self._withdraw(query)
 
-        if hearer is not None:
-            self.actor.listeners.add(query.id, on_this_loop(hearer))
-        self.calls.dispatcher.call(self._begin, query, ask, ended, timeout_s)
         try:
+            self._listen(query, on_status)
+            if hearer is not None:
+                self.actor.listeners.add(query.id, on_this_loop(hearer))
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
             await future
-        except BaseException:  # cancelled, or for instance KeyboardInterrupt on the caller's loop
+        except RrError:
+            raise
+        except BaseException:  # cancelled, or KeyboardInterrupt, which may come anywhere
             self._withdraw(query)
             raise
         finally:
