@@ -91,7 +91,7 @@ class Declared(Generic[Request, Returned, Response]):
         types: tuple[Any, Any],
         options: dict[str, Any],
         *,
-        says_recovery: bool = True,
+        says_recovery: bool,
     ) -> None:
         with examined(f"@rr.server({name!r})"):
             functools.update_wrapper(cast("Callable[..., Any]", self), load)
@@ -126,19 +126,16 @@ class Declared(Generic[Request, Returned, Response]):
 
     def _take(self, role: str, callback: F) -> F:
         with examined(f"server {self.name!r}: {role}: a method to decorate"):
-            return self._examined(role, callback)
-
-    def _examined(self, role: str, callback: F) -> F:
-        if role in self._others:
-            raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
-        name = callback.__name__
-        if name == self._load.__name__:  # a property's setter has the name of its getter; here it must differ
-            expected = f"a method of another name than {name!r}, the load callback, which it would replace"
-            text = f"server {self.name!r}: {role}: expected {expected}"
-            raise InvalidSpec(text, field=role, expected=expected, got=name)
-        check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
-        self._others[role] = callback
-        return callback
+            if role in self._others:
+                raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
+            name = callback.__name__
+            if name == self._load.__name__:  # a property's setter has the name of its getter; here it must differ
+                expected = f"a method of another name than {name!r}, the load callback, which it would replace"
+                text = f"server {self.name!r}: {role}: expected {expected}"
+                raise InvalidSpec(text, field=role, expected=expected, got=name)
+            check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
+            self._others[role] = callback
+            return callback
 
     @overload
     def __get__(self, instance: None, owner: Any) -> Declared[Request, Returned, Response]: ...

@@ -101,9 +101,7 @@ class Manager(Actor):
             NameTaken: two methods declare the same name.
         """
         found: dict[str, Declared[Any, Any, Any]] = {}
-        attributes: dict[str, Any] = {}
-        for base in reversed(cls.__mro__):
-            attributes.update(vars(base))
+        attributes = {name: attribute for base in reversed(cls.__mro__) for name, attribute in vars(base).items()}
         for attribute in attributes.values():
             if isinstance(attribute, Declared):
                 if attribute.name in found:

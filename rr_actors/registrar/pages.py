@@ -209,32 +209,28 @@ def _resource_row(
     message = row.message
     if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
         message = shown_progress(*progress)
-    texts = text_of_value(row.request), text_of_value(row.response), row.phase.value, str(state), message
+    texts = _text_of_value(row.request), _text_of_value(row.response), row.phase.value, str(state), message
     return ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *around)
 
 
 def _query_row(name: str, row: Held) -> QueryRow:
-    server, request = f"{row.registrar}/{row.server}", text_of_value(row.request)
+    server, request = f"{row.registrar}/{row.server}", _text_of_value(row.request)
     return QueryRow(row.id, name, server, row.resource_id, row.parent, request, row.hold.value, row.state.value)
 
 
-def text_of_value(raw: bytes | None) -> str:
-    """Return a request's or response's bytes as text: as JSON; "" for None."""
+def _text_of_value(raw: bytes | None) -> str:
+    """Return a request's or response's bytes as the text that is shown; "" for None."""
     if raw is None:
         return ""
     value: Any = shown_plain(raw)
     if value is None and raw != b"\xc0":
         return f"<{len(raw)} bytes>"
-    return shortened_json(value, _CELL)
-
-
-def shortened_json(value: Any, limit: int) -> str:
-    """Return a value as JSON of at most `limit` characters; what JSON does not have is shown as in Python."""
     text = readable(_json_of(value))
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+    return text if len(text) <= _CELL else text[: _CELL - 1] + "…"
 
 
 def _json_of(value: Any) -> str:
+    """Return a value as JSON; what JSON does not have is shown as in Python."""
     try:
         return msgspec.json.encode(value, enc_hook=repr).decode()
     except Exception:  # a key is no text, a number is too long, or the nesting is too deep

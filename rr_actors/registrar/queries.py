@@ -246,24 +246,18 @@ class Query(Generic[Response]):
         if self._response is None:  # otherwise an update arrived before the answer
             self._response = _Bytes(response)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the query as it is now. Elsewhere the copy can be read, and names the query."""
-        facts = {
-            name: getattr(self, name)
-            for name in ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released")
-        }
-        return (_remade, (facts, self.request, self.response))
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: the query as it is now. Elsewhere the copy can be read, and names the query."""
+        names = ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released")
+        return {name: getattr(self, name) for name in names} | {"_request": self.request, "_response": self.response}
 
-    def _set_values(self, request: Any, response: Any) -> None:
-        """Set the private fields of a query that is being unpickled."""
-        self._holder = None
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value)
+        self._holder = self._codec = self._waiters = self._statuses = None
         self._over = True
         self._is_released = False
-        self._request, self._response = request, response
         self._types = _no_types
-        self._codec = None
-        self._waiters = None
-        self._statuses = None
 
     def _read_as(self, codec: Codec) -> Self:
         """Decode the response with this codec, and not with that of the server's response type."""
@@ -362,14 +356,6 @@ def read_later(loaded: Any, codec: Codec) -> Reply[Query]:
 
 def _no_types(server_id: str) -> tuple[Any, Any]:
     raise UnknownQuery(f"{server_id}: a query of another process has no types here")
-
-
-def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
-    query = Query.__new__(Query)
-    for name, value in facts.items():
-        setattr(query, name, value)
-    query._set_values(request, response)  # pyright: ignore[reportPrivateUsage]  # same file
-    return query
 
 
 class _Bytes(msgspec.Struct, frozen=True, gc=False):
