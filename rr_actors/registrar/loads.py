@@ -63,18 +63,10 @@ class Wait:
         self.value: Any = None
         self.error: BaseException | None = None
 
-    def load_ended(self, _held: Held | None, error: RrError | None) -> None:
-        """Note how the load ended, and wake the thread that waits."""
+    def ended(self, value: Any, error: Exception | None) -> None:
+        """Note how the task ended, and wake the thread that waits. On the loop."""
+        self.value = value
         self.error = error
-        self.done = True
-        self._lock.release()
-
-    def run(self, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
-        """Run fn on the loop, and wake the thread that waits."""
-        try:
-            self.value = fn(*args)
-        except Exception as error:
-            self.error = error
         self.done = True
         self._lock.release()
 
@@ -92,20 +84,12 @@ class Calls:
         self.limits = TimeLimits(self.dispatcher.loop)
 
     def check_open(self) -> None:
-        """Raise if the registrar is closed.
-
-        Raises:
-            RegistrarDown: the registrar is closed.
-        """
+        """Raise RegistrarDown if the registrar is closed."""
         if self.actor.closed:
             raise self.actor.down()
 
     def check_may_wait(self) -> None:
-        """Raise if the calling thread is in a finalizer that the garbage collector runs in the middle of a decision.
-
-        Raises:
-            UsageError: the thread is deciding.
-        """
+        """Raise UsageError in a finalizer that the garbage collector runs in the middle of a decision."""
         if is_deciding():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
@@ -135,7 +119,12 @@ class Calls:
 
     def _run_in_order(self, wait: Wait, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
         self.actor.monitor.decide_waiting()
-        wait.run(fn, args)
+        try:
+            value = fn(*args)
+        except Exception as error:
+            wait.ended(None, error)
+        else:
+            wait.ended(value, None)
 
     def ask_other(self, registrar: str, method: str, *args: Any) -> Any:
         """Call a method of another registrar of the system, wherever it runs.
@@ -207,9 +196,8 @@ class Together:
         del self.pending[name]
         if error is not None:
             self._errors.append(error)
-        if self.pending:
-            return
-        settle(self.reply, with_notes(self._errors) if self._errors else None)
+        if not self.pending:
+            settle(self.reply, with_notes(self._errors) if self._errors else None)
 
 
 # -- loads -------------------------------------------------------------------------------------------------------------
@@ -266,7 +254,7 @@ class Loads:
                 self._wait_hearing(query, request, timeout_s, hearer)
             elif query_id or not self._directly(query, request, timeout_s):
                 wait = Wait()
-                dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
+                dispatcher.call(self._begin, query, self._ask(query, request), wait.ended)
                 self._await_end(wait, query, timeout_s, timeout_s)
         except RrError:
             raise
@@ -279,7 +267,7 @@ class Loads:
         wait = HearingWait(hearer)
         self.actor.listeners.add(query.id, wait.progressed)
         try:
-            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), wait.ended)
             self._await_end(wait, query, timeout_s, timeout_s)
         finally:
             self.actor.listeners.forget(query.id)
@@ -364,8 +352,7 @@ class Loads:
         return query
 
     def _listen(self, query: Query, on_status: StatusCallback | None) -> None:
-        if self.actor.closed:
-            raise self.actor.down()
+        self.calls.check_open()
         if on_status is not None:
             self.views.listen(query.id, on_status)
 
@@ -505,7 +492,7 @@ class Loads:
         def ended(held: Held | None, error: RrError | None) -> None:
             if error is None and held is not None:
                 loaded(query, held)
-            wait.load_ended(held, error)
+            wait.ended(held, error)
 
         self.calls.dispatcher.call(self.actor.go_on_loading, query.id, ended, command)
         if isinstance(command, c.GiveUp):
@@ -618,7 +605,6 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-
         catalog = self._actor.catalog
         resource = catalog.find(target)
 
@@ -638,7 +624,7 @@ class Unloads:
 
     def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         """Release every held query that `wanted` accepts, newest first. The future is set when all have been tried."""
-        return self.calls.call(self._release_many, wanted, timeout_s)
+        return self.calls.call(self._many_now, wanted, timeout_s)
 
     def at_server(self, server: ServerId, timeout_s: float | None) -> Reply[None]:
         """Release every query that is held at a server, newest first. The future is set when all have been tried.
@@ -730,7 +716,7 @@ class Unloads:
         failure = Failure("Unavailable", f"{text}; {provider} is {doing}", details)
         actor.post(c.ReleaseOverdue(query_id, failure))
 
-    def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
+    def _many_now(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         with self._actor.lock:  # meanwhile no thread releases one of them
             held = self._actor.whole().held
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]

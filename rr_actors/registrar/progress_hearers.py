@@ -105,8 +105,8 @@ class HearingWait:
         self.done = False
         self.error: BaseException | None = None
 
-    def load_ended(self, _held: Held | None, error: RrError | None) -> None:
-        """Note how the load ended, and wake the waiting thread. On the loop."""
+    def ended(self, _held: Held | None, error: RrError | None) -> None:
+        """Note how the load ended, and wake the thread that waits. On the loop."""
         self.error = error
         self.done = True
         self._arrived.put(None)

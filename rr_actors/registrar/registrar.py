@@ -25,7 +25,6 @@ from rr_actors.base.names import ServerId, check_name, new_id, parse_server
 from rr_actors.base.pictures.html_tables import table
 from rr_actors.base.pictures.mime_bundles import bundle_or_text
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar import load_groups
 from rr_actors.registrar.arguments import (
     check_text,
     codec_for,
@@ -48,13 +47,14 @@ from rr_actors.registrar.engine.server import (
     status_callback_of,
 )
 from rr_actors.registrar.engine.status import Status, message_text
-from rr_actors.registrar.load_groups import Queries
+from rr_actors.registrar.load_groups import Group, Queries, wanted
 from rr_actors.registrar.loads import Calls, Loads, Unloads, settle
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import FetchedQuery, error_of
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
-from rr_actors.registrar.pages import Holder, Page, Wanted, page_of
+from rr_actors.registrar.model.rows import Query as QueryRow
+from rr_actors.registrar.pages import Page, Wanted, page_of
 from rr_actors.registrar.progress_hearers import ProgressWanted, hearer_of
 from rr_actors.registrar.queries import (
     PLAIN,
@@ -89,10 +89,6 @@ _KEPT = (
 )
 
 _SHOWN = 50  # rows of a picture in a notebook
-
-
-def _names(holders: list[Holder]) -> str:
-    return ", ".join(holder.origin for holder in holders)
 
 
 class Registrar:
@@ -133,8 +129,8 @@ class Registrar:
             served = self._page(Wanted("resources", limit=_SHOWN))
             held = self._page(Wanted("queries", limit=_SHOWN))
             serves = [
-                (one.server, one.request, one.response, one.state or one.phase, _names(one.holders))
-                for one in served.resources
+                (row.server, row.request, row.response, row.condition, ", ".join(one.origin for one in row.holders))
+                for row in served.resources
             ]
             holds = [(row.server, row.request, row.state, row.parent or "itself") for row in held.queries]
             text = ", ".join(self.servers()) or "none"
@@ -541,10 +537,8 @@ class Registrar:
         if not self._node.dispatcher.may_block():  # a callback that is a coroutine: the call is refused
             return
         self._warned_in_event_loop = True
-        text = (
-            f"{called}() blocks the event loop that runs in this thread until it returns: write `await {instead}(...)`"
-        )
-        warnings.warn(f"registrar {self.name!r}: {text}", RuntimeWarning, stacklevel=3)
+        text = f"{called}() blocks the event loop that runs in this thread until it returns"
+        warnings.warn(f"registrar {self.name!r}: {text}: write `await {instead}(...)`", RuntimeWarning, stacklevel=3)
 
     def _target(self, server: object) -> ServerId:
         return server_target(server, self._node)
@@ -575,11 +569,7 @@ class Registrar:
         """
         if asyncio._get_running_loop() is not None:
             self._warn_in_event_loop("load_all", "load_all_async")
-        asked = load_groups.wanted(requests, self._target)
-        limit_s = time_limit(timeout_s)
-        on_status = status_callback(on_status, "load_all")
-        owner, parent_id = self._holder(parent)
-        return load_groups.wait(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
+        return self._group(requests, on_status, timeout_s, parent).wait()
 
     async def load_all_async(
         self,
@@ -590,11 +580,15 @@ class Registrar:
         parent: Any = None,
     ) -> Queries:
         """Load as load_all() does, awaited. If it is cancelled, all loads are released or withdrawn."""
-        asked = load_groups.wanted(requests, self._target)
+        return await self._group(requests, on_status, timeout_s, parent).result()
+
+    def _group(self, requests: Any, on_status: Any, timeout_s: Any, parent: Any) -> Group:
+        """Return a group of loads that has not begun, with its arguments checked."""
+        asked = wanted(requests, self._target)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all")
         owner, parent_id = self._holder(parent)
-        return await load_groups.result(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
+        return Group(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Return the registrar that holds the next load, and the id of its resource that needs it; "" for none.
@@ -786,32 +780,24 @@ class Registrar:
         self._actor.settle()
         with self._actor.enter():
             catalog = self._actor.whole()
-            resource_id = target
-            if target in catalog.queries and target not in catalog.resources:
-                resource_id = catalog.queries[target].resource_id
-            if resource_id not in catalog.resources and resource_id not in catalog.parts:
+            resource = catalog.find(target)
+            if resource is None and target not in catalog.parts:
                 text = f"{shortened(target)}: {self.name!r} serves no resource and no query of this id"
                 raise UnknownQuery(text, query_id=target)
-            parts = [catalog.held[id] for id in reversed(catalog.parts_of(resource_id))]
-        return [self._views.of(held) for held in parts]
+            parts = catalog.parts_of(target if resource is None else resource.id)
+            held = [catalog.held[id] for id in reversed(parts)]
+        return [self._views.of(row) for row in held]
 
     def resources(self) -> list[ResourceInfo]:
         """Return every resource served here, with its state, response and holders."""
         return [self._info(*row) for row in self._calls.call(self._resources_now)]
 
-    def _resources_now(self) -> list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]]:
-        rows: list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]] = []
+    def _resources_now(self) -> list[tuple[Resource, ServerActor | None, list[QueryRow]]]:
         with self._actor.enter():
-            catalog = self._actor.whole()
-            for resource in catalog.resources.values():
-                query_ids = tuple(catalog.holders.get(resource.id, ()))
-                holders = tuple(catalog.queries[id].origin for id in query_ids)
-                rows.append((resource, self._actor.servers.get(resource.server), holders, query_ids))
-        return rows
+            catalog, server_of = self._actor.whole(), self._actor.servers.get
+            return [(row, server_of(row.server), catalog.queries_of(row.id)) for row in catalog.resources.values()]
 
-    def _info(
-        self, resource: Resource, server: ServerActor | None, holders: tuple[str, ...], queries: tuple[str, ...]
-    ) -> ResourceInfo:
+    def _info(self, resource: Resource, server: ServerActor | None, queries: list[QueryRow]) -> ResourceInfo:
         """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
         request = (server.request if server else PLAIN).show(resource.request)
         response = None
@@ -819,7 +805,8 @@ class Registrar:
             response = (server.response if server else PLAIN).show(resource.response)
         state = str(resource.state if resource.phase is Phase.LOADED else resource.phase)
         facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
-        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)
+        holders, ids = tuple(query.origin for query in queries), tuple(query.id for query in queries)
+        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, ids)
 
     def clients(self) -> list[str]:
         """Return the servers ("registrar/server") where this registrar holds something."""
