@@ -168,27 +168,20 @@ def _of_id(actor: RegistrarActor, id: str) -> tuple[list[Resource], list[Held]]:
     The id of a query that is served here stands for its resource.
     """
 
-    def exactly(catalog: Catalog) -> tuple[list[Resource], list[Held]]:
-        resource, held = catalog.find(id), catalog.held.get(id)
-        return [resource] if resource is not None else [], [held] if held is not None else []
+    def rows(catalog: Catalog, served: list[str], held: list[str]) -> tuple[list[Resource], list[Held]]:
+        resources = {row.id: row for name in served if (row := catalog.find(name)) is not None}
+        return list(resources.values()), [row for name in held if (row := catalog.held.get(name)) is not None]
 
-    found = _read(actor, exactly)
+    found = _read(actor, lambda catalog: rows(catalog, [id], [id]))
     if any(found) or len(id) < _PREFIX:
         return found
-    resources, queries, held = _read(
-        actor, lambda catalog: (list(catalog.resources), list(catalog.queries), list(catalog.held))
-    )
-    named = list(_beginning(id, [*resources, *queries])), list(_beginning(id, held))
-
-    def rows(catalog: Catalog) -> tuple[list[Resource], list[Held]]:
-        served = {row.id: row for name in named[0] if (row := catalog.find(name)) is not None}
-        return list(served.values()), [row for name in named[1] if (row := catalog.held.get(name)) is not None]
-
-    return _read(actor, rows)
+    served, held = _read(actor, lambda catalog: ([*catalog.resources, *catalog.queries], list(catalog.held)))
+    served, held = _beginning(id, served), _beginning(id, held)
+    return _read(actor, lambda catalog: rows(catalog, served, held))
 
 
-def _beginning(text: str, ids: Iterable[str]) -> Iterable[str]:
-    return itertools.islice((id for id in ids if id.startswith(text)), _FOUND)
+def _beginning(text: str, ids: Iterable[str]) -> list[str]:
+    return list(itertools.islice((id for id in ids if id.startswith(text)), _FOUND))
 
 
 def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[ResourceRow]:

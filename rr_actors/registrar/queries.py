@@ -47,11 +47,9 @@ class Holder(Protocol):
 
     def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> object:
         """Release the query, and return when that is done."""
-        ...
 
     async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
         """Release the query as unload() does, awaited."""
-        ...
 
 
 class Query(Generic[Response]):

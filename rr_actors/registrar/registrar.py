@@ -66,7 +66,7 @@ from rr_actors.registrar.queries import (
     read_later,
     response_bytes,
 )
-from rr_actors.registrar.replacements import Replacements, encoded_response, new_response
+from rr_actors.registrar.replacements import Replacements, encoded_response
 from rr_actors.runtime.time_limits import time_limit
 
 if TYPE_CHECKING:
@@ -333,7 +333,9 @@ class Registrar:
             UsageError: not called in a status callback, or the status is of the resource itself.
         """
         limit_s = time_limit(timeout_s)
-        make_response = new_response(response)
+        if response is not None and not callable(response):
+            expected = "expected a function that takes the spare's Query and returns the new response"
+            raise UsageError(f"replace_part: response: {expected}, got {shown(response)} ({type(response).__name__})")
         target = None if server is None else self._target(server)
         if not is_a(status, Status):
             raise UsageError(f"replace_part: expected the Status of the callback, got {shown(status)}")
@@ -341,7 +343,7 @@ class Registrar:
         if not resource_id:
             where = "expected to be called in a status callback of a server"
             raise UsageError(f"registrar {self.name!r}: replace_part: {where}")
-        return owner._replacements.replace(status, request, target, make_response, limit_s)
+        return owner._replacements.replace(status, request, target, response, limit_s)
 
     # -- load ----------------------------------------------------------------------------------------------------
 
