@@ -48,12 +48,7 @@ class server:  # noqa: N801 - used as a decorator
         if callable(name):  # @rr.server on the method itself
             meant = cast("FunctionType", name).__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
-        self._says_recovery = recovery is not None
-        self._options: dict[str, Any] = {
-            "linger_s": linger_s,
-            "load_timeout_s": load_timeout_s,
-            "recovery": "keep" if recovery is None else recovery,
-        }
+        self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
         self._types = (request_type, response_type)
         self._name = make_spec(name, _nothing, **self._options).name
 
@@ -73,7 +68,7 @@ class server:  # noqa: N801 - used as a decorator
             expected = "a method to decorate"
             text = f"@rr.server({self._name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
             raise InvalidSpec(text, field="load", expected=expected, got=load)
-        return Declared(self._name, load, self._types, self._options, says_recovery=self._says_recovery)
+        return Declared(self._name, load, self._types, self._options)
 
 
 class Declared(Generic[Request, Returned, Response]):
@@ -84,21 +79,12 @@ class Declared(Generic[Request, Returned, Response]):
     On an instance the attribute is still the method. On the class it names the server in Registrar.load().
     """
 
-    def __init__(
-        self,
-        name: str,
-        load: Callable[..., Any],
-        types: tuple[Any, Any],
-        options: dict[str, Any],
-        *,
-        says_recovery: bool,
-    ) -> None:
+    def __init__(self, name: str, load: Callable[..., Any], types: tuple[Any, Any], options: dict[str, Any]) -> None:
         with examined(f"@rr.server({name!r})"):
             functools.update_wrapper(cast("Callable[..., Any]", self), load)
         self._name = name
         self._load = load
         self._options = options
-        self._says_recovery = says_recovery
         self._owner: type | None = None
         self._others: dict[str, Callable[..., Any]] = {}
         checked = make_spec(name, _without_self(load), **options)
@@ -185,11 +171,6 @@ class Declared(Generic[Request, Returned, Response]):
 # For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
 id_in = Declared[Any, Any, Any]._id_in  # pyright: ignore[reportPrivateUsage]
-
-
-def says_recovery(declared: Declared[Any, Any, Any]) -> bool:
-    """Return whether the declaration says what becomes of the server's resources when its manager is respawned."""
-    return declared._says_recovery  # pyright: ignore[reportPrivateUsage] - same file
 
 
 def class_name(cls: type) -> str:

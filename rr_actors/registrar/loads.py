@@ -94,10 +94,6 @@ class Calls:
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
 
-    def post(self, command: Any) -> None:
-        """Give the actor a command, and do not wait."""
-        self.dispatcher.call(self.actor.post, command)
-
     def call(self, fn: Callable[..., T], *args: Any) -> T:
         """Run fn on the loop, behind the commands that threads have given it before, and return what it returns.
 
@@ -401,7 +397,7 @@ class Loads:
 
     def _await_end(self, wait: Wait | HearingWait, query: Query, left_s: float | None, timeout_s: float | None) -> None:
         if not wait.done_within(left_s):
-            self.calls.post(c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
+            self.calls.dispatcher.call(self.actor.post, c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
             wait.done_within(GRACE_S)
         if wait.error is not None:
             raise wait.error

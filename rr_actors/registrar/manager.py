@@ -10,7 +10,7 @@ from rr_actors.actors.refs import ActorRef
 from rr_actors.base import pickling
 from rr_actors.base.errors import NameTaken, StartFailed, UsageError
 from rr_actors.registrar.arguments import check_text
-from rr_actors.registrar.declarations import Declared, says_recovery, spec_for
+from rr_actors.registrar.declarations import Declared, spec_for
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.server import current, serving
 from rr_actors.registrar.registrar import Registrar, register_spec
@@ -86,7 +86,7 @@ class Manager(Actor):
         """Register the declared and the stored servers. In a worker: reading types and unpickling run users' code."""
         declared = self._declared_servers()
         for declaration in declared.values():
-            register_spec(self.registrar, spec_for(declaration, self), says_recovery=says_recovery(declaration))
+            register_spec(self.registrar, spec_for(declaration, self))
         with actor.enter():
             stored_servers = list(actor.whole().stored_servers.values())
         for stored in stored_servers:

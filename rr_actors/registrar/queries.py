@@ -389,8 +389,6 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     queries: tuple[str, ...]
 
 
-# Views: the Query objects of one registrar, the callbacks for their statuses, and the codecs for their bytes.
-
 logger = logging.getLogger("rr_actors.registrar")
 
 StatusCallback = Callable[[Status], Any]

@@ -197,25 +197,24 @@ class Registrar:
             response_type=response_type,
             linger_s=linger_s,
             load_timeout_s=load_timeout_s,
-            recovery="keep" if recovery is None else recovery,
+            recovery=recovery,
         )
-        self._register_spec(spec, says_recovery=recovery is not None)
+        self._register_spec(spec)
 
-    def _register_spec(
-        self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
-    ) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server from its checked spec. With `stored`, these bytes of the spec are kept in the catalog.
 
         A `restored` server, which comes from the catalog, is replaced if its name is registered again.
         """
         origin = f"{self.name}/{spec.name}"
-        if stored is None and not restored:
+        is_declared_here = stored is None and not restored
+        if is_declared_here:
             log_unread_types(spec, origin)
         types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
         server = ServerActor(self._actor, spec, types)
         server.restored = restored
         kept = self._calls.call(self._register, server, stored)
-        if kept and not says_recovery and spec.recover is None:
+        if kept and is_declared_here and spec.recovery is None and spec.recover is None:
             logger.warning(_KEPT, self.name, spec.name, kept)
 
     def _register(self, server: ServerActor, stored: bytes | None) -> int:

@@ -60,9 +60,7 @@ class RegistrarHandle(Registrar):
     def __repr__(self) -> str:
         return f"<Registrar {self._name} (handle)>"
 
-    def _register_spec(
-        self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
-    ) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server in the other process from its checked spec; a respawn restores it."""
         log_unread_types(spec, f"{self.name}/{spec.name}")
         for role in ("load", "unload", "status", "recover"):

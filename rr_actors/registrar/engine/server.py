@@ -201,7 +201,7 @@ class ServerSpec(msgspec.Struct, frozen=True):
     response_type: Any = None
     linger_s: float = 0.0
     load_timeout_s: float | None = None
-    recovery: str = "keep"
+    recovery: str | None = None  # None: "keep", as nothing was said
 
 
 class ServerActor:
@@ -258,7 +258,9 @@ class ServerActor:
         spec = self.spec
         has_recover = spec.recover is not None
         has_status = spec.status is not None
-        return Server(spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, has_status, has_recover, self.types)
+        return Server(
+            spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery or "keep", has_status, has_recover, self.types
+        )
 
     # -- load ----------------------------------------------------------------------------------------------------
 
@@ -495,7 +497,7 @@ def make_spec(
     response_type: Any = None,
     linger_s: float = 0.0,
     load_timeout_s: float | None = None,
-    recovery: str = "keep",
+    recovery: str | None = None,
 ) -> ServerSpec:
     """Check the arguments of a server's registration, and read its types from the annotations of `load`.
 
@@ -509,7 +511,7 @@ def make_spec(
                 check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
             elif field == "load" or callback is not None:
                 _invalid(name, field, "a callable", callback)
-        if recovery not in RECOVERY:
+        if recovery is not None and recovery not in RECOVERY:
             _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
         if not is_number(linger_s) or linger_s < 0:
             _invalid(name, "linger_s", "seconds, 0 or more", linger_s)
