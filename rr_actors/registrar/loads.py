@@ -11,7 +11,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import pykka
@@ -172,28 +172,6 @@ def with_notes(errors: Sequence[RrError]) -> RrError:
     for other in errors[1:]:
         errors[0].add_note(f"and {type(other).__name__}: {other}")
     return errors[0]
-
-
-class Together:
-    """The reply of many calls, set when all have ended. It raises the first error; the others are its notes.
-
-    `pending` has the names of the calls that have not ended. On the loop.
-    """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self.reply: Reply[None] = Reply()
-        self.pending = dict.fromkeys(names)
-        self._errors: list[RrError] = []
-        if not self.pending:
-            self.reply.set()
-
-    def ended(self, name: str, error: RrError | None) -> None:
-        """Note how one of the calls ended; after the last one, set the reply."""
-        del self.pending[name]
-        if error is not None:
-            self._errors.append(error)
-        if not self.pending:
-            settle(self.reply, with_notes(self._errors) if self._errors else None)
 
 
 # -- loads -------------------------------------------------------------------------------------------------------------
@@ -713,21 +691,33 @@ class Unloads:
         actor.post(c.ReleaseOverdue(query_id, failure))
 
     def _many_now(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        with self._actor.lock:  # meanwhile no thread releases one of them
-            held = self._actor.whole().held
-            mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
-            together = Together(mine)
-            releases = Releases(self._actor, mine, together.ended)
+        """Begin to release. The reply raises the first error; the others are its notes."""
+        reply: Reply[None] = Reply()
+        errors: list[RrError] = []
+
+        def ended(query_id: str, error: RrError | None) -> None:
+            del pending[query_id]
+            if error is not None:
+                errors.append(error)
+            if not pending:
+                settle(reply, with_notes(errors) if errors else None)
 
         def overdue() -> None:
             releases.hurry()
-            for query_id in list(together.pending):
+            for query_id in list(pending):
                 self.release_overdue(query_id, timeout_s)
 
-        if timeout_s is not None and together.pending:
+        with self._actor.lock:  # meanwhile no thread releases one of them
+            held = self._actor.whole().held
+            mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
+            pending = dict.fromkeys(mine)
+            releases = Releases(self._actor, mine, ended)
+        if not mine:
+            reply.set()
+        elif timeout_s is not None and pending:
             self.calls.limits.begin(timeout_s, overdue)
-            together.reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
-        return together.reply
+            reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
+        return reply
 
 
 def _no_one(_error: RrError | None) -> None:
