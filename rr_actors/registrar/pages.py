@@ -192,18 +192,15 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         return holders, len(queries), list(reversed(parts))[:HOLDERS_SHOWN], len(parts)
 
     neighbours = _read(actor, lambda catalog: [around(catalog, resource) for resource in resources])
-    return [_resource_row(actor, *both) for both in zip(resources, neighbours, strict=True)]
-
-
-def _resource_row(
-    actor: RegistrarActor, row: Resource, around: tuple[list[Holder], int, list[str], int]
-) -> ResourceRow:
-    state = row.state if row.phase is Phase.LOADED else ""
-    message = row.message
-    if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
-        message = shown_progress(*progress)
-    texts = _text_of_value(row.request), _text_of_value(row.response), row.phase.value, str(state), message
-    return ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *around)
+    rows: list[ResourceRow] = []
+    for row, others in zip(resources, neighbours, strict=True):
+        state = str(row.state) if row.phase is Phase.LOADED else ""
+        message = row.message
+        if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
+            message = shown_progress(*progress)
+        texts = _text_of_value(row.request), _text_of_value(row.response), row.phase.value, state, message
+        rows.append(ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *others))
+    return rows
 
 
 def _query_row(name: str, row: Held) -> QueryRow:
