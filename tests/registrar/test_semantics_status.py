@@ -24,24 +24,6 @@ def test_the_states_are_those_five() -> None:
     assert [state.value for state in rr.State] == ["OK", "UPDATE", "WARNING", "ERROR", "FATAL"]
 
 
-def test_a_holder_that_is_not_the_owner_hears_who_the_owner_is(app: rr.Registrar, provider: rr.Registrar) -> None:
-    serve(provider, "camera")
-    query = app.load("provider/camera", "front")
-    calls: list[Callable[[Any], object]] = [
-        lambda target: app.send_status(target, WARNING),
-        lambda target: app.update_response(target, "new"),
-        lambda target: app.unload(target, force=True),
-    ]
-    for call in calls:
-        for target in (query, query.id, query.resource_id):
-            with pytest.raises(
-                rr.UnknownQuery, match=r"'app' only holds it; 'provider' serves it: make the call there"
-            ):
-                call(target)
-    with pytest.raises(rr.UnknownQuery, match="serves no resource and no query of this id"):
-        app.send_status("nothing", WARNING)
-
-
 # -- every holder, once --------------------------------------------------------------------------------------------
 
 

@@ -23,10 +23,6 @@ def unknown_server(catalog: Catalog, server: str) -> Failure:
 def unknown_target(catalog: Catalog, target: str) -> Failure:
     """Return the failure of a call for an id that is neither a resource nor a query served here."""
     what = "serves no resource and no query of this id (never did, or unloaded already)"
-    rows = catalog.held.values()
-    held = catalog.held.get(target) or next((row for row in rows if row.resource_id == target), None)
-    if held is not None:
-        what = f"only holds it; {held.registrar!r} serves it: make the call there"
     text = f"{shortened(target)}: {catalog.name!r} {what}"
     return Failure("UnknownQuery", text, {"query_id": target})
 
