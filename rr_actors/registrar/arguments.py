@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import threading
@@ -21,7 +22,7 @@ from rr_actors.base.errors import (
     is_a,
     shown,
 )
-from rr_actors.base.names import ServerId, parse_server
+from rr_actors.base.names import ServerId, check_name, parse_server
 from rr_actors.base.values.canonical import Codec
 from rr_actors.registrar.declarations import Declared, id_in
 from rr_actors.registrar.queries import Query, ResourceInfo
@@ -43,22 +44,24 @@ def server_target(server: object, node: Node) -> ServerId:
     try:
         return parse_server(server)
     except InvalidName as error:
-        if not is_a(server, str) or "/" in (name := exact_text(cast("str", server))):
-            raise
-        raise InvalidName(f"{error.message}{_meant(name, node)}", name=name) from None
+        text = error.message
+        with contextlib.suppress(InvalidName):  # a server's id or another text that is no name
+            text += _meant(check_name(server), node)
+        raise InvalidName(text, name=error.name) from None
 
 
 def _meant(name: str, node: Node) -> str:
     """Return the end of an error about a server id that lacks its registrar: the ids that it may mean."""
-    registrars = node.directory.registrars()
-    if name in registrars:
+    no_registrar = node.directory.no_registrar(name)
+    if name in no_registrar.known:
         return f"; {name!r} is a registrar, name its server, too: '{name}/...'"
     here = list(node.registrars.items())
     known = {f"{registrar}/{server}" for registrar, actor in here for server in actor.servers.names()}
     known.update(*(list(actor.catalog.server_types) for _, actor in here))
     named = [id for id in sorted(known) if id.endswith(f"/{name}")]
-    hint = f"; did you mean {' or '.join(map(repr, named))}?" if named else did_you_mean(name, known) or ";"
-    return f"{hint} this system has the registrars: {', '.join(registrars) or 'none'}"
+    if named:
+        return f"; did you mean {' or '.join(map(repr, named))}?"
+    return did_you_mean(name, known) or f"; {no_registrar}"
 
 
 def codec_for(response_type: Any) -> Codec:
@@ -70,11 +73,10 @@ def codec_for(response_type: Any) -> Codec:
     try:
         return _codec_for(response_type)
     except TypeError:  # the type has no hash: Annotated with a list, say
-        return Codec(response_type, _RESPONSE)
+        return _codec_for.__wrapped__(response_type)
 
 
-_RESPONSE = "load: response_type"
-_codec_for = functools.lru_cache(256)(functools.partial(Codec, what=_RESPONSE))
+_codec_for = functools.lru_cache(256)(functools.partial(Codec, what="load: response_type"))
 
 
 def status_callback(

@@ -47,7 +47,9 @@ def test_other_names_of_servers_are_refused(provider: rr.Registrar, name: Any) -
     assert list(provider.servers()) == []
 
 
-@pytest.mark.parametrize("server", ["camera", "", "/", "a/", "/a", "a/b/c", "a//b", "a b/c", None, 7])
+@pytest.mark.parametrize(
+    "server", ["camera", "", "/", "a/", "/a", "a/b/c", "a//b", "a b/c", "a\0b", "x" * 500, None, 7]
+)
 def test_a_server_is_addressed_as_registrar_slash_server(app: rr.Registrar, server: Any) -> None:
     with pytest.raises(rr.InvalidName):
         app.load(server, "x")
@@ -68,9 +70,9 @@ def test_a_server_without_its_registrar_is_refused_with_the_one_that_was_probabl
     for ask in asks:
         with pytest.raises(rr.InvalidName, match=r"got no '/'; did you mean 'provider/camera'\?"):
             ask("camera")
-    with pytest.raises(rr.InvalidName, match=r"did you mean 'provider/camera'\?.* the registrars: app, provider"):
+    with pytest.raises(rr.InvalidName, match=r"did you mean 'provider/camera'\?"):
         app.load("provider.camera", 1)
-    with pytest.raises(rr.InvalidName, match=r"got no '/'; this system has the registrars: app, provider") as caught:
+    with pytest.raises(rr.InvalidName, match=r"got no '/'; registrar 'map': there is none .*app, provider") as caught:
         app.load("map", 1)
     assert caught.value.name == "map"
     with pytest.raises(rr.InvalidName, match="'provider' is a registrar, name its server, too"):
