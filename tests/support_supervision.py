@@ -14,13 +14,14 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import pykka
 
 from rr_actors.actors.actor import IGNORE, Actor, ExitReport
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.base.config import SystemConfig
+from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import event_loop
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
@@ -302,6 +303,34 @@ class StuckManager(Manager):
 
     def on_receive(self, message: Any) -> str:
         return "served"
+
+
+class _Slow:
+    """An attribute of a class that cannot be read before `let_go` is set."""
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        let_go.wait()
+        return lambda manager, request, response: None
+
+
+class _Thing(Manager):
+    @server("thing")
+    def load_thing(self, request: int) -> int:
+        return request
+
+    @load_thing.unload
+    def unload_thing(self, request: int, response: int) -> None:
+        """Do nothing."""
+
+
+class SlowToRegister(_Thing):
+    """Has a server that is not registered before `let_go` is set. `made`: the instances."""
+
+    made: ClassVar[list[SlowToRegister]] = []
+    unload_thing: Any = _Slow()
+
+    def __init__(self) -> None:
+        self.made.append(self)
 
 
 class Idle(Manager):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import threading
@@ -11,25 +12,56 @@ from typing import Any, cast
 
 from rr_actors.base.checks import check_takes, examined, has_home, path_text
 from rr_actors.base.config import SystemConfig
-from rr_actors.base.errors import ConfigError, UsageError, exact_number, exact_text, is_a, shown
-from rr_actors.base.names import ServerId, parse_server
+from rr_actors.base.errors import (
+    ConfigError,
+    InvalidName,
+    UsageError,
+    did_you_mean,
+    exact_number,
+    exact_text,
+    is_a,
+    shown,
+)
+from rr_actors.base.names import ServerId, check_name, parse_server
 from rr_actors.base.values.canonical import Codec
 from rr_actors.registrar.declarations import Declared, id_in
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.runtime.callback_errors import described
-from rr_actors.wire.name_service import Directory
+from rr_actors.system.hosting.node import Node
 
 # -- a registrar's -----------------------------------------------------------------------------------------------
 
 
-def server_target(server: object, directory: Directory) -> ServerId:
+def server_target(server: object, node: Node) -> ServerId:
     """Return a server's id as parse_server() does, also for the method that declares it.
 
     Raises:
-        InvalidName: `server` is neither.
+        InvalidName: `server` is neither; for a name without a registrar the text has the id that was probably meant.
         UnknownRegistrar, UsageError: none or several of the system's children have the declaring class.
     """
-    return parse_server(id_in(cast("Declared[Any, Any, Any]", server), directory) if is_a(server, Declared) else server)
+    if is_a(server, Declared):
+        return parse_server(id_in(cast("Declared[Any, Any, Any]", server), node.directory))
+    try:
+        return parse_server(server)
+    except InvalidName as error:
+        text = error.message
+        with contextlib.suppress(InvalidName):  # a server's id or another text that is no name
+            text += _meant(check_name(server), node)
+        raise InvalidName(text, name=error.name) from None
+
+
+def _meant(name: str, node: Node) -> str:
+    """Return the end of an error about a server id that lacks its registrar: the ids that it may mean."""
+    no_registrar = node.directory.no_registrar(name)
+    if name in no_registrar.known:
+        return f"; {name!r} is a registrar, name its server, too: '{name}/...'"
+    here = list(node.registrars.items())
+    known = {f"{registrar}/{server}" for registrar, actor in here for server in actor.servers.names()}
+    known.update(*(list(actor.catalog.server_types) for _, actor in here))
+    named = [id for id in sorted(known) if id.endswith(f"/{name}")]
+    if named:
+        return f"; did you mean {' or '.join(map(repr, named))}?"
+    return did_you_mean(name, known) or f"; {no_registrar}"
 
 
 def codec_for(response_type: Any) -> Codec:
@@ -41,11 +73,10 @@ def codec_for(response_type: Any) -> Codec:
     try:
         return _codec_for(response_type)
     except TypeError:  # the type has no hash: Annotated with a list, say
-        return Codec(response_type, _RESPONSE)
+        return _codec_for.__wrapped__(response_type)
 
 
-_RESPONSE = "load: response_type"
-_codec_for = functools.lru_cache(256)(functools.partial(Codec, what=_RESPONSE))
+_codec_for = functools.lru_cache(256)(functools.partial(Codec, what="load: response_type"))
 
 
 def status_callback(

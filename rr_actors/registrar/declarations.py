@@ -48,12 +48,7 @@ class server:  # noqa: N801 - used as a decorator
         if callable(name):  # @rr.server on the method itself
             meant = cast("FunctionType", name).__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
-        self._says_recovery = recovery is not None
-        self._options: dict[str, Any] = {
-            "linger_s": linger_s,
-            "load_timeout_s": load_timeout_s,
-            "recovery": "keep" if recovery is None else recovery,
-        }
+        self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
         self._types = (request_type, response_type)
         self._name = make_spec(name, _nothing, **self._options).name
 
@@ -73,7 +68,7 @@ class server:  # noqa: N801 - used as a decorator
             expected = "a method to decorate"
             text = f"@rr.server({self._name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
             raise InvalidSpec(text, field="load", expected=expected, got=load)
-        return Declared(self._name, load, self._types, self._options, says_recovery=self._says_recovery)
+        return Declared(self._name, load, self._types, self._options)
 
 
 class Declared(Generic[Request, Returned, Response]):
@@ -84,21 +79,12 @@ class Declared(Generic[Request, Returned, Response]):
     On an instance the attribute is still the method. On the class it names the server in Registrar.load().
     """
 
-    def __init__(
-        self,
-        name: str,
-        load: Callable[..., Any],
-        types: tuple[Any, Any],
-        options: dict[str, Any],
-        *,
-        says_recovery: bool = True,
-    ) -> None:
+    def __init__(self, name: str, load: Callable[..., Any], types: tuple[Any, Any], options: dict[str, Any]) -> None:
         with examined(f"@rr.server({name!r})"):
             functools.update_wrapper(cast("Callable[..., Any]", self), load)
         self._name = name
         self._load = load
         self._options = options
-        self._says_recovery = says_recovery
         self._owner: type | None = None
         self._others: dict[str, Callable[..., Any]] = {}
         checked = make_spec(name, _without_self(load), **options)
@@ -126,19 +112,16 @@ class Declared(Generic[Request, Returned, Response]):
 
     def _take(self, role: str, callback: F) -> F:
         with examined(f"server {self.name!r}: {role}: a method to decorate"):
-            return self._examined(role, callback)
-
-    def _examined(self, role: str, callback: F) -> F:
-        if role in self._others:
-            raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
-        name = callback.__name__
-        if name == self._load.__name__:  # a property's setter has the name of its getter; here it must differ
-            expected = f"a method of another name than {name!r}, the load callback, which it would replace"
-            text = f"server {self.name!r}: {role}: expected {expected}"
-            raise InvalidSpec(text, field=role, expected=expected, got=name)
-        check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
-        self._others[role] = callback
-        return callback
+            if role in self._others:
+                raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
+            name = callback.__name__
+            if name == self._load.__name__:  # a property's setter has the name of its getter; here it must differ
+                expected = f"a method of another name than {name!r}, the load callback, which it would replace"
+                text = f"server {self.name!r}: {role}: expected {expected}"
+                raise InvalidSpec(text, field=role, expected=expected, got=name)
+            check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
+            self._others[role] = callback
+            return callback
 
     @overload
     def __get__(self, instance: None, owner: Any) -> Declared[Request, Returned, Response]: ...
@@ -188,11 +171,6 @@ class Declared(Generic[Request, Returned, Response]):
 # For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
 id_in = Declared[Any, Any, Any]._id_in  # pyright: ignore[reportPrivateUsage]
-
-
-def says_recovery(declared: Declared[Any, Any, Any]) -> bool:
-    """Return whether the declaration says what becomes of the server's resources when its manager is respawned."""
-    return declared._says_recovery  # pyright: ignore[reportPrivateUsage] - same file
 
 
 def class_name(cls: type) -> str:

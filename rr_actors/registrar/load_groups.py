@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self, cast
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import RrError, Unavailable, UnknownQuery, UsageError, shown
-from rr_actors.base.names import ServerId, parse_server
+from rr_actors.base.names import ServerId
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.loads import Loads, Unloads, with_notes
 from rr_actors.registrar.queries import Query, StatusCallback
@@ -65,23 +65,28 @@ class Wanted(NamedTuple):
     shown: str
 
 
-def wanted(requests: Iterable[tuple[str, Any]]) -> list[Wanted]:
+def wanted(requests: Iterable[tuple[str, Any]], target: Callable[[object], ServerId]) -> list[Wanted]:
     """Return the requests of a group, checked and ready to be sent.
 
     Raises:
         UsageError, InvalidName, NotSerializable: one of them is no pair of a server and a request that can be sent.
     """
     found: list[Wanted] = []
-    for number, pair in enumerate(_iterated(requests), 1):
+    for number, pair in enumerate(iterated(requests), 1):
         if not isinstance(pair, (tuple, list)) or len(cast("tuple[Any, ...]", pair)) != 2:
             expected = 'expected a pair ("registrar/server", request)'
             raise UsageError(f"load_all: request {number}: {expected}, got {shown(cast('object', pair))}")
         server, request = cast("tuple[Any, Any]", pair)
-        found.append(Wanted(parse_server(server), encode(request), shown(request)))
+        found.append(Wanted(target(server), encode(request), shown(request)))
     return found
 
 
-def _iterated(requests: Any) -> Iterable[Any]:
+def iterated(requests: Any) -> Iterable[Any]:
+    """Return an iterator over the requests of a group.
+
+    Raises:
+        UsageError: they are not iterable.
+    """
     try:
         return iter(requests)
     except TypeError:
@@ -89,45 +94,89 @@ def _iterated(requests: Any) -> Iterable[Any]:
         raise UsageError(text) from None
 
 
-class _Group:
-    """The loads of one load_all(). `settled` is called when one has failed, and when all have ended."""
+class Group:
+    """The loads of one load_all(): wait() or result() begins them all."""
 
     def __init__(
         self,
         loads: Loads,
         unloads: Unloads,
         requests: Sequence[Wanted],
+        parent: str,
+        on_status: StatusCallback | None,
         timeout_s: float | None,
-        settled: Callable[[], object],
     ) -> None:
         self._loads = loads
         self._unloads = unloads
         self._requests = requests
+        self._parent = parent
+        self._on_status = on_status
         self._timeout_s = timeout_s
-        self._settled = settled
-        self._left = itertools.count(len(requests) - 1, -1)
         self._replies: list[Reply[Query]] = []
 
-    def ask(self, parent: str, on_status: StatusCallback | None) -> None:
-        """Begin all loads of the group."""
+    def wait(self) -> Queries:
+        """Load all requests, and return their queries when all are held.
+
+        Raises:
+            RrError: the error of the first load that failed; nothing is held.
+        """
+        if not self._requests:
+            return Queries()
+        self._loads.calls.dispatcher.check_may_block(f"{self._loads.actor.name}.load_all()")
+        settled = Flag()
+        try:
+            self._begin(settled.set)
+            settled.wait()
+            failed = self._failed()
+            if failed is None:
+                return Queries(reply.get() for reply in self._replies)
+            raise self._error(failed, shielded(self._undo))
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
+            self._undo()
+            raise
+
+    async def result(self) -> Queries:
+        """Load all requests as wait() does, awaited on any event loop. If it is cancelled, nothing stays held."""
+        if not self._requests:
+            return Queries()
+        loop = asyncio.get_running_loop()
+        settled = asyncio.Event()
+
+        def settle() -> None:
+            try:
+                loop.call_soon_threadsafe(settled.set)
+            except RuntimeError:  # the event loop is closed, with the task that waited
+                self._undo()
+
+        try:
+            self._begin(settle)
+            await settled.wait()
+            failed = self._failed()
+            if failed is None:
+                return Queries(reply.get() for reply in self._replies)
+            raise await asyncio.to_thread(self._error, failed, self._undo())
+        except BaseException:
+            self._undo()
+            raise
+
+    def _begin(self, settled: Callable[[], object]) -> None:
+        """Begin all loads. `settled` is called when one has failed, and when all have ended."""
+        left = itertools.count(len(self._requests) - 1, -1)
+
+        def ended(reply: Reply[Query]) -> None:
+            if not next(left) or _error_of(reply) is not None:
+                settled()
+
         for server, request, _ in self._requests:
-            self._replies.append(self._loads.future(server, request, parent, on_status, self._timeout_s))
-            self._replies[-1].add_done_callback(self._ended)
+            self._replies.append(self._loads.future(server, request, self._parent, self._on_status, self._timeout_s))
+            self._replies[-1].add_done_callback(ended)
 
-    def _ended(self, reply: Reply[Query]) -> None:
-        if not next(self._left) or _error_of(reply) is not None:
-            self._settled()
-
-    def failed(self) -> tuple[int, RrError] | None:
+    def _failed(self) -> tuple[int, RrError] | None:
         """Return the place and error of the first load that failed, or None."""
         errors = map(_error_of, self._replies)
         return next(((place, error) for place, error in enumerate(errors) if error is not None), None)
 
-    def queries(self) -> Queries:
-        """Return the queries of the group, once all loads have succeeded."""
-        return Queries(reply.get() for reply in self._replies)
-
-    def undo(self) -> list[Reply[None]]:
+    def _undo(self) -> list[Reply[None]]:
         """Release the held queries, newest first, and withdraw the other loads; return the futures of the releases."""
         undone: list[Reply[None]] = []
         while self._replies:
@@ -137,7 +186,7 @@ class _Group:
                     undone.append(self._unloads.future(reply.get().id, self._timeout_s))
         return undone
 
-    def error(self, failed: tuple[int, RrError], undone: Sequence[Reply[None]]) -> RrError:
+    def _error(self, failed: tuple[int, RrError], undone: Sequence[Reply[None]]) -> RrError:
         """Return the error, with notes that name its request and what was not released. Wait for all of `undone`."""
         place, error = failed
         server, _, request = self._requests[place]
@@ -156,70 +205,3 @@ class _Group:
 def _error_of(load: Reply[Query]) -> RrError | None:
     """Return the error of a load that has failed; None if it is held, withdrawn, or still loading."""
     return cast("RrError | None", load.exception()) if load.done() and not load.cancelled() else None
-
-
-def wait(
-    loads: Loads,
-    unloads: Unloads,
-    requests: Sequence[Wanted],
-    parent: str,
-    on_status: StatusCallback | None,
-    timeout_s: float | None,
-) -> Queries:
-    """Load all requests, and return their queries when all are held.
-
-    Raises:
-        RrError: the error of the first load that failed; nothing is held.
-    """
-    if not requests:
-        return Queries()
-    loads.calls.dispatcher.check_may_block(f"{loads.actor.name}.load_all()")
-    settled = Flag()
-    group = _Group(loads, unloads, requests, timeout_s, settled.set)
-    try:
-        group.ask(parent, on_status)
-        settled.wait()
-        failed = group.failed()
-        if failed is None:
-            return group.queries()
-        raise group.error(failed, shielded(group.undo))
-    except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
-        group.undo()
-        raise
-
-
-async def result(
-    loads: Loads,
-    unloads: Unloads,
-    requests: Sequence[Wanted],
-    parent: str,
-    on_status: StatusCallback | None,
-    timeout_s: float | None,
-) -> Queries:
-    """Load all requests as wait() does, awaited on any event loop. If it is cancelled, nothing stays held.
-
-    Raises:
-        RrError: the error of the first load that failed; nothing is held.
-    """
-    if not requests:
-        return Queries()
-    loop = asyncio.get_running_loop()
-    settled = asyncio.Event()
-
-    def settle() -> None:
-        try:
-            loop.call_soon_threadsafe(settled.set)
-        except RuntimeError:  # the event loop is closed, with the task that waited
-            group.undo()
-
-    group = _Group(loads, unloads, requests, timeout_s, settle)
-    try:
-        group.ask(parent, on_status)
-        await settled.wait()
-        failed = group.failed()
-        if failed is None:
-            return group.queries()
-        raise await asyncio.to_thread(group.error, failed, group.undo())
-    except BaseException:
-        group.undo()
-        raise

@@ -11,7 +11,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import pykka
@@ -63,18 +63,10 @@ class Wait:
         self.value: Any = None
         self.error: BaseException | None = None
 
-    def load_ended(self, _held: Held | None, error: RrError | None) -> None:
-        """Note how the load ended, and wake the thread that waits."""
+    def ended(self, value: Any, error: Exception | None) -> None:
+        """Note how the task ended, and wake the thread that waits. On the loop."""
+        self.value = value
         self.error = error
-        self.done = True
-        self._lock.release()
-
-    def run(self, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
-        """Run fn on the loop, and wake the thread that waits."""
-        try:
-            self.value = fn(*args)
-        except Exception as error:
-            self.error = error
         self.done = True
         self._lock.release()
 
@@ -92,27 +84,15 @@ class Calls:
         self.limits = TimeLimits(self.dispatcher.loop)
 
     def check_open(self) -> None:
-        """Raise if the registrar is closed.
-
-        Raises:
-            RegistrarDown: the registrar is closed.
-        """
+        """Raise RegistrarDown if the registrar is closed."""
         if self.actor.closed:
             raise self.actor.down()
 
     def check_may_wait(self) -> None:
-        """Raise if the calling thread is in a finalizer that the garbage collector runs in the middle of a decision.
-
-        Raises:
-            UsageError: the thread is deciding.
-        """
+        """Raise UsageError in a finalizer that the garbage collector runs in the middle of a decision."""
         if is_deciding():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
-
-    def post(self, command: Any) -> None:
-        """Give the actor a command, and do not wait."""
-        self.dispatcher.call(self.actor.post, command)
 
     def call(self, fn: Callable[..., T], *args: Any) -> T:
         """Run fn on the loop, behind the commands that threads have given it before, and return what it returns.
@@ -135,7 +115,12 @@ class Calls:
 
     def _run_in_order(self, wait: Wait, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
         self.actor.monitor.decide_waiting()
-        wait.run(fn, args)
+        try:
+            value = fn(*args)
+        except Exception as error:
+            wait.ended(None, error)
+        else:
+            wait.ended(value, None)
 
     def ask_other(self, registrar: str, method: str, *args: Any) -> Any:
         """Call a method of another registrar of the system, wherever it runs.
@@ -187,29 +172,6 @@ def with_notes(errors: Sequence[RrError]) -> RrError:
     for other in errors[1:]:
         errors[0].add_note(f"and {type(other).__name__}: {other}")
     return errors[0]
-
-
-class Together:
-    """The reply of many calls, set when all have ended. It raises the first error; the others are its notes.
-
-    `pending` has the names of the calls that have not ended. On the loop.
-    """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self.reply: Reply[None] = Reply()
-        self.pending = dict.fromkeys(names)
-        self._errors: list[RrError] = []
-        if not self.pending:
-            self.reply.set()
-
-    def ended(self, name: str, error: RrError | None) -> None:
-        """Note how one of the calls ended; after the last one, set the reply."""
-        del self.pending[name]
-        if error is not None:
-            self._errors.append(error)
-        if self.pending:
-            return
-        settle(self.reply, with_notes(self._errors) if self._errors else None)
 
 
 # -- loads -------------------------------------------------------------------------------------------------------------
@@ -266,7 +228,7 @@ class Loads:
                 self._wait_hearing(query, request, timeout_s, hearer)
             elif query_id or not self._directly(query, request, timeout_s):
                 wait = Wait()
-                dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
+                dispatcher.call(self._begin, query, self._ask(query, request), wait.ended)
                 self._await_end(wait, query, timeout_s, timeout_s)
         except RrError:
             raise
@@ -279,7 +241,7 @@ class Loads:
         wait = HearingWait(hearer)
         self.actor.listeners.add(query.id, wait.progressed)
         try:
-            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), wait.ended)
             self._await_end(wait, query, timeout_s, timeout_s)
         finally:
             self.actor.listeners.forget(query.id)
@@ -333,8 +295,6 @@ class Loads:
             RrError: how the load ended.
         """
         query = self.views.new(new_id(), target, request, parent)
-        self._listen(query, on_status)
-        ask = self._ask(query, request)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[None] = loop.create_future()
 
@@ -348,12 +308,15 @@ class Loads:
             except RuntimeError:  # the event loop is closed, with the task that waited
                 self._withdraw(query)
 
-        if hearer is not None:
-            self.actor.listeners.add(query.id, on_this_loop(hearer))
-        self.calls.dispatcher.call(self._begin, query, ask, ended, timeout_s)
         try:
+            self._listen(query, on_status)
+            if hearer is not None:
+                self.actor.listeners.add(query.id, on_this_loop(hearer))
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
             await future
-        except BaseException:  # cancelled, or for instance KeyboardInterrupt on the caller's loop
+        except RrError:
+            raise
+        except BaseException:  # cancelled, or KeyboardInterrupt, which may come anywhere
             self._withdraw(query)
             raise
         finally:
@@ -363,8 +326,7 @@ class Loads:
         return query
 
     def _listen(self, query: Query, on_status: StatusCallback | None) -> None:
-        if self.actor.closed:
-            raise self.actor.down()
+        self.calls.check_open()
         if on_status is not None:
             self.views.listen(query.id, on_status)
 
@@ -413,7 +375,7 @@ class Loads:
 
     def _await_end(self, wait: Wait | HearingWait, query: Query, left_s: float | None, timeout_s: float | None) -> None:
         if not wait.done_within(left_s):
-            self.calls.post(c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
+            self.calls.dispatcher.call(self.actor.post, c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
             wait.done_within(GRACE_S)
         if wait.error is not None:
             raise wait.error
@@ -504,7 +466,7 @@ class Loads:
         def ended(held: Held | None, error: RrError | None) -> None:
             if error is None and held is not None:
                 loaded(query, held)
-            wait.load_ended(held, error)
+            wait.ended(held, error)
 
         self.calls.dispatcher.call(self.actor.go_on_loading, query.id, ended, command)
         if isinstance(command, c.GiveUp):
@@ -617,7 +579,6 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-
         catalog = self._actor.catalog
         resource = catalog.find(target)
 
@@ -637,7 +598,7 @@ class Unloads:
 
     def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         """Release every held query that `wanted` accepts, newest first. The future is set when all have been tried."""
-        return self.calls.call(self._release_many, wanted, timeout_s)
+        return self.calls.call(self._many_now, wanted, timeout_s)
 
     def at_server(self, server: ServerId, timeout_s: float | None) -> Reply[None]:
         """Release every query that is held at a server, newest first. The future is set when all have been tried.
@@ -729,22 +690,34 @@ class Unloads:
         failure = Failure("Unavailable", f"{text}; {provider} is {doing}", details)
         actor.post(c.ReleaseOverdue(query_id, failure))
 
-    def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        with self._actor.lock:  # meanwhile no thread releases one of them
-            held = self._actor.whole().held
-            mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
-            together = Together(mine)
-            releases = Releases(self._actor, mine, together.ended)
+    def _many_now(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
+        """Begin to release. The reply raises the first error; the others are its notes."""
+        reply: Reply[None] = Reply()
+        errors: list[RrError] = []
+
+        def ended(query_id: str, error: RrError | None) -> None:
+            del pending[query_id]
+            if error is not None:
+                errors.append(error)
+            if not pending:
+                settle(reply, with_notes(errors) if errors else None)
 
         def overdue() -> None:
             releases.hurry()
-            for query_id in list(together.pending):
+            for query_id in list(pending):
                 self.release_overdue(query_id, timeout_s)
 
-        if timeout_s is not None and together.pending:
+        with self._actor.lock:  # meanwhile no thread releases one of them
+            held = self._actor.whole().held
+            mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
+            pending = dict.fromkeys(mine)
+            releases = Releases(self._actor, mine, ended)
+        if not mine:
+            reply.set()
+        elif timeout_s is not None and pending:
             self.calls.limits.begin(timeout_s, overdue)
-            together.reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
-        return together.reply
+            reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
+        return reply
 
 
 def _no_one(_error: RrError | None) -> None:

@@ -10,7 +10,7 @@ from rr_actors.actors.refs import ActorRef
 from rr_actors.base import pickling
 from rr_actors.base.errors import NameTaken, StartFailed, UsageError
 from rr_actors.registrar.arguments import check_text
-from rr_actors.registrar.declarations import Declared, says_recovery, spec_for
+from rr_actors.registrar.declarations import Declared, spec_for
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.server import current, serving
 from rr_actors.registrar.registrar import Registrar, register_spec
@@ -79,14 +79,14 @@ class Manager(Actor):
             await node.dispatcher.workers.run(self._register_servers, actor)
             await node.settle(actor)
         except BaseException:
-            node.close_registrar(place.id, None)
+            self._close_registrar(None)
             raise
 
     def _register_servers(self, actor: RegistrarActor) -> None:
         """Register the declared and the stored servers. In a worker: reading types and unpickling run users' code."""
         declared = self._declared_servers()
         for declaration in declared.values():
-            register_spec(self.registrar, spec_for(declaration, self), says_recovery=says_recovery(declaration))
+            register_spec(self.registrar, spec_for(declaration, self))
         with actor.enter():
             stored_servers = list(actor.whole().stored_servers.values())
         for stored in stored_servers:
@@ -101,9 +101,7 @@ class Manager(Actor):
             NameTaken: two methods declare the same name.
         """
         found: dict[str, Declared[Any, Any, Any]] = {}
-        attributes: dict[str, Any] = {}
-        for base in reversed(cls.__mro__):
-            attributes.update(vars(base))
+        attributes = {name: attribute for base in reversed(cls.__mro__) for name, attribute in vars(base).items()}
         for attribute in attributes.values():
             if isinstance(attribute, Declared):
                 if attribute.name in found:

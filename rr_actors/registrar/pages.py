@@ -26,7 +26,7 @@ _CELL = 400  # characters of a request or response
 _PREFIX = 4  # characters that a search for the beginning of an id needs
 _FOUND = 20
 
-_VALUE = re.compile(r"""["'{}()\[\],:]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
+_VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
 
 _Row = TypeVar("_Row", Resource, Held)
 _Found = TypeVar("_Found")
@@ -140,20 +140,20 @@ def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
 def _chosen(rows: list[_Row], wanted: Wanted, name: str) -> tuple[list[_Row], int]:
     if wanted.match:
         text, raw = wanted.match, wanted.match.encode("utf-8", "replace")
-        decodes = _may_be_more_than_a_string(text)
+        in_json = _json_of(text)[1:-1]
+        # To decode a request takes 5 us. It must be done if the text may be in it though its bytes are not.
+        decodes = _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
         def matches(row: Resource | Held) -> bool:
-            if raw in row.request or any(text in value for value in _texts(row, name)):
+            if any(text in value for value in _texts(row, name)):
                 return True
-            return decodes and text in text_of_value(row.request)
+            if not (decodes or raw in row.request):
+                return False
+            request = _json_of(shown_plain(row.request))  # a number or a length may be the same byte as a letter
+            return text in request or in_json in request
 
         rows = [row for row in rows if matches(row)]
     return rows[wanted.offset : wanted.offset + wanted.limit], len(rows)
-
-
-def _may_be_more_than_a_string(text: str) -> bool:
-    """Return whether the text of a request may contain `text` though its bytes do not. To decode one takes 5 us."""
-    return _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
 
 def _texts(row: Resource | Held, name: str) -> tuple[str, ...]:
@@ -168,27 +168,20 @@ def _of_id(actor: RegistrarActor, id: str) -> tuple[list[Resource], list[Held]]:
     The id of a query that is served here stands for its resource.
     """
 
-    def exactly(catalog: Catalog) -> tuple[list[Resource], list[Held]]:
-        resource, held = catalog.find(id), catalog.held.get(id)
-        return [resource] if resource is not None else [], [held] if held is not None else []
+    def rows(catalog: Catalog, served: list[str], held: list[str]) -> tuple[list[Resource], list[Held]]:
+        resources = {row.id: row for name in served if (row := catalog.find(name)) is not None}
+        return list(resources.values()), [row for name in held if (row := catalog.held.get(name)) is not None]
 
-    found = _read(actor, exactly)
+    found = _read(actor, lambda catalog: rows(catalog, [id], [id]))
     if any(found) or len(id) < _PREFIX:
         return found
-    resources, queries, held = _read(
-        actor, lambda catalog: (list(catalog.resources), list(catalog.queries), list(catalog.held))
-    )
-    named = list(_beginning(id, [*resources, *queries])), list(_beginning(id, held))
-
-    def rows(catalog: Catalog) -> tuple[list[Resource], list[Held]]:
-        served = {row.id: row for name in named[0] if (row := catalog.find(name)) is not None}
-        return list(served.values()), [row for name in named[1] if (row := catalog.held.get(name)) is not None]
-
-    return _read(actor, rows)
+    served, held = _read(actor, lambda catalog: ([*catalog.resources, *catalog.queries], list(catalog.held)))
+    served, held = _beginning(id, served), _beginning(id, held)
+    return _read(actor, lambda catalog: rows(catalog, served, held))
 
 
-def _beginning(text: str, ids: Iterable[str]) -> Iterable[str]:
-    return itertools.islice((id for id in ids if id.startswith(text)), _FOUND)
+def _beginning(text: str, ids: Iterable[str]) -> list[str]:
+    return list(itertools.islice((id for id in ids if id.startswith(text)), _FOUND))
 
 
 def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[ResourceRow]:
@@ -199,40 +192,36 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         return holders, len(queries), list(reversed(parts))[:HOLDERS_SHOWN], len(parts)
 
     neighbours = _read(actor, lambda catalog: [around(catalog, resource) for resource in resources])
-    return [_resource_row(actor, *both) for both in zip(resources, neighbours, strict=True)]
-
-
-def _resource_row(
-    actor: RegistrarActor, row: Resource, around: tuple[list[Holder], int, list[str], int]
-) -> ResourceRow:
-    state = row.state if row.phase is Phase.LOADED else ""
-    message = row.message
-    if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
-        message = shown_progress(*progress)
-    texts = text_of_value(row.request), text_of_value(row.response), row.phase.value, str(state), message
-    return ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *around)
+    rows: list[ResourceRow] = []
+    for row, others in zip(resources, neighbours, strict=True):
+        state = str(row.state) if row.phase is Phase.LOADED else ""
+        message = row.message
+        if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
+            message = shown_progress(*progress)
+        texts = _text_of_value(row.request), _text_of_value(row.response), row.phase.value, state, message
+        rows.append(ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *others))
+    return rows
 
 
 def _query_row(name: str, row: Held) -> QueryRow:
-    server, request = f"{row.registrar}/{row.server}", text_of_value(row.request)
+    server, request = f"{row.registrar}/{row.server}", _text_of_value(row.request)
     return QueryRow(row.id, name, server, row.resource_id, row.parent, request, row.hold.value, row.state.value)
 
 
-def text_of_value(raw: bytes | None) -> str:
-    """Return a request's or response's bytes as text: as JSON; "" for None."""
+def _text_of_value(raw: bytes | None) -> str:
+    """Return a request's or response's bytes as the text that is shown; "" for None."""
     if raw is None:
         return ""
     value: Any = shown_plain(raw)
     if value is None and raw != b"\xc0":
         return f"<{len(raw)} bytes>"
-    return shortened_json(value, _CELL)
+    text = readable(_json_of(value))
+    return text if len(text) <= _CELL else text[: _CELL - 1] + "…"
 
 
-def shortened_json(value: Any, limit: int) -> str:
-    """Return a value as JSON of at most `limit` characters; what JSON does not have is shown as in Python."""
+def _json_of(value: Any) -> str:
+    """Return a value as JSON; what JSON does not have is shown as in Python."""
     try:
-        text = msgspec.json.encode(value, enc_hook=repr).decode()
+        return msgspec.json.encode(value, enc_hook=repr).decode()
     except Exception:  # a key is no text, a number is too long, or the nesting is too deep
-        text = repr(value)
-    text = readable(text)
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+        return repr(value)

@@ -13,7 +13,7 @@ import queue
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol, cast
+from typing import cast
 
 from rr_actors.base.checks import Extra, check_takes, examined
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
@@ -78,7 +78,9 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     if progress is False or progress is None:
         return None
     if progress is True:
-        bar = _bar()
+        with Extra("load: progress=True", "progress", ", or give a callable: load(..., progress=print)"):
+            from rr_actors.registrar.progress_bar import Bar  # `import rr_actors` works without it
+        bar = Bar()
         return Hearer(actor, bar.show, bar.close)
     if not callable(progress):
         raise UsageError(f"load: progress: expected a callable or a bool, got {shown(progress)}")
@@ -89,17 +91,6 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     with examined("load: progress"):
         check_takes(callback, ("progress",), "load", "progress")
     return hearer
-
-
-class _Bar(Protocol):
-    def show(self, progress: Progress) -> None: ...
-    def close(self) -> None: ...
-
-
-def _bar() -> _Bar:
-    with Extra("load: progress=True", "progress", ", or give a callable: load(..., progress=print)"):
-        from rr_actors.registrar.progress_bar import Bar  # `import rr_actors` works without it
-    return Bar()
 
 
 # -- three ways to wait, and to hear meanwhile -------------------------------------------------------------------------
@@ -114,8 +105,8 @@ class HearingWait:
         self.done = False
         self.error: BaseException | None = None
 
-    def load_ended(self, _held: Held | None, error: RrError | None) -> None:
-        """Note how the load ended, and wake the waiting thread. On the loop."""
+    def ended(self, _held: Held | None, error: RrError | None) -> None:
+        """Note how the load ended, and wake the thread that waits. On the loop."""
         self.error = error
         self.done = True
         self._arrived.put(None)

@@ -47,11 +47,9 @@ class Holder(Protocol):
 
     def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> object:
         """Release the query, and return when that is done."""
-        ...
 
     async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
         """Release the query as unload() does, awaited."""
-        ...
 
 
 class Query(Generic[Response]):
@@ -125,10 +123,13 @@ class Query(Generic[Response]):
     @property
     def request(self) -> Any:
         """The request, decoded as the server's request type."""
-        if type(self._request) is _Bytes:
+        request = self._request
+        if type(request) is _Bytes:
             codec = self._types(self.server_id)[0]
-            self._request = codec.decode(self._request.raw, self.server_id)
-        return self._request
+            request = codec.decode(request.raw, self.server_id)
+            if codec is not PLAIN:  # else the types are not known yet, and the next read tries again
+                self._request = request
+        return request
 
     @property
     def response(self) -> Response:
@@ -138,10 +139,14 @@ class Query(Generic[Response]):
             InvalidResponse: the response has another type than `response_type`; or it needs a declared type, and none
                 is known.
         """
-        if type(self._response) is _Bytes:
+        response = self._response
+        if type(response) is _Bytes:
             codec = self._codec or self._types(self.server_id)[1]
-            self._response = codec.decode(self._response.raw, self.server_id, "response")
-        return self._response
+            value = codec.decode(response.raw, self.server_id, "response")
+            if codec is not PLAIN and self._response is response:  # else a newer one has arrived meanwhile
+                self._response = value  # no other thread runs between the comparison and this
+            return value
+        return response
 
     def unload(self, *, timeout_s: float | None = 30.0) -> None:
         """Release the query. Return when the unload callback has run, or at once if others hold the resource.
@@ -239,24 +244,18 @@ class Query(Generic[Response]):
         if self._response is None:  # otherwise an update arrived before the answer
             self._response = _Bytes(response)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the query as it is now. Elsewhere the copy can be read, and names the query."""
-        facts = {
-            name: getattr(self, name)
-            for name in ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released")
-        }
-        return (_remade, (facts, self.request, self.response))
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: the query as it is now. Elsewhere the copy can be read, and names the query."""
+        names = ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released")
+        return {name: getattr(self, name) for name in names} | {"_request": self.request, "_response": self.response}
 
-    def _set_values(self, request: Any, response: Any) -> None:
-        """Set the private fields of a query that is being unpickled."""
-        self._holder = None
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value)
+        self._holder = self._codec = self._waiters = self._statuses = None
         self._over = True
         self._is_released = False
-        self._request, self._response = request, response
         self._types = _no_types
-        self._codec = None
-        self._waiters = None
-        self._statuses = None
 
     def _read_as(self, codec: Codec) -> Self:
         """Decode the response with this codec, and not with that of the server's response type."""
@@ -357,14 +356,6 @@ def _no_types(server_id: str) -> tuple[Any, Any]:
     raise UnknownQuery(f"{server_id}: a query of another process has no types here")
 
 
-def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
-    query = Query.__new__(Query)
-    for name, value in facts.items():
-        setattr(query, name, value)
-    query._set_values(request, response)  # pyright: ignore[reportPrivateUsage]  # same file
-    return query
-
-
 class _Bytes(msgspec.Struct, frozen=True, gc=False):
     """A value that is not decoded yet. The thread that reads the value decodes it, never the loop."""
 
@@ -398,8 +389,6 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     queries: tuple[str, ...]
 
 
-# Views: the Query objects of one registrar, the callbacks for their statuses, and the codecs for their bytes.
-
 logger = logging.getLogger("rr_actors.registrar")
 
 StatusCallback = Callable[[Status], Any]
@@ -424,6 +413,7 @@ class Views:
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
         self._codecs_of = self.codecs_of  # one bound method for all queries
         self._left: set[tuple[str, str]] = set()  # servers where something was held, and released
+        self._silent: set[str] = set()  # servers whose types were asked for, and did not come in time
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
         """Return a Query that is being loaded. No status reaches it before add()."""
@@ -448,8 +438,8 @@ class Views:
 
     def listen(self, query_id: str, callback: StatusCallback) -> None:
         """Have the callback called with each status of one query."""
+        self._on_query[query_id] = callback  # first: an interrupt may come now, and forget() looks here
         self._actor.catalog.listened.add(query_id)
-        self._on_query[query_id] = callback
 
     def listen_to_server(self, server: str, callback: StatusCallback) -> None:
         """Have the callback called with each status of every query at a server."""
@@ -517,14 +507,19 @@ class Views:
             request_type, response_type = pickling.loads(known.blob)
             codecs = Codec(request_type, f"{server_id}: request"), Codec(response_type, f"{server_id}: response")
             cached = self._codecs[server_id] = (known.blob, codecs)
+            self._silent.discard(server_id)
         return cached[1]
 
     def _ask_types(self, server_id: str) -> ServerType | None:
-        """Ask the provider for a server's types, which a crash may have lost; None if it does not answer in time."""
+        """Ask the provider for a server's types, which a crash may have lost; None if it does not answer in time.
+
+        After a first wait in vain, reads do not wait any more: the question stays open until the provider is back.
+        """
         dispatcher = self._actor.node.dispatcher
-        if dispatcher.is_loop_thread() or self._actor.closed:
+        if dispatcher.is_loop_thread() or self._actor.closed or server_id in self._silent:
             return None
         told = Flag()
         dispatcher.call(self._actor.types.tell, parse_server_id(server_id), told.set)
-        told.wait(_TYPES_S)
+        if not told.wait(_TYPES_S):
+            self._silent.add(server_id)
         return self._actor.catalog.server_types.get(server_id)

@@ -25,7 +25,6 @@ from rr_actors.base.names import ServerId, check_name, new_id, parse_server
 from rr_actors.base.pictures.html_tables import table
 from rr_actors.base.pictures.mime_bundles import bundle_or_text
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar import load_groups
 from rr_actors.registrar.arguments import (
     check_text,
     codec_for,
@@ -48,13 +47,14 @@ from rr_actors.registrar.engine.server import (
     status_callback_of,
 )
 from rr_actors.registrar.engine.status import Status, message_text
-from rr_actors.registrar.load_groups import Queries
+from rr_actors.registrar.load_groups import Group, Queries, wanted
 from rr_actors.registrar.loads import Calls, Loads, Unloads, settle
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import FetchedQuery, error_of
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
-from rr_actors.registrar.pages import Holder, Page, Wanted, page_of
+from rr_actors.registrar.model.rows import Query as QueryRow
+from rr_actors.registrar.pages import Page, Wanted, page_of
 from rr_actors.registrar.progress_hearers import ProgressWanted, hearer_of
 from rr_actors.registrar.queries import (
     PLAIN,
@@ -66,7 +66,7 @@ from rr_actors.registrar.queries import (
     read_later,
     response_bytes,
 )
-from rr_actors.registrar.replacements import Replacements, encoded_response, new_response
+from rr_actors.registrar.replacements import Replacements, encoded_response
 from rr_actors.runtime.time_limits import time_limit
 
 if TYPE_CHECKING:
@@ -89,10 +89,6 @@ _KEPT = (
 )
 
 _SHOWN = 50  # rows of a picture in a notebook
-
-
-def _names(holders: list[Holder]) -> str:
-    return ", ".join(holder.origin for holder in holders)
 
 
 class Registrar:
@@ -133,8 +129,8 @@ class Registrar:
             served = self._page(Wanted("resources", limit=_SHOWN))
             held = self._page(Wanted("queries", limit=_SHOWN))
             serves = [
-                (one.server, one.request, one.response, one.state or one.phase, _names(one.holders))
-                for one in served.resources
+                (row.server, row.request, row.response, row.condition, ", ".join(one.origin for one in row.holders))
+                for row in served.resources
             ]
             holds = [(row.server, row.request, row.state, row.parent or "itself") for row in held.queries]
             text = ", ".join(self.servers()) or "none"
@@ -201,25 +197,24 @@ class Registrar:
             response_type=response_type,
             linger_s=linger_s,
             load_timeout_s=load_timeout_s,
-            recovery="keep" if recovery is None else recovery,
+            recovery=recovery,
         )
-        self._register_spec(spec, says_recovery=recovery is not None)
+        self._register_spec(spec)
 
-    def _register_spec(
-        self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
-    ) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server from its checked spec. With `stored`, these bytes of the spec are kept in the catalog.
 
         A `restored` server, which comes from the catalog, is replaced if its name is registered again.
         """
         origin = f"{self.name}/{spec.name}"
-        if stored is None and not restored:
+        is_declared_here = stored is None and not restored
+        if is_declared_here:
             log_unread_types(spec, origin)
         types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
         server = ServerActor(self._actor, spec, types)
         server.restored = restored
         kept = self._calls.call(self._register, server, stored)
-        if kept and not says_recovery and spec.recover is None:
+        if kept and is_declared_here and spec.recovery is None and spec.recover is None:
             logger.warning(_KEPT, self.name, spec.name, kept)
 
     def _register(self, server: ServerActor, stored: bytes | None) -> int:
@@ -337,7 +332,9 @@ class Registrar:
             UsageError: not called in a status callback, or the status is of the resource itself.
         """
         limit_s = time_limit(timeout_s)
-        make_response = new_response(response)
+        if response is not None and not callable(response):
+            expected = "expected a function that takes the spare's Query and returns the new response"
+            raise UsageError(f"replace_part: response: {expected}, got {shown(response)} ({type(response).__name__})")
         target = None if server is None else self._target(server)
         if not is_a(status, Status):
             raise UsageError(f"replace_part: expected the Status of the callback, got {shown(status)}")
@@ -345,7 +342,7 @@ class Registrar:
         if not resource_id:
             where = "expected to be called in a status callback of a server"
             raise UsageError(f"registrar {self.name!r}: replace_part: {where}")
-        return owner._replacements.replace(status, request, target, make_response, limit_s)
+        return owner._replacements.replace(status, request, target, response, limit_s)
 
     # -- load ----------------------------------------------------------------------------------------------------
 
@@ -479,7 +476,7 @@ class Registrar:
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
-        target = parse_server(server) if type(server) is str else self._target(server)
+        target = parse_server(server) if type(server) is str and "/" in server else self._target(server)
         hearer = None if progress is False else hearer_of(progress, owner._actor)
         loaded = way(target, encode(request), parent_id, on_status, limit_s, hearer)
         if codec is None:
@@ -541,13 +538,11 @@ class Registrar:
         if not self._node.dispatcher.may_block():  # a callback that is a coroutine: the call is refused
             return
         self._warned_in_event_loop = True
-        text = (
-            f"{called}() blocks the event loop that runs in this thread until it returns: write `await {instead}(...)`"
-        )
-        warnings.warn(f"registrar {self.name!r}: {text}", RuntimeWarning, stacklevel=3)
+        text = f"{called}() blocks the event loop that runs in this thread until it returns"
+        warnings.warn(f"registrar {self.name!r}: {text}: write `await {instead}(...)`", RuntimeWarning, stacklevel=3)
 
     def _target(self, server: object) -> ServerId:
-        return server_target(server, self._node.directory)
+        return server_target(server, self._node)
 
     def load_all(
         self,
@@ -575,11 +570,7 @@ class Registrar:
         """
         if asyncio._get_running_loop() is not None:
             self._warn_in_event_loop("load_all", "load_all_async")
-        asked = load_groups.wanted(requests)
-        limit_s = time_limit(timeout_s)
-        on_status = status_callback(on_status, "load_all")
-        owner, parent_id = self._holder(parent)
-        return load_groups.wait(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
+        return self._group(requests, on_status, timeout_s, parent).wait()
 
     async def load_all_async(
         self,
@@ -590,11 +581,15 @@ class Registrar:
         parent: Any = None,
     ) -> Queries:
         """Load as load_all() does, awaited. If it is cancelled, all loads are released or withdrawn."""
-        asked = load_groups.wanted(requests)
+        return await self._group(requests, on_status, timeout_s, parent).result()
+
+    def _group(self, requests: Any, on_status: Any, timeout_s: Any, parent: Any) -> Group:
+        """Return a group of loads that has not begun, with its arguments checked."""
+        asked = wanted(requests, self._target)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all")
         owner, parent_id = self._holder(parent)
-        return await load_groups.result(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
+        return Group(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Return the registrar that holds the next load, and the id of its resource that needs it; "" for none.
@@ -707,7 +702,7 @@ class Registrar:
             The errors of unload(), after all queries have been tried.
         """
         self._calls.check_open()
-        reply = self._unloads.at_server(parse_server(server), time_limit(timeout_s))
+        reply = self._unloads.at_server(self._target(server), time_limit(timeout_s))
         return reply.get() if block else reply
 
     @overload
@@ -786,32 +781,24 @@ class Registrar:
         self._actor.settle()
         with self._actor.enter():
             catalog = self._actor.whole()
-            resource_id = target
-            if target in catalog.queries and target not in catalog.resources:
-                resource_id = catalog.queries[target].resource_id
-            if resource_id not in catalog.resources and resource_id not in catalog.parts:
+            resource = catalog.find(target)
+            if resource is None and target not in catalog.parts:
                 text = f"{shortened(target)}: {self.name!r} serves no resource and no query of this id"
                 raise UnknownQuery(text, query_id=target)
-            parts = [catalog.held[id] for id in reversed(catalog.parts_of(resource_id))]
-        return [self._views.of(held) for held in parts]
+            parts = catalog.parts_of(target if resource is None else resource.id)
+            held = [catalog.held[id] for id in reversed(parts)]
+        return [self._views.of(row) for row in held]
 
     def resources(self) -> list[ResourceInfo]:
         """Return every resource served here, with its state, response and holders."""
         return [self._info(*row) for row in self._calls.call(self._resources_now)]
 
-    def _resources_now(self) -> list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]]:
-        rows: list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]] = []
+    def _resources_now(self) -> list[tuple[Resource, ServerActor | None, list[QueryRow]]]:
         with self._actor.enter():
-            catalog = self._actor.whole()
-            for resource in catalog.resources.values():
-                query_ids = tuple(catalog.holders.get(resource.id, ()))
-                holders = tuple(catalog.queries[id].origin for id in query_ids)
-                rows.append((resource, self._actor.servers.get(resource.server), holders, query_ids))
-        return rows
+            catalog, server_of = self._actor.whole(), self._actor.servers.get
+            return [(row, server_of(row.server), catalog.queries_of(row.id)) for row in catalog.resources.values()]
 
-    def _info(
-        self, resource: Resource, server: ServerActor | None, holders: tuple[str, ...], queries: tuple[str, ...]
-    ) -> ResourceInfo:
+    def _info(self, resource: Resource, server: ServerActor | None, queries: list[QueryRow]) -> ResourceInfo:
         """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
         request = (server.request if server else PLAIN).show(resource.request)
         response = None
@@ -819,7 +806,8 @@ class Registrar:
             response = (server.response if server else PLAIN).show(resource.response)
         state = str(resource.state if resource.phase is Phase.LOADED else resource.phase)
         facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
-        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)
+        holders, ids = tuple(query.origin for query in queries), tuple(query.id for query in queries)
+        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, ids)
 
     def clients(self) -> list[str]:
         """Return the servers ("registrar/server") where this registrar holds something."""
@@ -873,7 +861,7 @@ class Registrar:
 
         As in a load's `on_status`, `status.handled()` stops the status from going further up.
         """
-        key = str(parse_server(server))
+        key = str(self._target(server))
         own = status_callback(callback, "on_status", "callback")
         if own is None:
             raise UsageError("on_status: callback: expected a callable, got None")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import functools
 import inspect
@@ -17,7 +16,7 @@ from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import RrError, Unavailable, UsageError, is_a
 from rr_actors.registrar.arguments import codec_for
 from rr_actors.registrar.engine.server import ServerSpec, log_unread_types
-from rr_actors.registrar.load_groups import Queries
+from rr_actors.registrar.load_groups import Queries, iterated
 from rr_actors.registrar.progress_hearers import ProgressWanted
 from rr_actors.registrar.queries import Query, held_by, read_as
 from rr_actors.registrar.registrar import Registrar, StatusCallback
@@ -61,9 +60,7 @@ class RegistrarHandle(Registrar):
     def __repr__(self) -> str:
         return f"<Registrar {self._name} (handle)>"
 
-    def _register_spec(
-        self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
-    ) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server in the other process from its checked spec; a respawn restores it."""
         log_unread_types(spec, f"{self.name}/{spec.name}")
         for role in ("load", "unload", "status", "recover"):
@@ -99,18 +96,19 @@ class RegistrarHandle(Registrar):
             text = "progress is heard only in the process that holds the query: load by a registrar of this process"
             raise UsageError(f"registrar {self.name!r}: {text} (system.open_registrar)")
         codec = None if response_type is None else codec_for(response_type)
-        reply, _ = self._begin("load", target, request, on_status=on_status, timeout_s=limit_s, parent=parent)
+        reply: Reply[Query] = Reply()
 
         def own(query: Query) -> Query:
             return held_by(query, self) if codec is None else read_as(held_by(query, self), codec)
 
-        if not block:
+        try:
+            self._begin(reply, "load", target, request, on_status=on_status, timeout_s=limit_s, parent=parent)
+            if block:
+                return own(self._finish(reply, limit_s))
             owned: Reply[Query] = Reply()
             owned.withdraw = lambda: self._withdraw(reply)
             reply.add_done_callback(lambda reply: owned.set_unopened(lambda: own(reply.get())))
             return owned
-        try:
-            return own(self._finish(reply, limit_s))
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
             self._withdraw(reply)
             raise
@@ -135,7 +133,7 @@ class RegistrarHandle(Registrar):
         reply: Reply[Query] = self.load(server, request, **options, parent=parent, progress=progress, block=False)
         try:
             return await reply
-        except asyncio.CancelledError:
+        except BaseException:  # cancelled, or KeyboardInterrupt: the caller never gets the query
             self._withdraw(reply)
             raise
 
@@ -151,10 +149,11 @@ class RegistrarHandle(Registrar):
         owner, parent = self._holder(parent)
         if owner is not self:
             return owner.load_all(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
-        requests = list(requests)
-        reply, limit_s = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
+        requests = list(iterated(requests))
+        reply: Reply[Queries] = Reply()
         try:
-            return self._own(self._finish(reply, limit_s))
+            options: dict[str, Any] = {"on_status": on_status, "timeout_s": timeout_s, "parent": parent}
+            return self._own(self._finish(reply, self._begin(reply, "load_all", requests, **options)))
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
             self._withdraw(reply)
             raise
@@ -171,11 +170,12 @@ class RegistrarHandle(Registrar):
         owner, parent = self._holder(parent)
         if owner is not self:
             return await owner.load_all_async(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
-        requests = list(requests)
-        reply, _ = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
+        requests = list(iterated(requests))
+        reply: Reply[Queries] = Reply()
         try:
+            self._begin(reply, "load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
             return self._own(await reply)
-        except asyncio.CancelledError:
+        except BaseException:  # cancelled, or KeyboardInterrupt: the caller never gets the queries
             self._withdraw(reply)
             raise
 
@@ -190,15 +190,17 @@ class RegistrarHandle(Registrar):
     # -- calling -------------------------------------------------------------------------------------------------
 
     def _ask(self, method: str, *args: Any, block: bool = True, **options: Any) -> Any:
-        reply, limit_s = self._begin(method, *args, **options)
+        reply: Reply[Any] = Reply()
+        limit_s = self._begin(reply, method, *args, **options)
         return self._own(self._finish(reply, limit_s)) if block else reply
 
-    def _begin(self, method: str, *args: Any, **options: Any) -> tuple[Reply[Any], float | None]:
-        """Have the other process call a method. Return the reply, and the seconds that the caller may wait for it."""
+    def _begin(self, reply: Reply[Any], method: str, *args: Any, **options: Any) -> float | None:
+        """Have the other process call a method, and return for how many seconds the caller may wait for the reply."""
         limit_s: float | None = 30.0
         if "timeout_s" in options:
             limit_s = options["timeout_s"] = time_limit(options["timeout_s"])
-        return self._line.call(method, args, options, limit_s if self._patient else 0.0), limit_s
+        self._line.call(method, args, options, limit_s if self._patient else 0.0, reply)
+        return limit_s
 
     def _finish(self, reply: Reply[Any], timeout_s: float | None) -> Any:
         try:

@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from rr_actors.base.errors import UnknownQuery, UsageError, shown
+from rr_actors.base.errors import UnknownQuery, UsageError
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -65,8 +65,10 @@ class Replacements:
             return self._replaced_before(status, found)
         place = target or ServerId(found.part.registrar, found.part.server)
         raw = encode(request)
-        spare = self._loaded(found, place, raw)
-        if spare is None:
+        row = next((row for row in found.spares if (row.registrar, row.server, row.request) == (*place, raw)), None)
+        if row is not None:  # an interrupted run of the callback has loaded the spare
+            spare = self._calls.call(self._views.of, row)
+        else:
             id = _spare_id(family, place, raw, next_spare(status))
             spare = self._loads.wait(place, raw, resource_id, None, timeout_s, query_id=id)
         self._swap(found, status, spare, family, response)
@@ -91,13 +93,6 @@ class Replacements:
             raise UnknownQuery(f"{text}: nothing is replaced", query_id=status.query_id)
         status.handled()
         return self._calls.call(self._views.of, found.spares[0])
-
-    def _loaded(self, found: _Found, place: ServerId, request: bytes) -> Query | None:
-        """Return the spare that an interrupted run of the callback has loaded, if there is one."""
-        for row in found.spares:
-            if (row.registrar, row.server, row.request) == (*place, request):
-                return self._calls.call(self._views.of, row)
-        return None
 
     def _swap(
         self, found: _Found, status: Status, spare: Query, family: str, response: Callable[[Query], Any] | None
@@ -127,18 +122,6 @@ def encoded_response(response: Any, resource: Resource | None, server: ServerAct
     if resource is not None and (refusal := server.too_long(resource, raw)) is not None:
         raise refusal
     return raw
-
-
-def new_response(function: Callable[[Query], Any] | None) -> Callable[[Query], Any] | None:
-    """Return the function that makes the new response, or None.
-
-    Raises:
-        UsageError: `function` cannot be called.
-    """
-    if function is None or callable(function):
-        return function
-    expected = "expected a function that takes the spare's Query and returns the new response"
-    raise UsageError(f"replace_part: response: {expected}, got {shown(function)} ({type(function).__name__})")
 
 
 def _family(part_id: str) -> str:

@@ -545,5 +545,5 @@ def test_reports_that_come_faster_than_they_are_heard_hold_up_no_time_limit() ->
 
     assert not wait.done_within(0.05)
     assert hearer.heard > 1
-    wait.load_ended(None, None)
+    wait.ended(None, None)
     assert wait.done_within(LIMIT_S)

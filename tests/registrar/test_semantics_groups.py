@@ -226,6 +226,15 @@ def test_in_a_callback_they_become_parts_of_its_resource(
     eventually(lambda: parts.resources() == [])
 
 
+@pytest.mark.parametrize("requests", [None, 7, Order("wheel")])
+def test_a_handle_refuses_what_is_no_list_of_pairs(
+    load_all: Way, start: Start, workshop: Workshop, requests: Any
+) -> None:
+    buyer = start(rr.ChildSpec(Shop, id="buyer", args=(str(workshop.root),))).registrar("buyer")
+    with pytest.raises(rr.UsageError, match="load_all: expected a list of pairs"):
+        load_all(buyer, requests)
+
+
 def test_a_manager_loads_all_through_its_handle(start: Start, workshop: Workshop) -> None:
     system = start(
         rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)),

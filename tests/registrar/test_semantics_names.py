@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -46,10 +47,36 @@ def test_other_names_of_servers_are_refused(provider: rr.Registrar, name: Any) -
     assert list(provider.servers()) == []
 
 
-@pytest.mark.parametrize("server", ["camera", "", "/", "a/", "/a", "a/b/c", "a//b", "a b/c", None, 7])
+@pytest.mark.parametrize(
+    "server", ["camera", "", "/", "a/", "/a", "a/b/c", "a//b", "a b/c", "a\0b", "x" * 500, None, 7]
+)
 def test_a_server_is_addressed_as_registrar_slash_server(app: rr.Registrar, server: Any) -> None:
     with pytest.raises(rr.InvalidName):
         app.load(server, "x")
+
+
+def test_a_server_without_its_registrar_is_refused_with_the_one_that_was_probably_meant(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "camera")
+    asks: list[Callable[[str], object]] = [
+        lambda server: app.load(server, 1),
+        lambda server: app.load(server, 1, block=False),
+        lambda server: asyncio.run(app.load_async(server, 1)),
+        lambda server: app.load_all([(server, 1)]),
+        lambda server: app.on_status(server, print),
+        lambda server: app.unload_client(server),
+    ]
+    for ask in asks:
+        with pytest.raises(rr.InvalidName, match=r"got no '/'; did you mean 'provider/camera'\?"):
+            ask("camera")
+    with pytest.raises(rr.InvalidName, match=r"did you mean 'provider/camera'\?"):
+        app.load("provider.camera", 1)
+    with pytest.raises(rr.InvalidName, match=r"got no '/'; registrar 'map': there is none .*app, provider") as caught:
+        app.load("map", 1)
+    assert caught.value.name == "map"
+    with pytest.raises(rr.InvalidName, match="'provider' is a registrar, name its server, too"):
+        app.load("provider", 1)
 
 
 def test_taking_a_registrars_name_twice_is_an_error_and_leaves_the_first_untouched(

@@ -42,7 +42,7 @@ from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.wire.name_service import Entry, Status, actor_key, open_state_dir, registrar_key
 from support import Gate, lives, quickly, wait_gone
-from support_supervision import Idle, Log, StuckManager, Threaded, Tree, Worker, eventually, let_go
+from support_supervision import Idle, Log, SlowToRegister, StuckManager, Threaded, Tree, Worker, eventually, let_go
 
 Plant = Callable[..., Tree]
 both = pytest.mark.parametrize("placement", ["process", "thread"])
@@ -887,6 +887,23 @@ def test_a_manager_that_hangs_in_its_start_as_a_thread_is_abandoned_with_its_cat
     let_go.set()
     assert tree.ask("root/shop", "anything") == "served"
     assert tree.node.registrars["shop"] is served
+
+
+def test_a_manager_that_fails_after_it_was_abandoned_leaves_its_successors_registrar_open(
+    plant: Plant, log: Log
+) -> None:
+    tree = plant()
+    hanging = ChildSpec(SlowToRegister, id="shop", placement="thread", start_timeout_s=0.2)
+    with pytest.raises(StartFailed, match="start_timeout_s"):
+        tree.supervisor().start_child(hanging)
+    tree.supervisor().start_child(ChildSpec(StuckManager, id="shop", placement="thread", shutdown_s=0.1))
+    served = tree.node.registrars["shop"]
+    let_go.set()
+    (abandoned,) = SlowToRegister.made
+    eventually(abandoned._started.done)  # pyright: ignore[reportPrivateUsage]
+    assert tree.ask("root/shop", "anything") == "served"
+    assert tree.node.registrars["shop"] is served
+    assert not served.closed
 
 
 def _registrar(tree: Tree, name: str) -> Status | None:

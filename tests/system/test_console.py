@@ -235,6 +235,23 @@ def test_a_page_has_the_rows_that_are_visible_and_how_many_there_are(
     assert len(console.queries("app", "item 12").rows) == 10
 
 
+def test_a_search_finds_what_a_request_says_and_not_the_bytes_around_it(
+    app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+) -> None:
+    serve(provider, "shelf")
+    letters = {"room": "A"}, 'an "A"', "x" * 500 + "A"
+    numbers = 65, [65.0, 0x4142434445464748], "x" * 65, b"A"
+    app.load_all([("provider/shelf", request) for request in (*letters, *numbers)])
+
+    def found(match: str) -> int:
+        assert console.queries("app", match).total == console.ask(ListResources(match=match), Resources).total
+        return console.ask(ListResources(match=match), Resources).total
+
+    assert found("A") == len(letters)
+    assert found('"room":"A"') == found('an "A"') == found('an \\"A\\"') == found("xA") == 1
+    assert found("65") == 2
+
+
 def test_a_resource_is_found_by_its_id_or_the_beginning_of_it_with_its_holders_and_parts(
     shop: rr.System, console: ConsoleClient
 ) -> None:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
+import itertools
 import os
 import sys
 import threading
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
+import rr_actors as rr
 from rr_actors.runtime.thread_wakeup import EventBell
+from support import Calls, Workshop, eventually, serve
 from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
+from support_managers import Order, Shop
 
 _QUICK = (
     *("load here", "load elsewhere", "join here", "unload here", "unload elsewhere", "unload_all"),
@@ -79,6 +86,79 @@ def test_the_interrupt_comes_at_each_point_of_a_call_and_nowhere_else() -> None:
         if told.was_raised:
             ends.append(list(steps))
     assert ends == [["in"], ["in"], ["in", "out"]]
+
+
+def _interrupt_before_it_waits(begin: Callable[[], Any]) -> int:
+    """Interrupt a coroutine at each point before it awaits something, and return how many points there are."""
+
+    async def interrupt() -> int:
+        for point in itertools.chain([sys.maxsize], itertools.count(1)):  # at first caches are filled
+            load = begin()
+            told = interrupted(lambda load=load: load.send(None), point)
+            load.close()
+            if not told.where and point < sys.maxsize:
+                return point - 1
+        raise AssertionError
+
+    loop = asyncio.new_event_loop()  # asyncio.run() has a signal handler of its own
+    try:
+        return loop.run_until_complete(interrupt())
+    finally:
+        loop.close()
+
+
+def test_an_awaited_load_that_is_interrupted_before_it_waits_is_withdrawn(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    heard, numbers = Calls(), itertools.count()
+    points = _interrupt_before_it_waits(lambda: app.load_async("provider/thing", next(numbers), on_status=heard))
+    assert points > 50
+    eventually(lambda: (app.queries(), app.stats()["loading"], provider.resources()) == ([], 0, []))
+    assert app._actor.catalog.listened == set()  # pyright: ignore[reportPrivateUsage]
+
+
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")  # the interrupt came before
+@pytest.mark.parametrize("how", ["load_async", "load_all_async"])
+def test_an_awaited_load_through_a_handle_that_is_interrupted_before_it_waits_is_released(
+    start: Callable[..., rr.System], workshop: Workshop, how: str
+) -> None:
+    shop = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))).registrar("shop")
+    numbers = itertools.count()
+
+    def begin() -> object:
+        order = Order(str(next(numbers)))
+        return (
+            shop.load_async("shop/thing", order)
+            if how == "load_async"
+            else shop.load_all_async([("shop/thing", order)])
+        )
+
+    assert _interrupt_before_it_waits(begin) > 20
+    eventually(lambda: (shop.queries(), shop.resources()) == ([], []))
+
+
+@pytest.mark.parametrize("how", ["load", "load_all", "future"])
+def test_a_load_through_a_handle_that_is_interrupted_is_released(
+    start: Callable[..., rr.System], workshop: Workshop, how: str
+) -> None:
+    shop = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))).registrar("shop")
+    ways: dict[str, Callable[[Order], object]] = {
+        "load": lambda order: shop.load("shop/thing", order),
+        "load_all": lambda order: shop.load_all([("shop/thing", order)]),
+        "future": lambda order: shop.load("shop/thing", order, block=False),
+    }
+    orders = [Order("first")]
+    ways[how](orders[0])  # which fills caches
+    eventually(shop.queries)
+    shop.unload_all()
+    where = "at first"
+    while where:
+        orders.append(Order(str(len(orders))))
+        where = interrupted(lambda: ways[how](orders[-1]), len(orders)).where
+    eventually(lambda: [query.request for query in shop.queries()] == orders[-1:])
+    shop.unload_all()
+    assert shop.resources() == []
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # an interrupt in __del__ goes nowhere

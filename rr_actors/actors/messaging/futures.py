@@ -24,6 +24,7 @@ from rr_actors.actors.messaging import ask_cycles
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.base.errors import ActorUnavailable, UsageError
 from rr_actors.runtime import event_loop
+from rr_actors.runtime.shielding import is_interruptible
 from rr_actors.runtime.time_limits import time_limit
 
 if TYPE_CHECKING:
@@ -395,6 +396,8 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             try:
                 self._value = self._open()
             except BaseException as error:  # kept, and raised by every get()
+                if isinstance(error, KeyboardInterrupt) and is_interruptible():
+                    raise  # the calling thread was interrupted: the next get() opens the reply again
                 self._error = error
             self._open = None
 

@@ -194,7 +194,7 @@ class ServerSpec(msgspec.Struct, frozen=True):
     response_type: Any = None
     linger_s: float = 0.0
     load_timeout_s: float | None = None
-    recovery: str = "keep"
+    recovery: str | None = None  # None: "keep", as nothing was said
 
 
 class ServerActor:
@@ -213,7 +213,7 @@ class ServerActor:
         self.restored = False  # whether it came from the catalog; then a second registration replaces it
         self.types = types
         has = spec.status is not None, spec.recover is not None
-        limits = spec.linger_s, spec.load_timeout_s, spec.recovery
+        limits = spec.linger_s, spec.load_timeout_s, spec.recovery or "keep"
         self.facts = Server(spec.name, *limits, *has, types)  # what decisions need to know
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
@@ -478,7 +478,7 @@ def make_spec(
     response_type: Any = None,
     linger_s: float = 0.0,
     load_timeout_s: float | None = None,
-    recovery: str = "keep",
+    recovery: str | None = None,
 ) -> ServerSpec:
     """Check the arguments of a server's registration, and read its types from the annotations of `load`.
 
@@ -492,7 +492,7 @@ def make_spec(
                 check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
             elif field == "load" or callback is not None:
                 _invalid(name, field, "a callable", callback)
-        if recovery not in RECOVERY:
+        if recovery is not None and recovery not in RECOVERY:
             _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
         if not is_number(linger_s) or linger_s < 0:
             _invalid(name, "linger_s", "seconds, 0 or more", linger_s)

@@ -156,17 +156,23 @@ class HandleLine:
         self._closed = False
 
     def call(
-        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], patience_s: float | None = 0.0
+        self,
+        method: str,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        patience_s: float | None = 0.0,
+        reply: Reply[Any] | None = None,
     ) -> Reply[Any]:
         """Call a method. The reply gets its result or error. From any thread.
 
-        It waits `patience_s` seconds for a registrar that is being started or respawned; None: without limit.
+        It waits `patience_s` seconds for a registrar that is being started or respawned; None: without limit. A caller
+        that gives the reply has it also when the call is interrupted.
 
         Raises:
             NotSerializable: an argument cannot be pickled.
         """
         body = pickling.dumps((args, kwargs), f"{self._registrar}.{method}()")
-        reply: Reply[Any] = Reply()
+        reply = Reply() if reply is None else reply
         self._node.dispatcher.call(self._begin, method, body, reply, patience_s)
         return reply
 
