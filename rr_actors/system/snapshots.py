@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+import pykka
 
 from rr_actors.base.errors import NotFound, RrError, shown
 from rr_actors.registrar.queries import Query, ResourceInfo
@@ -14,12 +15,18 @@ from rr_actors.system.hosting.node import Node
 from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Status
 
+_NO_ANSWER = (RrError, pykka.Timeout)
+"""What a supervisor raises that is stopped or being respawned, or whose process does not answer in time."""
+
 
 def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
-    """Return a supervisor and all below it: id, path, settings, and its children in the order of their start."""
+    """Return a supervisor and all below it: id, path, settings, and its children in the order of their start.
+
+    One that does not answer has an "error" and no children.
+    """
     try:
         described = supervisor.describe()
-    except RrError as error:
+    except _NO_ANSWER as error:
         return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "error": str(error), "children": []}
     children = [_describe_child(supervisor.path, child) for child in described["children"]]
     return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"} | described | {"children": children}
@@ -47,7 +54,7 @@ def describe_at(place: SupervisorRef) -> dict[str, Any]:
         children: list[dict[str, Any]] = SupervisorRef(above).describe()["children"]
     except NotFound:
         raise
-    except RrError:  # the supervisor above does not answer either
+    except _NO_ANSWER:  # the supervisor above does not answer either
         return described
     for child in children:
         if child["id"] == id:
@@ -60,7 +67,8 @@ def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
     """Return the paths of all children of this id below a supervisor.
 
     Raises:
-        ActorUnavailable: a supervisor on the way is being respawned, so the children below it are not known.
+        ActorUnavailable, pykka.Timeout: a supervisor on the way is being respawned, or its process does not answer, so
+            the children below it are not known.
     """
     ahead, paths = [supervisor], list[str]()
     while ahead:

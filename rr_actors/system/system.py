@@ -576,6 +576,7 @@ class System:
         Raises:
             NotFound: no child has this id, or several have it. The error has their paths.
             ActorUnavailable: a supervisor that may have the child is being respawned.
+            pykka.Timeout: the process of such a supervisor has not answered within 60 s.
         """
         path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
         supervisor = self._supervisor_ref(path)
@@ -617,13 +618,18 @@ class System:
     # -- looking -------------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the tree, and every registrar's resources, queries and dependencies, as plain data."""
+        """Return the tree, and every registrar's resources, queries and dependencies, as plain data.
+
+        A supervisor or registrar that does not answer has an "error" in the place of what it would say.
+        """
         node = self._running()
         registrars = describe_registrars(node)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:
         """Return a picture of the child at `path` and everything below it; without a path, of the whole tree.
+
+        A supervisor that does not answer is "unavailable" in it, and nothing below it is known.
 
         Raises:
             NotFound: there is nothing at that path.
