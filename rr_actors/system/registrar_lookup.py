@@ -82,8 +82,6 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
 
 # Dormant registrars: their process died, and nobody has opened them again. Their queries stay held meanwhile.
 
-_HELD: tuple[Table, ...] = ("held", "peers")
-
 logger = logging.getLogger("rr_actors")
 
 
@@ -134,12 +132,14 @@ async def give_up(node: Node, name: str, *, erase: bool = False) -> None:
         CatalogError: its catalog cannot be opened.
     """
     config, state_dir = node.config.registrar(name), Path(node.info.state_dir)
-    await node.dispatcher.workers.run(functools.partial(forget_held, config, state_dir, erase=erase))
+    await node.dispatcher.workers.run(forget, config, state_dir, "held")
     await node.retire(name)
+    # The peers stay until now: if the application was killed before, its next start finds the registrar dormant again.
+    await node.dispatcher.workers.run(functools.partial(forget, config, state_dir, "peers", erase=erase))
 
 
-def forget_held(config: RegistrarConfig, state_dir: Path, *, erase: bool = False) -> None:
-    """Delete the queries and peers of a registrar that nobody has open from its catalog. Blocks.
+def forget(config: RegistrarConfig, state_dir: Path, *tables: Table, erase: bool = False) -> None:
+    """Delete all rows of some tables from the catalog of a registrar that nobody has open. Blocks.
 
     Args:
         erase: remove the catalog from disk, too.
@@ -152,7 +152,7 @@ def forget_held(config: RegistrarConfig, state_dir: Path, *, erase: bool = False
     store = open_store(path, durability=durability, on_damage=config.on_damage, witness=witness)
     try:
         content = store.load()
-        store.commit([Drop(table, id) for table in _HELD for id in content[table]])
+        store.commit([Drop(table, id) for table in tables for id in content[table]])
     except BaseException:
         store.close()
         raise

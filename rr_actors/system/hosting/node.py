@@ -31,6 +31,7 @@ from rr_actors.base.errors import (
     UnknownRegistrar,
     shown,
 )
+from rr_actors.base.names import CLIENTS
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -285,12 +286,19 @@ class Node:
         with registrar.lock:
             catalog = registrar.whole()
             origins = {**catalog.by_origin, **catalog.notices_to}
-        for origin in origins:
-            entry = self.find(origin)
-            if entry is not None and entry.status is _GONE:
-                registrar.monitor.receive(Gone(origin), origin)
+        for origin in filter(self._is_gone, origins):
+            registrar.monitor.receive(Gone(origin), origin)
         registrar.serve()
         self.directory.publish(registrar_key(registrar.name), self.transport.address)
+
+    def _is_gone(self, registrar: str) -> bool:
+        entry = self.find(registrar)
+        if entry is not None:
+            return entry.status is _GONE
+        if not registrar.startswith(CLIENTS):
+            return False
+        # If an application is killed, its next start alone gives up its clients. Later ones find no catalog of them.
+        return not self.config.registrar(registrar).catalog_path(self.info.state_dir).exists()
 
     def close_registrar(self, name: str, status: Status | None, *, erase: bool = False) -> None:
         """Close a registrar, and write its status into the directory; None: write nothing."""
