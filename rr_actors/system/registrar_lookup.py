@@ -18,8 +18,6 @@ from rr_actors.storage.witness import Witness, tell_of_missing
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
 
-# The registrars of a running system, found and opened from one of its processes.
-
 
 def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object) -> Registrar:
     """Open a registrar in this process, and serve other processes. Not on the loop.
@@ -36,18 +34,12 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
         expected, got = "a RegistrarConfig", type(config).__name__
         text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
         raise ConfigError(text, file=None, key="config", expected=expected, got=got)
-    registrar = node.dispatcher.run(open_in(node, name, called(config, name)))
+    registrar = node.dispatcher.run(_open_in(node, name, called(config, name)))
     node.owner = owner
     return registrar
 
 
-async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
-    """Open a registrar in this process, and serve other processes. On the loop.
-
-    Raises:
-        NameTaken: the system has a registrar of this name, or will have one.
-        CatalogError: its catalog is locked, damaged or of another version.
-    """
+async def _open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
     entry = node.find(name)
     if entry is not None and entry.status in (Status.UP, Status.STARTING, Status.STOPPED):
         system = node.info.name

@@ -101,8 +101,7 @@ def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
 
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:
     """Return a registrar: its servers, its resources with their holders and dependencies, and the queries it holds."""
-    queries = registrar.queries()
-    resources = registrar.resources()
+    queries, resources = registrar.queries(), registrar.resources()
     depends: dict[str, list[str]] = {}
     for query in queries:
         if query.parent:
@@ -116,18 +115,8 @@ def describe_registrar(registrar: Registrar) -> dict[str, Any]:
 
 
 def _describe_resource(info: ResourceInfo, depends_on: list[str]) -> dict[str, Any]:
-    return {
-        "id": info.id,
-        "server": info.server,
-        "request": _plain(info.request),
-        "response": _plain(info.response),
-        "state": info.state,
-        "message": info.message,
-        "attempt": info.attempt,
-        "holders": list(info.holders),
-        "queries": list(info.queries),
-        "depends_on": depends_on,
-    }
+    lists = {"holders": list(info.holders), "queries": list(info.queries), "depends_on": depends_on}
+    return msgspec.to_builtins(info) | lists
 
 
 def _describe_query(query: Query) -> dict[str, Any]:
@@ -136,12 +125,8 @@ def _describe_query(query: Query) -> dict[str, Any]:
         "resource_id": query.resource_id,
         "origin": query.origin,
         "server": query.server_id,
-        "request": _plain(query.request),
-        "response": _plain(query.response),
+        "request": msgspec.to_builtins(query.request),
+        "response": msgspec.to_builtins(query.response),
         "state": str(query.state),
         "parent": query.parent,
     }
-
-
-def _plain(value: Any) -> Any:
-    return msgspec.to_builtins(value)

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, Self, cast
 
@@ -143,10 +143,10 @@ class System:
         config: SystemConfig | None = None,
     ) -> None:
         self.name = check_name(name, "system name")
-        self.root = root_of(root)
+        self.root = _root_of(root)
         self.state_dir = state_path(state_dir)
         self.config = system_config(config)
-        check_tree(self.root, self.root.id)
+        _check_tree(self.root, self.root.id)
         self._top = self.root.id  # the paths of this tree begin with it
         self._lock = threading.RLock()  # held by the thread that starts or stops the system
         self._starting: _Starting | None = None
@@ -784,28 +784,27 @@ def _free_top(id: str) -> str:
     return top
 
 
-# Trees: a Supervisor and all below it, checked before the system starts any of it.
+def _root_of(root: object) -> Supervisor:
+    """Return the root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists."""
+    if is_a(root, Supervisor):
+        return cast("Supervisor", root)
+    if not is_a(root, (list, tuple, Sequence)) or is_a(root, (str, bytes, range, memoryview)):
+        raise invalid("System", "root", "a Supervisor or a list of ChildSpecs", root)
+    children: list[ChildSpec | Supervisor] = []
+    with examined("System: root"):
+        for child in cast("Sequence[ChildSpec | Supervisor]", root):
+            if not is_a(child, (ChildSpec, Supervisor)):  # checked before the next: there may be a thousand million
+                raise invalid("System", "root", "ChildSpecs and Supervisors", child)
+            children.append(child)
+    return Supervisor(children)
 
 
-def root_of(root: object) -> Supervisor:
-    """Return the root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists.
-
-    Raises:
-        InvalidSpec: `root` is no Supervisor and no list of children.
-    """
-    return cast("Supervisor", root) if is_a(root, Supervisor) else Supervisor(_children(root))
-
-
-def check_tree(supervisor: Supervisor, path: str) -> None:
-    """Check that every child can be hosted, and that no two managers would have the same registrar, or a client's.
-
-    Raises:
-        InvalidSpec: a check fails; the error names the child and the field.
-    """
+def _check_tree(supervisor: Supervisor, path: str) -> None:
+    """Check that every child can be hosted, and that no two managers would have the same registrar, or a client's."""
     for spec in supervisor.child_specs:
         inner = spec.actor_class_or_manager
         if isinstance(inner, Supervisor):
-            check_tree(inner, f"{path}/{spec.id}")
+            _check_tree(inner, f"{path}/{spec.id}")
         else:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
     names = registrars_of(as_child_spec(supervisor), path)
@@ -815,17 +814,3 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
             text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
             raise InvalidSpec(text, field="id", expected=expected, got=name)
-
-
-def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
-    if not is_a(root, (list, tuple, Sequence)) or is_a(root, (str, bytes, range, memoryview)):
-        raise invalid("System", "root", "a Supervisor or a list of ChildSpecs", root)
-    with examined("System: root"):
-        return tuple(_each_child(root))
-
-
-def _each_child(root: object) -> Iterator[ChildSpec | Supervisor]:
-    for child in cast("Sequence[ChildSpec | Supervisor]", root):
-        if not is_a(child, (ChildSpec, Supervisor)):  # checked before the next: there may be a thousand million
-            raise invalid("System", "root", "ChildSpecs and Supervisors", child)
-        yield child
