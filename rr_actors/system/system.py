@@ -52,8 +52,8 @@ from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spe
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
 from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
-from rr_actors.system import dropped
 from rr_actors.system.console.console_server import Console
+from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.hosted import Hosted, check_hostable, prepare
@@ -69,7 +69,6 @@ from rr_actors.system.registrar_lookup import (
     registrar_in,
 )
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
-from rr_actors.system.termination import Termination, Told
 from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import (
     StateDir,
@@ -204,7 +203,7 @@ class System:
                 raise AlreadyStarted(text, id=self.name)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
-            dropped.wait_stopped(path, self.config.stop_timeout_s)
+            wait_stopped(path, self.config.stop_timeout_s)
             self._starting = starting
             try:
                 self._state = state = open_state_dir(path)
@@ -246,7 +245,7 @@ class System:
         if node is not None:
             what = f"system {self.name!r} in {self.state_dir}"
             place = Path(node.info.state_dir)
-            dropped.stop(what, place, self, self._stop_dropped(node), self.config.stop_timeout_s)
+            stop_dropped(what, place, self, self._stop_dropped(node), self.config.stop_timeout_s)
 
     async def _stop_dropped(self, node: Node) -> None:
         try:
@@ -259,7 +258,7 @@ class System:
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
         # The running parts hold the system weakly, so that a dropped system is noticed.
-        node = Node(info, self._top, on_event=dropped.weakly(self._publish))
+        node = Node(info, self._top, on_event=weakly(self._publish))
         self._node = node
         self._subscribers.attend(node)
         try:
@@ -278,10 +277,10 @@ class System:
                 node.directory.mark(registrar_key(name), Status.DORMANT)
             await give_up_clients(node, dormant)
             if self.config.console:
-                shut_down = dropped.weakly(self._shut_down)
+                shut_down = weakly(self._shut_down)
                 self._console = Console(self, node, self._subscribers, self._recordings, shut_down)
                 await self._console.open()
-            self._tree = prepare(node, SupervisorActor, self._top, dropped.weakly(self._tree_ended))
+            self._tree = prepare(node, SupervisorActor, self._top, weakly(self._tree_ended))
             await self._start_tree(self._tree)
         except BaseException:
             console, self._console, self._tree = self._console, None, None

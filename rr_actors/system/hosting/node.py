@@ -135,17 +135,13 @@ class Node:
             await steps.take_async("ending the server that processes are forked from", ending)
         finally:
             steps.take("closing the way to other processes' actors", self.hub.close)
-            steps.take("removing it", self._remove_hub)
-            await steps.take_async("closing what registrars need", self._close())
+            if remove_hub(self.hub) and hub() is None:
+                dead_letters.office.listener = None
+            self.owner = None
+            await self._close(steps)
         steps.end(f"{self.path}: not closed altogether")
 
-    def _remove_hub(self) -> None:
-        if remove_hub(self.hub) and hub() is None:
-            dead_letters.office.listener = None
-
-    async def _close(self) -> None:
-        self.owner = None
-        steps = Steps()
+    async def _close(self, steps: Steps) -> None:
         steps.take("sending what is recorded", self.recorder.close)
         steps.take("ending to look after the files", self.keeper.stop)
         for name in list(self.registrars):
@@ -158,7 +154,6 @@ class Node:
         finally:
             steps.take("closing the directory of names", self.directory.close)
             self.dispatcher.loop.call_soon(release)  # after the callbacks of the closed transports
-        steps.end(f"{self.path}: not closed altogether")
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Accept a link for a registrar or for the actors of this process."""
