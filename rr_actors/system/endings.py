@@ -23,8 +23,6 @@ logger = logging.getLogger("rr_actors")
 
 # Signals: by them an operating system, a container or a terminal tells a program to end.
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT)
-
 
 class Told(BaseException):
     """Raised in the main thread by the first signal, out of the call that waits."""
@@ -56,7 +54,7 @@ class Termination:
             raise UsageError(
                 f"{self._what}: only the main thread hears signals; call it there, or use start() and stop()"
             )
-        for number in SIGNALS:
+        for number in (signal.SIGTERM, signal.SIGINT):
             self._before[number] = signal.signal(number, self._hear)
         return self
 

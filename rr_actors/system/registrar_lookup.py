@@ -1,4 +1,7 @@
-"""The registrars of a system: how to find and open one, and the dormant ones, which nobody has open now."""
+"""The registrars of a system: how to find and open one, and the dormant ones.
+
+The process of a dormant registrar died, and nobody has opened it again. Its queries stay held meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,8 @@ from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.witness import Witness, tell_of_missing
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
+
+logger = logging.getLogger("rr_actors")
 
 
 def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object) -> Registrar:
@@ -70,11 +75,6 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
     if entry is None or entry.status in (Status.GONE, Status.DORMANT):
         raise node.directory.no_registrar(name)
     return RegistrarHandle(node, name, patient=patient, owner=owner)
-
-
-# Dormant registrars: their process died, and nobody has opened them again. Their queries stay held meanwhile.
-
-logger = logging.getLogger("rr_actors")
 
 
 def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:

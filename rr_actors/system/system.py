@@ -377,8 +377,8 @@ class System:
 
     async def _wind_up(self, node: Node, limit_s: float, steps: Steps) -> None:
         node.stopping = f"system {self.name!r} is being stopped"
-        hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
-        for name in reversed([name for name in node.registrars if name not in hosted_here]):
+        opened = [name for name, actor in node.registrars.items() if actor.on_failure is None]  # by no manager
+        for name in reversed(opened):
             await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
         if self._tree is not None and self._end is None:
             await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
@@ -472,19 +472,16 @@ class System:
             finally:
                 termination.awaited = False
                 report = self._end
-                self._stop_unless_hurried(termination)
+                try:
+                    self.stop()
+                except Unavailable:
+                    if not termination.again:
+                        raise
+                    logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
         if termination.told is None and report is not None and report.exception is not None:
             text = f"system {self.name!r}: its root supervisor has ended: {report.detail or report.reason}"
             raise SupervisionError(text) from report.exception
         return termination.told
-
-    def _stop_unless_hurried(self, termination: Termination) -> None:
-        try:
-            self.stop()
-        except Unavailable:
-            if not termination.again:
-                raise
-            logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the tree ends by itself (restart intensity, auto_shutdown), or the system is stopped.

@@ -38,14 +38,11 @@ def prepare(node: Node, cls: type[Any], path: str, on_exit: OnExit, *, once: boo
     """Return an actor of the class `cls` for this process, under `path`, which start() starts. On the loop.
 
     Args:
+        cls: a class that check_hostable() accepts.
         on_exit: called on the loop, once, when the actor has ended by itself. Not called if its start failed, or
             after stop().
         once: the actor is temporary: it is not started again when it has ended.
-
-    Raises:
-        InvalidSpec: the class cannot be hosted.
     """
-    check_hostable(cls, path)
     kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
     return kind(node, cls, path, on_exit, once=once)
 

@@ -171,10 +171,9 @@ class Node:
 
     def handle(self, registrar: str) -> HandleLine:
         """Return the line to a registrar of another process, for its handle. From any thread."""
-        line = self._handles.get(registrar)
-        if line is None:  # of the lines that several threads make at once, all take the first
-            line = self._handles.setdefault(registrar, HandleLine(self, registrar))
-        return line
+        if registrar not in self._handles:  # of the lines that several threads make at once, all take the first
+            self._handles.setdefault(registrar, HandleLine(self, registrar))
+        return self._handles[registrar]
 
     def ref(self, id: str, near: str = "") -> ActorRef[Any]:
         """Return a reference to a supervised actor of the system, found by the directory alone. From any thread.
