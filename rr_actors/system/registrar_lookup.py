@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import functools
 import logging
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, called
+from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
 from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
 from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
@@ -77,7 +78,7 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
     return RegistrarHandle(node, name, patient=patient, owner=owner)
 
 
-def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
+def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> list[str]:
     """Return the registrars whose catalog on disk holds or serves something, or cannot be read, and all of clients.
 
     Blocks.
@@ -87,9 +88,10 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
     """
     found: list[str] = []
     tell_of_missing(state_dir)
-    for catalog in sorted(state_dir.glob(f"*/{CATALOG_FILE}")):
-        name = catalog.parent.name
-        if name in except_for:
+    placed = {name: config.registrar(name).catalog_path(state_dir) for name in config.registrars}
+    others = set(state_dir.glob(f"*/{CATALOG_FILE}")) - {*placed.values()}
+    for name, catalog in sorted(({catalog.parent.name: catalog for catalog in others} | placed).items()):
+        if name in except_for or not os.path.exists(catalog):  # False, too, if it cannot be looked at
             continue
         try:
             rows = read_rows(catalog)

@@ -272,7 +272,7 @@ class System:
             spec = as_child_spec(self.root)
             in_tree = set(registrars_of(spec, self._top))
             Entries(node.directory).announce(spec, self._top)
-            dormant = await node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
+            dormant = await node.dispatcher.workers.run(left_behind, self.config, Path(info.state_dir), in_tree)
             for name in dormant:
                 node.directory.mark(registrar_key(name), Status.DORMANT)
             await give_up_clients(node, dormant)

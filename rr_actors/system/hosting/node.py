@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -292,7 +293,7 @@ class Node:
         if not registrar.startswith(CLIENTS):
             return False
         # If an application is killed, its next start alone gives up its clients. Later ones find no catalog of them.
-        return not self.config.registrar(registrar).catalog_path(self.info.state_dir).exists()
+        return not os.path.exists(self.config.registrar(registrar).catalog_path(self.info.state_dir))
 
     def close_registrar(self, name: str, status: Status | None, *, erase: bool = False) -> None:
         """Close a registrar, and write its status into the directory; None: write nothing."""
