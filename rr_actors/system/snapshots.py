@@ -24,12 +24,13 @@ def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
 
     One that does not answer has an "error" and no children.
     """
+    here = {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"}
     try:
         described = supervisor.describe()
     except _NO_ANSWER as error:
-        return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "error": str(error), "children": []}
+        return here | {"error": str(error), "children": []}
     children = [_describe_child(supervisor.path, child) for child in described["children"]]
-    return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"} | described | {"children": children}
+    return here | described | {"children": children}
 
 
 def _describe_child(above: str, child: dict[str, Any]) -> dict[str, Any]:

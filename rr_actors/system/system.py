@@ -82,9 +82,7 @@ from rr_actors.wire.name_service import (
 logger = logging.getLogger("rr_actors")
 
 _LOOK_S = 1.0
-
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
-
 
 _systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
 """The running systems of this process, by the real paths of their state directories."""
