@@ -1,13 +1,17 @@
-"""The registrars of a system: how to find and open one, and the dormant ones, which nobody has open now."""
+"""The registrars of a system: how to find and open one, and the dormant ones.
+
+The process of a dormant registrar died, and nobody has opened it again. Its queries stay held meanwhile.
+"""
 
 from __future__ import annotations
 
 import functools
 import logging
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, called
+from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
 from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
 from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
@@ -18,7 +22,7 @@ from rr_actors.storage.witness import Witness, tell_of_missing
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
 
-# The registrars of a running system, found and opened from one of its processes.
+logger = logging.getLogger("rr_actors")
 
 
 def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object) -> Registrar:
@@ -36,18 +40,12 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
         expected, got = "a RegistrarConfig", type(config).__name__
         text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
         raise ConfigError(text, file=None, key="config", expected=expected, got=got)
-    registrar = node.dispatcher.run(open_in(node, name, called(config, name)))
+    registrar = node.dispatcher.run(_open_in(node, name, called(config, name)))
     node.owner = owner
     return registrar
 
 
-async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
-    """Open a registrar in this process, and serve other processes. On the loop.
-
-    Raises:
-        NameTaken: the system has a registrar of this name, or will have one.
-        CatalogError: its catalog is locked, damaged or of another version.
-    """
+async def _open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
     entry = node.find(name)
     if entry is not None and entry.status in (Status.UP, Status.STARTING, Status.STOPPED):
         system = node.info.name
@@ -80,14 +78,7 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
     return RegistrarHandle(node, name, patient=patient, owner=owner)
 
 
-# Dormant registrars: their process died, and nobody has opened them again. Their queries stay held meanwhile.
-
-_HELD: tuple[Table, ...] = ("held", "peers")
-
-logger = logging.getLogger("rr_actors")
-
-
-def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
+def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> list[str]:
     """Return the registrars whose catalog on disk holds or serves something, or cannot be read, and all of clients.
 
     Blocks.
@@ -97,9 +88,10 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
     """
     found: list[str] = []
     tell_of_missing(state_dir)
-    for catalog in sorted(state_dir.glob(f"*/{CATALOG_FILE}")):
-        name = catalog.parent.name
-        if name in except_for:
+    placed = {name: config.registrar(name).catalog_path(state_dir) for name in config.registrars}
+    others = set(state_dir.glob(f"*/{CATALOG_FILE}")) - {*placed.values()}
+    for name, catalog in sorted(({catalog.parent.name: catalog for catalog in others} | placed).items()):
+        if name in except_for or not os.path.exists(catalog):  # False, too, if it cannot be looked at
             continue
         try:
             rows = read_rows(catalog)
@@ -134,12 +126,14 @@ async def give_up(node: Node, name: str, *, erase: bool = False) -> None:
         CatalogError: its catalog cannot be opened.
     """
     config, state_dir = node.config.registrar(name), Path(node.info.state_dir)
-    await node.dispatcher.workers.run(functools.partial(forget_held, config, state_dir, erase=erase))
+    await node.dispatcher.workers.run(forget, config, state_dir, "held")
     await node.retire(name)
+    # The peers stay until now: if the application was killed before, its next start finds the registrar dormant again.
+    await node.dispatcher.workers.run(functools.partial(forget, config, state_dir, "peers", erase=erase))
 
 
-def forget_held(config: RegistrarConfig, state_dir: Path, *, erase: bool = False) -> None:
-    """Delete the queries and peers of a registrar that nobody has open from its catalog. Blocks.
+def forget(config: RegistrarConfig, state_dir: Path, *tables: Table, erase: bool = False) -> None:
+    """Delete all rows of some tables from the catalog of a registrar that nobody has open. Blocks.
 
     Args:
         erase: remove the catalog from disk, too.
@@ -152,7 +146,7 @@ def forget_held(config: RegistrarConfig, state_dir: Path, *, erase: bool = False
     store = open_store(path, durability=durability, on_damage=config.on_damage, witness=witness)
     try:
         content = store.load()
-        store.commit([Drop(table, id) for table in _HELD for id in content[table]])
+        store.commit([Drop(table, id) for table in tables for id in content[table]])
     except BaseException:
         store.close()
         raise

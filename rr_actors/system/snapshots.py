@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+import pykka
 
 from rr_actors.base.errors import NotFound, RrError, shown
 from rr_actors.registrar.queries import Query, ResourceInfo
@@ -14,15 +15,22 @@ from rr_actors.system.hosting.node import Node
 from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Status
 
+_NO_ANSWER = (RrError, pykka.Timeout)
+"""What a supervisor raises that is stopped or being respawned, or whose process does not answer in time."""
+
 
 def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
-    """Return a supervisor and all below it: id, path, settings, and its children in the order of their start."""
+    """Return a supervisor and all below it: id, path, settings, and its children in the order of their start.
+
+    One that does not answer has an "error" and no children.
+    """
+    here = {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"}
     try:
         described = supervisor.describe()
-    except RrError as error:
-        return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "error": str(error), "children": []}
+    except _NO_ANSWER as error:
+        return here | {"error": str(error), "children": []}
     children = [_describe_child(supervisor.path, child) for child in described["children"]]
-    return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"} | described | {"children": children}
+    return here | described | {"children": children}
 
 
 def _describe_child(above: str, child: dict[str, Any]) -> dict[str, Any]:
@@ -47,7 +55,7 @@ def describe_at(place: SupervisorRef) -> dict[str, Any]:
         children: list[dict[str, Any]] = SupervisorRef(above).describe()["children"]
     except NotFound:
         raise
-    except RrError:  # the supervisor above does not answer either
+    except _NO_ANSWER:  # the supervisor above does not answer either
         return described
     for child in children:
         if child["id"] == id:
@@ -60,7 +68,8 @@ def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
     """Return the paths of all children of this id below a supervisor.
 
     Raises:
-        ActorUnavailable: a supervisor on the way is being respawned, so the children below it are not known.
+        ActorUnavailable, pykka.Timeout: a supervisor on the way is being respawned, or its process does not answer, so
+            the children below it are not known.
     """
     ahead, paths = [supervisor], list[str]()
     while ahead:
@@ -93,8 +102,7 @@ def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
 
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:
     """Return a registrar: its servers, its resources with their holders and dependencies, and the queries it holds."""
-    queries = registrar.queries()
-    resources = registrar.resources()
+    queries, resources = registrar.queries(), registrar.resources()
     depends: dict[str, list[str]] = {}
     for query in queries:
         if query.parent:
@@ -108,18 +116,8 @@ def describe_registrar(registrar: Registrar) -> dict[str, Any]:
 
 
 def _describe_resource(info: ResourceInfo, depends_on: list[str]) -> dict[str, Any]:
-    return {
-        "id": info.id,
-        "server": info.server,
-        "request": _plain(info.request),
-        "response": _plain(info.response),
-        "state": info.state,
-        "message": info.message,
-        "attempt": info.attempt,
-        "holders": list(info.holders),
-        "queries": list(info.queries),
-        "depends_on": depends_on,
-    }
+    lists = {"holders": list(info.holders), "queries": list(info.queries), "depends_on": depends_on}
+    return msgspec.to_builtins(info) | lists
 
 
 def _describe_query(query: Query) -> dict[str, Any]:
@@ -128,12 +126,8 @@ def _describe_query(query: Query) -> dict[str, Any]:
         "resource_id": query.resource_id,
         "origin": query.origin,
         "server": query.server_id,
-        "request": _plain(query.request),
-        "response": _plain(query.response),
+        "request": msgspec.to_builtins(query.request),
+        "response": msgspec.to_builtins(query.response),
         "state": str(query.state),
         "parent": query.parent,
     }
-
-
-def _plain(value: Any) -> Any:
-    return msgspec.to_builtins(value)

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, Self, cast
 
@@ -60,8 +60,8 @@ from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spe
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
 from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
-from rr_actors.system import dropped
 from rr_actors.system.console.console_server import Console
+from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.hosted import Hosted, check_hostable, prepare
@@ -77,7 +77,6 @@ from rr_actors.system.registrar_lookup import (
     registrar_in,
 )
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
-from rr_actors.system.termination import Termination, Told
 from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import (
     StateDir,
@@ -91,9 +90,7 @@ from rr_actors.wire.name_service import (
 logger = logging.getLogger("rr_actors")
 
 _LOOK_S = 1.0
-
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
-
 
 _systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
 """The running systems of this process, by the real paths of their state directories."""
@@ -151,10 +148,10 @@ class System:
         config: SystemConfig | None = None,
     ) -> None:
         self.name = check_name(name, "system name")
-        self.root = root_of(root)
+        self.root = _root_of(root)
         self.state_dir = state_path(state_dir)
         self.config = system_config(config)
-        check_tree(self.root, self.root.id)
+        _check_tree(self.root, self.root.id)
         self._top = self.root.id  # the paths of this tree begin with it
         self._lock = threading.RLock()  # held by the thread that starts or stops the system
         self._starting: _Starting | None = None
@@ -212,7 +209,7 @@ class System:
                 raise AlreadyStarted(text, id=self.name)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
-            dropped.wait_stopped(path, self.config.stop_timeout_s)
+            wait_stopped(path, self.config.stop_timeout_s)
             self._starting = starting
             try:
                 self._state = state = open_state_dir(path)
@@ -254,7 +251,7 @@ class System:
         if node is not None:
             what = f"system {self.name!r} in {self.state_dir}"
             place = Path(node.info.state_dir)
-            dropped.stop(what, place, self, self._stop_dropped(node), self.config.stop_timeout_s)
+            stop_dropped(what, place, self, self._stop_dropped(node), self.config.stop_timeout_s)
 
     async def _stop_dropped(self, node: Node) -> None:
         try:
@@ -267,7 +264,7 @@ class System:
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
         # The running parts hold the system weakly, so that a dropped system is noticed.
-        node = Node(info, self._top, on_event=dropped.weakly(self._publish))
+        node = Node(info, self._top, on_event=weakly(self._publish))
         self._node = node
         self._subscribers.attend(node)
         try:
@@ -281,15 +278,15 @@ class System:
             spec = as_child_spec(self.root)
             in_tree = set(registrars_of(spec, self._top))
             Entries(node.directory).announce(spec, self._top)
-            dormant = await node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
+            dormant = await node.dispatcher.workers.run(left_behind, self.config, Path(info.state_dir), in_tree)
             for name in dormant:
                 node.directory.mark(registrar_key(name), Status.DORMANT)
             await give_up_clients(node, dormant)
             if self.config.console:
-                shut_down = dropped.weakly(self._shut_down)
+                shut_down = weakly(self._shut_down)
                 self._console = Console(self, node, self._subscribers, self._recordings, shut_down)
                 await self._console.open()
-            self._tree = prepare(node, SupervisorActor, self._top, dropped.weakly(self._tree_ended))
+            self._tree = prepare(node, SupervisorActor, self._top, weakly(self._tree_ended))
             await self._start_tree(self._tree)
         except BaseException:
             console, self._console, self._tree = self._console, None, None
@@ -386,8 +383,8 @@ class System:
 
     async def _wind_up(self, node: Node, limit_s: float, steps: Steps) -> None:
         node.stopping = f"system {self.name!r} is being stopped"
-        hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
-        for name in reversed([name for name in node.registrars if name not in hosted_here]):
+        opened = [name for name, actor in node.registrars.items() if actor.on_failure is None]  # by no manager
+        for name in reversed(opened):
             await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
         if self._tree is not None and self._end is None:
             await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
@@ -481,19 +478,16 @@ class System:
             finally:
                 termination.awaited = False
                 report = self._end
-                self._stop_unless_hurried(termination)
+                try:
+                    self.stop()
+                except Unavailable:
+                    if not termination.again:
+                        raise
+                    logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
         if termination.told is None and report is not None and report.exception is not None:
             text = f"system {self.name!r}: its root supervisor has ended: {report.detail or report.reason}"
             raise SupervisionError(text) from report.exception
         return termination.told
-
-    def _stop_unless_hurried(self, termination: Termination) -> None:
-        try:
-            self.stop()
-        except Unavailable:
-            if not termination.again:
-                raise
-            logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the tree ends by itself (restart intensity, auto_shutdown), or the system is stopped.
@@ -584,6 +578,7 @@ class System:
         Raises:
             NotFound: no child has this id, or several have it. The error has their paths.
             ActorUnavailable: a supervisor that may have the child is being respawned.
+            pykka.Timeout: the process of such a supervisor has not answered within 60 s.
         """
         path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
         supervisor = self._supervisor_ref(path)
@@ -625,13 +620,18 @@ class System:
     # -- looking -------------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the tree, and every registrar's resources, queries and dependencies, as plain data."""
+        """Return the tree, and every registrar's resources, queries and dependencies, as plain data.
+
+        A supervisor or registrar that does not answer has an "error" in the place of what it would say.
+        """
         node = self._running()
         registrars = describe_registrars(node)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:
         """Return a picture of the child at `path` and everything below it; without a path, of the whole tree.
+
+        A supervisor that does not answer is "unavailable" in it, and nothing below it is known.
 
         Raises:
             NotFound: there is nothing at that path.
@@ -786,28 +786,27 @@ def _free_top(id: str) -> str:
     return top
 
 
-# Trees: a Supervisor and all below it, checked before the system starts any of it.
+def _root_of(root: object) -> Supervisor:
+    """Return the root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists."""
+    if is_a(root, Supervisor):
+        return cast("Supervisor", root)
+    if not is_a(root, (list, tuple, Sequence)) or is_a(root, (str, bytes, range, memoryview)):
+        raise invalid("System", "root", "a Supervisor or a list of ChildSpecs", root)
+    children: list[ChildSpec | Supervisor] = []
+    with examined("System: root"):
+        for child in cast("Sequence[ChildSpec | Supervisor]", root):
+            if not is_a(child, (ChildSpec, Supervisor)):  # checked before the next: there may be a thousand million
+                raise invalid("System", "root", "ChildSpecs and Supervisors", child)
+            children.append(child)
+    return Supervisor(children)
 
 
-def root_of(root: object) -> Supervisor:
-    """Return the root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists.
-
-    Raises:
-        InvalidSpec: `root` is no Supervisor and no list of children.
-    """
-    return cast("Supervisor", root) if is_a(root, Supervisor) else Supervisor(_children(root))
-
-
-def check_tree(supervisor: Supervisor, path: str) -> None:
-    """Check that every child can be hosted, and that no two managers would have the same registrar, or a client's.
-
-    Raises:
-        InvalidSpec: a check fails; the error names the child and the field.
-    """
+def _check_tree(supervisor: Supervisor, path: str) -> None:
+    """Check that every child can be hosted, and that no two managers would have the same registrar, or a client's."""
     for spec in supervisor.child_specs:
         inner = spec.actor_class_or_manager
         if isinstance(inner, Supervisor):
-            check_tree(inner, f"{path}/{spec.id}")
+            _check_tree(inner, f"{path}/{spec.id}")
         else:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
     names = registrars_of(as_child_spec(supervisor), path)
@@ -817,17 +816,3 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
             text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
             raise InvalidSpec(text, field="id", expected=expected, got=name)
-
-
-def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
-    if not is_a(root, (list, tuple, Sequence)) or is_a(root, (str, bytes, range, memoryview)):
-        raise invalid("System", "root", "a Supervisor or a list of ChildSpecs", root)
-    with examined("System: root"):
-        return tuple(_each_child(root))
-
-
-def _each_child(root: object) -> Iterator[ChildSpec | Supervisor]:
-    for child in cast("Sequence[ChildSpec | Supervisor]", root):
-        if not is_a(child, (ChildSpec, Supervisor)):  # checked before the next: there may be a thousand million
-            raise invalid("System", "root", "ChildSpecs and Supervisors", child)
-        yield child

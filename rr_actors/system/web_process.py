@@ -6,6 +6,7 @@ import importlib.machinery
 import select
 import subprocess
 import sys
+import time
 from typing import Self
 
 from rr_actors.base.checks import Extra
@@ -16,8 +17,6 @@ _LIBRARIES = ("nicegui", "typer", "rich")
 """The libraries of the program. They are looked for and not imported here: only the page's process needs them."""
 _START_S = 60.0
 """Seconds that the page may take until it can be opened: a busy machine imports slowly."""
-
-
 _END_S = 5.0
 """Seconds that the program may take until it has ended, once it has closed its output."""
 
@@ -80,12 +79,17 @@ class WebPage:
         assert output is not None
         poll = select.poll()
         poll.register(output, select.POLLIN)
-        ready = poll.poll(_START_S * 1000)
-        line = output.readline().decode().strip() if ready else ""
-        if not line.startswith("http"):
+        until = time.monotonic() + _START_S
+        printed = b""
+        while b"\n" not in printed and poll.poll(max(0.0, until - time.monotonic()) * 1000):
+            if not (got := output.read(4096)):  # it has closed its output
+                break
+            printed += got
+        line, ended, _ = printed.decode(errors="replace").partition("\n")
+        if not ended or not line.startswith("http"):
             how = f"its first line is no address: {shown(line)}" if line else self._end()
             raise Unavailable(f"serve_web: the page did not start: {how}; its error output says why")
-        return line
+        return line.strip()
 
     def _end(self) -> str:
         """Say how the program, which prints nothing, has ended, if it has."""

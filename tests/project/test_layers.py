@@ -18,7 +18,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # Where each library may be imported: a file, or a folder ending in "/".
 PLACES = {
-    "pykka": ("actors/", "supervision/", "registrar/", "system/hosting/"),
+    "pykka": ("actors/", "supervision/", "registrar/", "system/hosting/", "system/snapshots.py"),
     "cloudpickle": ("base/pickling.py",),
     "multiprocessing": ("runtime/processes/fork_server.py", "runtime/processes/child_bootstrap.py"),
     "sqlite3": ("storage/",),

@@ -19,7 +19,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.model.rows import Held
+from rr_actors.registrar.model.rows import Held, Peer
+from rr_actors.storage.opening import read_rows
 from rr_actors.wire.name_service import Directory, Status, registrar_key
 from support import (
     LIMIT_S,
@@ -731,6 +732,47 @@ def test_release_gives_up_what_a_dormant_registrar_holds(start: Start, workshop:
     workshop.wait("unload wheel")
     eventually(lambda: holders(system) == {})
     assert list(system.dormant()) == []
+
+
+@pytest.mark.parametrize("location", ["disk2", "deep/down", "{outside}"])
+def test_a_dormant_registrar_has_its_own_name_wherever_its_catalog_is(
+    start: Start, workshop: Workshop, state_dir: Path, location: str
+) -> None:
+    location = location.format(outside=workshop.root)
+    opened = f"system.open_registrar('other', rr.RegistrarConfig(location={location!r}))"
+    run_and_be_killed(workshop, state_dir, f"{opened}.load('shop/thing', Order('wheel'))")
+    (state_dir / "shop").rename(state_dir / "disk1")
+    places = {"other": rr.RegistrarConfig(location=location), "shop": rr.RegistrarConfig(location="disk1")}
+    system = start(shop(workshop), config=rr.SystemConfig(registrars=places))
+    assert holders(system) == {"wheel": ["other"]}
+    assert system.dormant() == ["other"]
+
+    system.release("other")
+
+    workshop.wait("unload wheel")
+    eventually(lambda: holders(system) == {})
+    assert system.dormant() == []
+
+
+def test_a_release_that_a_kill_interrupts_can_be_made_again(start: Start, workshop: Workshop, state_dir: Path) -> None:
+    run_and_be_killed(workshop, state_dir, "system.open_registrar('other').load('shop/thing', Order('wheel'))")
+    body = """
+    from rr_actors.system.hosting.node import Node
+    Node.retire = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    system.release('other')
+    """
+    run_and_be_killed(workshop, state_dir, body)
+    system = start(shop(workshop))
+    assert holders(system) == {"wheel": ["other"]}
+    assert system.dormant() == ["other"]
+
+    system.release("other")
+
+    workshop.wait("unload wheel")
+    eventually(lambda: holders(system) == {})
+    assert system.dormant() == []
+    left = read_rows(state_dir / "other" / "catalog.sqlite3")
+    assert not any(isinstance(row, Held | Peer) for row in left)
 
 
 def test_a_whole_system_that_was_killed_comes_back_with_everything(

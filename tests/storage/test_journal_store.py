@@ -33,7 +33,7 @@ from rr_actors.storage.journaled_store import JournaledStore, Segment
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import SqliteStore
 from rr_actors.storage.store import Store
-from rr_actors.system.registrar_lookup import forget_held
+from rr_actors.system.registrar_lookup import forget
 from support import REPOSITORY
 from support_stores import belonging_to_another, in_order, part, query, segments_of
 
@@ -616,7 +616,7 @@ def test_what_a_dormant_registrar_holds_is_found_in_its_journal_and_forgotten_wi
     in_parts(store, [Put(Peer("hub")), Put(query("a"))], [Put(Peer("maker")), Put(query("b"))], [Drop("queries", "a")])
     copy = left_by(path, "app")
     store.close()
-    forget_held(RegistrarConfig("app"), copy.parent.parent)
+    forget(RegistrarConfig("app"), copy.parent.parent, "held", "peers")
     assert read_rows(copy) == [query("b")]
     assert names(copy) == ["catalog.lock", "catalog.sqlite3"]
 

@@ -8,9 +8,11 @@ import signal
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import pykka
 import pytest
 
 import rr_actors as rr
+from rr_actors.supervision.supervisor import SupervisorRef
 from support import eventually
 
 Start = Callable[..., rr.System]
@@ -145,6 +147,29 @@ def test_a_supervisor_that_cannot_be_asked_is_shown_as_such() -> None:
     data = {"id": "root", "path": "root", "type": "supervisor", "error": "is being respawned", "children": []}
 
     assert rr.render(data) == "root  supervisor  unavailable"
+
+
+def test_a_supervisor_whose_process_does_not_answer_is_shown_as_such(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs_spec = rr.Supervisor([rr.ChildSpec(Worker, id="w")], id="jobs", placement="process")
+    system = start(rr.ChildSpec(Worker, id="a"), jobs_spec)
+    pid = system.supervisor().which_child("jobs").pid
+    assert pid is not None
+    monkeypatch.setattr(SupervisorRef.__init__, "__kwdefaults__", {"timeout_s": 0.3})
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        _, jobs = system.snapshot()["tree"]["children"]
+        assert "no reply after 0.3 seconds" in jobs["error"]
+        assert jobs["children"] == []
+        assert "unavailable" in system.tree().render()
+        assert "unavailable" in system.tree("jobs").render()
+        states = {figure.labels["state"]: figure.value for figure in system.figures() if figure.name == "rr_children"}
+        assert states["unavailable"] == 1
+        with pytest.raises(pykka.Timeout):
+            system.ref("w")
+    finally:
+        os.kill(pid, signal.SIGCONT)
 
 
 def test_texts_are_escaped() -> None:

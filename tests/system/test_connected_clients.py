@@ -448,6 +448,26 @@ def test_what_a_killed_application_held_for_its_clients_is_released_at_its_next_
     assert list(state_dir.glob("client.*")) == []
 
 
+def test_what_a_client_held_is_released_by_a_provider_that_is_opened_after_the_next_start(
+    start: Start, state_dir: Path
+) -> None:
+    code = (
+        "import os, signal, sys, rr_actors as rr\n"
+        "system = rr.System(state_dir=sys.argv[1]).start()\n"
+        "system.open_registrar('provider').register_server('camera', lambda request: request, lambda *_: None)\n"
+        "rr.connect(sys.argv[1]).open_registrar('worker').load('provider/camera', 'front')\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    killed = subprocess.run([sys.executable, "-c", code, str(state_dir)], timeout=30, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    start().stop()  # it gives up the client, but its provider is not there
+    provider = start().open_registrar("provider")
+    camera = serve(provider, "camera")
+
+    eventually(lambda: provider.resources() == [])
+    assert len(camera.unloads) == 1
+
+
 def test_a_name_of_clients_is_refused_to_the_application(system: rr.System) -> None:
     with pytest.raises(InvalidName, match=r"registrar name .client.mine.: .*\(rr.connect\(\)\)") as raised:
         system.open_registrar("client.mine")

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 import rr_actors as rr
-from rr_actors.system.termination import Termination
+from rr_actors.system.endings import Termination
 from support import TEST_PATHS, Workshop, kill
 
 LIMIT_S = 40.0

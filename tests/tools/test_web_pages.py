@@ -388,7 +388,15 @@ def test_prometheus_reads_figures_with_the_token_in_a_header(shop: rr.System) ->
 # -- its life --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("prints", "said"), [("echo hello", "hello"), ("exec >&-", "prints nothing")])
+@pytest.mark.parametrize(
+    ("prints", "said"),
+    [
+        ("echo hello", "hello"),
+        ("exec >&-", "prints nothing"),
+        ("printf http://127", "no address: 'http://127'"),
+        ("printf http://127; exec >&-", "no address: 'http://127'"),
+    ],
+)
 def test_a_program_that_prints_no_address_is_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prints: str, said: str
 ) -> None:
@@ -396,6 +404,7 @@ def test_a_program_that_prints_no_address_is_ended(
     program.write_text(f"#!/bin/sh\n{prints}\nexec sleep 60\n")
     program.chmod(0o700)
     monkeypatch.setattr(sys, "executable", str(program))
+    monkeypatch.setattr(web_process, "_START_S", 5.0)
     monkeypatch.setattr(web_process, "_END_S", 0.2)
     began = time.monotonic()
     with pytest.raises(rr.Unavailable, match=said):

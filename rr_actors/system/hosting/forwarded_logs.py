@@ -16,6 +16,11 @@ EVENT = "log"
 
 _TEXT_LIMIT = 64 * 1024  # characters of a message, and of a traceback
 _FORMATTER = logging.Formatter()
+_AS_IT_IS = (
+    *("name", "levelno", "levelname", "created", "msecs", "relativeCreated", "thread", "threadName"),
+    *("pathname", "filename", "module", "lineno", "funcName"),
+)
+"""The attributes of a record that are sent unchanged."""
 
 
 class Forwarder(logging.Handler):
@@ -69,27 +74,14 @@ def take(event: dict[str, Any]) -> None:
 
 def _facts_of(record: logging.LogRecord, path: str) -> dict[str, Any]:
     trace = record.exc_text or (_FORMATTER.formatException(record.exc_info) if record.exc_info else None)
-    return {
+    return {key: getattr(record, key) for key in _AS_IT_IS} | {
         "event": EVENT,
-        "name": record.name,
-        "levelno": record.levelno,
-        "levelname": record.levelname,
         "msg": _cut(record.getMessage()),
         "args": None,
         "exc_text": None if trace is None else _cut(trace),
         "stack_info": None if record.stack_info is None else _cut(record.stack_info),
-        "created": record.created,
-        "msecs": record.msecs,
-        "relativeCreated": record.relativeCreated,
-        "pathname": record.pathname,
-        "filename": record.filename,
-        "module": record.module,
-        "lineno": record.lineno,
-        "funcName": record.funcName,
         "process": os.getpid(),
         "processName": path,
-        "thread": record.thread,
-        "threadName": record.threadName,
     }
 
 

@@ -38,14 +38,11 @@ def prepare(node: Node, cls: type[Any], path: str, on_exit: OnExit, *, once: boo
     """Return an actor of the class `cls` for this process, under `path`, which start() starts. On the loop.
 
     Args:
+        cls: a class that check_hostable() accepts.
         on_exit: called on the loop, once, when the actor has ended by itself. Not called if its start failed, or
             after stop().
         once: the actor is temporary: it is not started again when it has ended.
-
-    Raises:
-        InvalidSpec: the class cannot be hosted.
     """
-    check_hostable(cls, path)
     kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
     return kind(node, cls, path, on_exit, once=once)
 
@@ -124,7 +121,7 @@ class Hosted(abc.ABC):
         try:
             await wait_while_running(starting, timeout_s)
             if not starting.done():
-                await self._abandon_start(starting)
+                await self._end_now(starting, ExitReport("abnormal", "did not start"))
                 text = f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not"
                 if now := in_progress():
                     modules = ", ".join(map(repr, sorted(now)))
@@ -164,7 +161,11 @@ class Hosted(abc.ABC):
         finally:
             stopping.cancel()
         if not self._ended.done():
-            await self._give_up(f"had not stopped after shutdown_s={shutdown_s}")
+            why = f"had not stopped after shutdown_s={shutdown_s}"
+            if self._place.kill is None:
+                text = "%s %s: it runs in a thread of this process, which cannot be killed; abandoned"
+                logger.error(text, self.path, why)
+            await self._end_now(self._ended, ExitReport("killed", f"{why}; abandoned"))
         return self._ended.result()
 
     async def _come_to_end(self, *, final: bool) -> None:
@@ -195,20 +196,13 @@ class Hosted(abc.ABC):
     def _ask_to_stop(self, *, final: bool) -> None:
         """Ask the actor to stop. It calls `_end` at its end."""
 
-    async def _abandon_start(self, starting: asyncio.Future[Any]) -> None:
+    async def _end_now(self, end: asyncio.Future[Any], report: ExitReport) -> None:
+        """Kill the processes below the actor and wait for `end`; abandon an actor that has none."""
         if self._place.kill is None:
-            self._abandon(ExitReport("abnormal", "did not start"))
+            self._abandon(report)
         else:
             self._place.kill()
-            await asyncio.wait((starting,))
-
-    async def _give_up(self, why: str) -> None:
-        if self._place.kill is not None:
-            self._place.kill()
-            await asyncio.shield(self._ended)
-            return
-        logger.error("%s %s: it runs in a thread of this process, which cannot be killed; abandoned", self.path, why)
-        self._abandon(ExitReport("killed", f"{why}; abandoned"))
+            await asyncio.wait((end,))
 
     def _abandon(self, report: ExitReport) -> None:
         """Take an actor that does not stop out of its place. It ends when its thread returns from the user's code."""

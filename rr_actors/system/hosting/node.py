@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -31,7 +32,7 @@ from rr_actors.base.errors import (
     UnknownRegistrar,
     shown,
 )
-from rr_actors.base.names import new_id
+from rr_actors.base.names import CLIENTS, new_id
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -135,17 +136,13 @@ class Node:
             await steps.take_async("ending the server that processes are forked from", ending)
         finally:
             steps.take("closing the way to other processes' actors", self.hub.close)
-            steps.take("removing it", self._remove_hub)
-            await steps.take_async("closing what registrars need", self._close())
+            if remove_hub(self.hub) and hub() is None:
+                dead_letters.office.listener = None
+            self.owner = None
+            await self._close(steps)
         steps.end(f"{self.path}: not closed altogether")
 
-    def _remove_hub(self) -> None:
-        if remove_hub(self.hub) and hub() is None:
-            dead_letters.office.listener = None
-
-    async def _close(self) -> None:
-        self.owner = None
-        steps = Steps()
+    async def _close(self, steps: Steps) -> None:
         steps.take("sending what is recorded", self.recorder.close)
         steps.take("ending to look after the files", self.keeper.stop)
         for name in list(self.registrars):
@@ -158,7 +155,6 @@ class Node:
         finally:
             steps.take("closing the directory of names", self.directory.close)
             self.dispatcher.loop.call_soon(release)  # after the callbacks of the closed transports
-        steps.end(f"{self.path}: not closed altogether")
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Accept a link for a registrar or for the actors of this process."""
@@ -174,10 +170,9 @@ class Node:
 
     def handle(self, registrar: str) -> HandleLine:
         """Return the line to a registrar of another process, for its handle. From any thread."""
-        line = self._handles.get(registrar)
-        if line is None:  # of the lines that several threads make at once, all take the first
-            line = self._handles.setdefault(registrar, HandleLine(self, registrar))
-        return line
+        if registrar not in self._handles:  # of the lines that several threads make at once, all take the first
+            self._handles.setdefault(registrar, HandleLine(self, registrar))
+        return self._handles[registrar]
 
     def ref(self, id: str, near: str = "") -> ActorRef[Any]:
         """Return a reference to a supervised actor of the system, found by the directory alone. From any thread.
@@ -284,12 +279,19 @@ class Node:
         with registrar.lock:
             catalog = registrar.whole()
             origins = {**catalog.by_origin, **catalog.notices_to}
-        for origin in origins:
-            entry = self.find(origin)
-            if entry is not None and entry.status is _GONE:
-                registrar.monitor.receive(Gone(origin), origin)
+        for origin in filter(self._is_gone, origins):
+            registrar.monitor.receive(Gone(origin), origin)
         registrar.serve()
         self.directory.publish(registrar_key(registrar.name), self.transport.address)
+
+    def _is_gone(self, registrar: str) -> bool:
+        entry = self.find(registrar)
+        if entry is not None:
+            return entry.status is _GONE
+        if not registrar.startswith(CLIENTS):
+            return False
+        # If an application is killed, its next start alone gives up its clients. Later ones find no catalog of them.
+        return not os.path.exists(self.config.registrar(registrar).catalog_path(self.info.state_dir))
 
     def close_registrar(self, name: str, status: Status | None, *, erase: bool = False) -> None:
         """Close a registrar, and write its status into the directory; None: write nothing."""

@@ -18,18 +18,16 @@ from rr_actors.base.steps import Steps
 from rr_actors.wire.name_service import Directory
 from rr_actors.wire.unix_transport import UnixTransport
 
-# Watched: one byte that all processes of a system share. It says whether anybody watches the system's events.
-#
-# Most systems run unwatched. To send every load to the system's own process costs as much as a tenth of the load, so
-# nothing is sent then. All processes see a change of the byte at once, and read it without a system call.
-
 _NAME = "watched"
 _EVENTS, _MESSAGES = 1, 3
 """Values of the byte: send events; send events and messages."""
 
 
 class Watched:
-    """The byte of one running system, false at first. It is true while anybody wants events.
+    """One byte that all processes of a running system share, false at first. It is true while anybody wants events.
+
+    Most systems run unwatched. To send every load to the system's own process costs as much as a tenth of the load, so
+    nothing is sent then. All processes see a change of the byte at once, and read it without a system call.
 
     Args:
         run_dir: the system's StateDir.run_dir.
@@ -90,19 +88,17 @@ class Watched:
         self.level[0] = _MESSAGES if recording else _EVENTS if watched else 0
 
 
-# Keeper: looks after the files of a running system that a cleaner of temporary files, or a person, may remove.
-#
-# It makes removed files again, and logs that. It touches the others each hour, since most cleaners remove old files.
-
 LOOK_S = 5.0
 """Seconds from one check to the next."""
-_TOUCH_S = 3600.0
+_TOUCH_S = 3600.0  # most cleaners of temporary files remove old ones
 
 logger = logging.getLogger("rr_actors")
 
 
 class Keeper:
     """Looks after one process's names and socket, and the byte that all processes share. On the loop.
+
+    It makes removed files again, logs that, and touches the others each hour.
 
     Attributes:
         also: further checks, which the loop calls; they must be quick.
