@@ -218,7 +218,8 @@ class Segment:
         header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
         self._records = 0
-        self._fd = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
+        self._file = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
+        self._fd = self._file.fileno()
         try:
             self._size = checked_records.write_whole(self._fd, header + _CHECKSUM.pack(self._checksum), 0)
         except BaseException:
@@ -254,10 +255,9 @@ class Segment:
 
     def close(self) -> None:
         """Close the segment's descriptor. A second call does nothing."""
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            with contextlib.suppress(OSError):  # it is closed even so
-                os.close(fd)
+        self._fd = -1
+        with contextlib.suppress(OSError):  # it is closed even so
+            self._file.close()
 
 
 class Found(msgspec.Struct, frozen=True):

@@ -45,9 +45,6 @@ def make_files_private(folder: Folder, names: Iterable[str]) -> None:
             continue
         if found is None or not stat.S_IMODE(found.st_mode) & 0o077:
             continue
-        fd = folder.open(name)
-        try:
-            os.fchmod(fd, 0o600)
-        finally:
-            os.close(fd)
+        with folder.open(name) as file:
+            os.fchmod(file.fileno(), 0o600)
         _log.info("%s: mode %o tightened to 600", folder.path / name, stat.S_IMODE(found.st_mode))

@@ -266,8 +266,7 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
         with contextlib.suppress(FileNotFoundError):  # left by a crash
             folder.unlink(file.name)
-    fd = folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    try:
+    with folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
         with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
             connection.execute("PRAGMA synchronous = OFF")  # fsync once, below
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -276,9 +275,7 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
                 connection.execute(sql)
             connection.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
             connection.execute("PRAGMA journal_mode = WAL").fetchall()
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+        os.fsync(file.fileno())
     folder.rename(new.name, path.name)
     if durability == "power":
         os.fsync(folder.fd)
@@ -316,7 +313,7 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
         if left is not None and left.st_size > 0:
             damaged(path, f"no such file, but {wal.name}, which belongs to it")
         return NONE, content_of(())
-    with os.fdopen(folder.open(file.name), "rb") as header:
+    with folder.open(file.name) as header:
         _check_header(path, header.read(_HEADER_BYTES))
     # Without a -wal no process has the file open; with "immutable" SQLite makes no -wal of its own.
     uri = f"{path.as_uri()}?{'mode=ro' if left is not None else 'immutable=1'}"

@@ -59,12 +59,9 @@ class Witness:
             with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
                 if place.has(new):
                     place.unlink(new)
-                fd = place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-                try:
+                with place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
                     body = msgspec.json.encode(known)
-                    write_whole(fd, b"%08x %b\n" % (zlib.crc32(body), body), 0)
-                finally:
-                    os.close(fd)
+                    write_whole(file.fileno(), b"%08x %b\n" % (zlib.crc32(body), body), 0)
                 place.rename(new, self.registrar)
         except OSError as error:
             self._tell(error)

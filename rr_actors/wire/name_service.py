@@ -22,6 +22,7 @@ import errno
 import fcntl
 import functools
 import hashlib
+import io
 import itertools
 import logging
 import os
@@ -303,9 +304,9 @@ class StateDir:
         key: 32 secret bytes, new each time; only the system's own processes get them.
     """
 
-    def __init__(self, folder: Folder, lock: int) -> None:
+    def __init__(self, folder: Folder, lock: io.FileIO) -> None:
         self.path = folder.path
-        self.lock = lock
+        self._lock = lock
         self.key = os.urandom(_KEY_BYTES)
         self._folder = folder
         with _named_errors("use", self.path / "run"), folder.inner("run") as run:
@@ -322,26 +323,26 @@ class StateDir:
         Raises:
             CatalogLocked: another system has taken the lock already; both use the directory, and one must be stopped.
         """
-        if self.lock < 0:
+        if self._lock.closed:
             return
         found = self._folder.look(_LOCK)
-        if found is not None and os.path.samestat(found, os.fstat(self.lock)):
+        if found is not None and os.path.samestat(found, os.fstat(self._lock.fileno())):
             return
         _log.error("state directory %s: its lock, %s, was removed; it is taken again", self.path, _LOCK)
-        lost, self.lock = self.lock, _take_lock(self._folder)
-        os.close(lost)
+        lost, self._lock = self._lock, _take_lock(self._folder)
+        lost.close()
 
     def close(self) -> None:
         """Remove the files that only a running system needs, and release the lock. A second call does nothing.
 
         Each step is tried. The next start removes the files that cannot be removed now.
         """
-        if self.lock < 0:
+        if self._lock.closed:
             return
         steps = Steps()
         steps.take("removing what only a running system needs", self._clear)
         with contextlib.suppress(OSError):  # the pid in the file is only for people
-            os.ftruncate(self.lock, 0)
+            self._lock.truncate(0)
         steps.take("giving its lock back", self.forget)
         steps.end(f"state directory {self.path}: not closed altogether")
 
@@ -355,8 +356,7 @@ class StateDir:
 
     def forget(self) -> None:
         """Close the lock and the directories, and remove nothing. A forked child must not keep its parent's lock."""
-        lock, self.lock = self.lock, -1
-        os.close(lock)
+        self._lock.close()
         self._run.close()
         self._folder.close()
 
@@ -380,7 +380,7 @@ def open_state_dir(path: Path | str) -> StateDir:
         try:
             return StateDir(folder, lock)
         except BaseException:
-            os.close(lock)
+            lock.close()
             raise
     except BaseException:
         folder.close()
@@ -415,7 +415,7 @@ def _unusable(path: object, text: str, expected: object, got: object) -> ConfigE
     return ConfigError(f"state directory {text}", file=str(path), key="state_dir", expected=expected, got=got)
 
 
-def _take_lock(folder: Folder) -> int:
+def _take_lock(folder: Folder) -> io.FileIO:
     path = folder.path
     lock_path = path / _LOCK
     with _named_errors("write", lock_path):
@@ -423,11 +423,12 @@ def _take_lock(folder: Folder) -> int:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with _named_errors("write", lock_path):
-            os.ftruncate(lock, 0)
-            os.write(lock, b"%d\n" % os.getpid())
+            lock.truncate(0)
+            lock.write(b"%d\n" % os.getpid())
     except BlockingIOError as error:
-        pid = _pid_in(lock)
-        os.close(lock)
+        text = os.pread(lock.fileno(), 20, 0).strip()
+        pid = int(text) if text.isdigit() else None
+        lock.close()
         who = f"pid {pid}" if pid else "another process"
         instead = "stop that system or choose another state_dir"
         if pid == os.getpid():
@@ -439,14 +440,9 @@ def _take_lock(folder: Folder) -> int:
             pid=pid,
         ) from error
     except BaseException:
-        os.close(lock)
+        lock.close()
         raise
     return lock
-
-
-def _pid_in(lock: int) -> int | None:
-    text = os.pread(lock, 20, 0).strip()
-    return int(text) if text.isdigit() else None
 
 
 def _open_private(path: Path) -> Folder:
