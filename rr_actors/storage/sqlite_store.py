@@ -93,7 +93,7 @@ class SqliteStore:
             raise
         self.note(meta.folded)
         if witness is not None:
-            witness.note(Known(meta.id, meta.epoch, str(path)))
+            witness.note(Known(meta.id, meta.epoch, str(path)), synced=durability == "power")
         self._content: Content | None = content  # as read at the opening; None once returned or out of date
         self._wal = files_of(path)[1]  # SQLite fills it again from its beginning: its size is not that of its content
         self._pages = 0  # an estimate of the pages written since the last copy

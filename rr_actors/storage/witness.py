@@ -52,8 +52,8 @@ class Witness:
             self._tell(error)
             return None
 
-    def note(self, known: Known) -> None:
-        """Record that the catalog was opened."""
+    def note(self, known: Known, *, synced: bool = False) -> None:
+        """Record that the catalog was opened. `synced`: a power cut neither loses the record nor damages it."""
         new = f".{self.registrar}.new"
         try:
             with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
@@ -62,7 +62,12 @@ class Witness:
                 with place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
                     body = msgspec.json.encode(known)
                     write_whole(file.fileno(), b"%08x %b\n" % (zlib.crc32(body), body), 0)
+                    if synced:
+                        os.fsync(file.fileno())
                 place.rename(new, self.registrar)
+                if synced:
+                    os.fsync(place.fd)
+                    os.fsync(state.fd)
         except OSError as error:
             self._tell(error)
 
