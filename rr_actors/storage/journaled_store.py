@@ -295,7 +295,7 @@ class Found(msgspec.Struct, frozen=True):
             name = f"{segment_prefix(self.catalog)}{number}"
             if data is not None:
                 _check_owner(name, data, owner)
-            if data is None or (end is not None and _before(data) != end):
+            if data is None or (end is not None and End(*_HEADER.unpack_from(data)[4:6]) != end):
                 _log.warning(
                     "%s: %s: missing, or not what was written next; it and what came later is ignored: what was"
                     " committed since then is lost. A power cut may do that (with durability 'power' it does not), and"
@@ -391,10 +391,6 @@ def _check_owner(name: str, data: bytes, owner: Owner) -> None:
     id_, epoch = _HEADER.unpack_from(data)[1:3]
     if id_ != owner.id.encode().ljust(16, b"\0") or epoch < owner.epoch:
         raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
-
-
-def _before(data: bytes) -> End:
-    return End(*_HEADER.unpack_from(data)[4:6])
 
 
 def _read_records(data: bytes, changes: list[Change]) -> tuple[End, checked_records.Place]:

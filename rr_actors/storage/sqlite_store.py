@@ -201,28 +201,23 @@ class SqliteStore:
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
         """Close the store as the contract says. `settled`: whether the journal has no change of its own."""
         with self._tidying, errors_named(self.path):
-            self._close(erase=erase, settled=settled)
-
-    def _close(self, *, erase: bool, settled: bool) -> None:
-        self._closed = True
-        try:
+            self._closed = True
+            with self.folder:
+                try:
+                    if erase:
+                        with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
+                            self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+                    self._cursor.close()  # a failed statement in it would keep SQLite's files open
+                    self._connection.close()
+                    if erase:
+                        self._erase()
+                    elif settled and not self.folder.has(self._wal.name):
+                        self._lock.note(None)
+                finally:
+                    self._lock.release(remove=erase)
             if erase:
-                with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
-                    self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-            self._cursor.close()  # a failed statement in it would keep SQLite's files open
-            self._connection.close()
-            if erase:
-                self._erase()
-            elif settled and not self.folder.has(self._wal.name):
-                self._lock.note(None)
-        finally:
-            try:
-                self._lock.release(remove=erase)
-            finally:
-                self.folder.close()
-        if erase:
-            with contextlib.suppress(OSError):  # something else is in the directory
-                self.path.parent.rmdir()
+                with contextlib.suppress(OSError):  # something else is in the directory
+                    self.path.parent.rmdir()
 
     def _erase(self) -> None:
         self._lock.note(None)  # a noted catalog without its file would count as damaged

@@ -284,3 +284,14 @@ def test_a_power_cut_leaves_the_record_of_a_catalog_for_which_commits_survive_it
     shutil.copytree(older, path.parent)
     opened(path, "power").close()
     assert "it was put back from an older copy" in caplog.text
+
+
+def test_records_that_cannot_be_reached_are_told_of_and_hold_up_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / ".catalogs").write_bytes(b"something else")
+    witness = Witness(tmp_path, "app")
+    for use in (witness.known, lambda: witness.note(Known("id", 1, "/nowhere")), witness.forget):
+        assert use() is None
+        assert "cannot be read or written" in caplog.text
+        caplog.clear()
