@@ -56,9 +56,7 @@ def check_number(
     """Check that the value is a finite number from `least` to `most`; `also` names an alternative, for the error."""
     expected = f"a number of at least {least:g}" if most is None else f"a number from {least:g} to {most:g}"
     expected += also
-    if not is_number(value):
-        raise invalid(who, field, expected, value)
-    if value < least or (most is not None and value > most):
+    if not is_number(value) or value < least or (most is not None and value > most):
         raise invalid(who, field, expected, value)
 
 

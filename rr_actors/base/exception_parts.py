@@ -8,6 +8,7 @@ base. If the remade exception has another text, it gets a subclass with the orig
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any, NamedTuple, cast
@@ -71,14 +72,12 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
         except Exception:
             return b""
 
-    def own_part() -> bytes:
-        try:
-            return dumps(error.__reduce_ex__(4))
-        except Exception:
-            return b""
-
     made = type(error)
     origin: type[BaseException] = vars(made).get(_ORIGIN, made)
+    own = b""
+    if _reduces_itself(origin):
+        with contextlib.suppress(Exception):
+            own = dumps(error.__reduce_ex__(4))
     above = _up_to_pythons_own(origin)
     classes = [part(cls) for cls in above]
     pythons_own: Any = above[-1]
@@ -88,7 +87,7 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
         name=made.__qualname__,
         classes=tuple(blob for blob in classes if blob),
         args=tuple(part(arg) or shown(arg) for arg in args),
-        own=own_part() if _reduces_itself(origin) else b"",
+        own=own,
         attributes={name: blob for name, blob in attributes.items() if blob},
         cause=b"" if error.__cause__ is None else part(error.__cause__),
         suppress_context=error.__suppress_context__,

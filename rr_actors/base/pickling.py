@@ -107,8 +107,7 @@ def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
         return file.getvalue()
 
 
-def _dumps_part(value: object) -> bytes:
-    return _dumps_by_value(value, resolve=False)
+_dumps_part = functools.partial(_dumps_by_value, resolve=False)
 
 
 def _made_of(parts: exception_parts.Parts) -> BaseException:
@@ -136,10 +135,11 @@ class _Pickler(_CloudPickler):
             return reduced  # by reference
         if isinstance(obj, types.FunctionType):
             if self.resolve:
-                _resolve_function(obj, reduced[2][1])
+                _resolve(reduced[2][1], obj.__globals__, lambda: inspect.getclosurevars(obj).nonlocals)
         elif isinstance(obj, type):
-            if self.resolve:
-                _resolve_class(obj, reduced[2][0])
+            module = sys.modules.get(obj.__module__)
+            if self.resolve and module is not None:
+                _resolve(reduced[2][0], vars(module), lambda: vars(obj))
             return _adapt_class(obj, reduced)
         return reduced
 
@@ -220,30 +220,18 @@ def _set_class_state(cls: type, state: tuple[Any, ...]) -> None:
 # -- annotations ---------------------------------------------------------------------------------------------------
 
 
-def _resolve_function(function: types.FunctionType, attributes: dict[str, Any]) -> None:
+def _resolve(attributes: dict[str, Any], names: Mapping[str, Any], inner: Callable[[], Mapping[str, Any]]) -> None:
+    """Replace text in the annotations among the attributes by the type that it names, if that type can be found."""
     annotations: dict[str, Any] = attributes.get("__annotations__") or {}
-    if annotations:
-        closure = inspect.getclosurevars(function).nonlocals
-        attributes["__annotations__"] = _resolved(annotations, function.__globals__, closure)
-
-
-def _resolve_class(cls: type, attributes: dict[str, Any]) -> None:
-    annotations: dict[str, Any] = attributes.get("__annotations__") or {}
-    module = sys.modules.get(cls.__module__)
-    if annotations and module is not None:
-        attributes["__annotations__"] = _resolved(annotations, vars(module), vars(cls))
-
-
-def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the annotations, with text replaced by the type that it names, if that type can be found."""
-    found = dict(annotations)
-    names, inner = dict(names), dict(inner)  # eval writes to them
+    if not annotations:
+        return
+    attributes["__annotations__"] = found = dict(annotations)
+    scopes = dict(names), dict(inner())  # eval writes to them
     for key, annotation in annotations.items():
         if not isinstance(annotation, type):
             alone = type("Alone", (), {"__annotations__": {key: annotation}})
             with contextlib.suppress(Exception):  # a name under TYPE_CHECKING, for instance
-                found[key] = typing.get_type_hints(alone, names, inner, include_extras=True)[key]
-    return found
+                found[key] = typing.get_type_hints(alone, *scopes, include_extras=True)[key]
 
 
 _BOUNDS = [name for name in dir(msgspec.Meta) if not name.startswith("_")]

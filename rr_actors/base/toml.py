@@ -84,25 +84,20 @@ def parse_toml(data: bytes, file: str) -> dict[str, Any]:
             whole number that does not fit into 64 bits. `.file`, `.expected`, `.got`
     """
     try:
-        return _parsed(data)
-    except ValueError as error:
+        table = msgspec.toml.decode(data.decode())
+        _check_integers(table)
+        return table
+    except (ValueError, RecursionError) as error:
         lines = len(data.splitlines()) or 1
         problem = str(error).replace("(at end of document)", f"(at line {lines}, end of the file)")
+        if isinstance(error, RecursionError):
+            problem = "nested too deeply"
+        elif isinstance(error, UnicodeDecodeError):
+            line = data[: error.start].count(b"\n") + 1
+            problem = f"not UTF-8 text (at line {line})"
         raise ConfigError(
             f"{file}: not valid TOML: {problem}", file=file, key=None, expected="valid TOML", got=problem
         ) from error
-
-
-def _parsed(data: bytes) -> dict[str, Any]:
-    try:
-        table = msgspec.toml.decode(data.decode())
-        _check_integers(table)
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise ValueError(f"not UTF-8 text (at line {line})") from error
-    except RecursionError as error:
-        raise ValueError("nested too deeply") from error
-    return table
 
 
 def _check_integers(value: object) -> None:
