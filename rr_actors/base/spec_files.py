@@ -34,6 +34,7 @@ from rr_actors.base.toml import check_keys, file_name, parse_toml, read_toml, wr
 
 FilePath = str | os.PathLike[str]
 _T = TypeVar("_T")
+_ACTOR = "actor_class_or_manager"  # ChildSpec's field for the key `actor`
 
 
 def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], backoff: type[Any]) -> _T:
@@ -63,17 +64,14 @@ class _Reader:
         if not isinstance(children, list):
             raise wrong(self.file, f"{key}children", "a list of tables, [[children]]", children)
         entries = enumerate(cast("list[object]", children))
-        made = [self._entry(f"{key}children[{index}]", entry) for index, entry in entries]
+        made = [self.child_at(f"{key}children[{index}].", entry) for index, entry in entries]
         return self._make(self.supervisor, key, {**table, "children": made})
 
-    def _entry(self, key: str, table: object) -> Any:
-        if not isinstance(table, dict):
-            raise wrong(self.file, key, "a table", table)
-        return self.child_at(f"{key}.", cast("dict[str, Any]", table))
-
-    def child_at(self, key: str, table: Mapping[str, Any]) -> Any:
+    def child_at(self, key: str, table: object) -> Any:
         """Make the child or supervisor in a table; `key` is the prefix of the table's keys, "children[0]."."""
-        fields = dict(table)
+        if not isinstance(table, dict):
+            raise wrong(self.file, key.rstrip("."), "a table", table)
+        fields = dict(cast("dict[str, Any]", table))
         if ("children" in fields) == ("actor" in fields):
             got = "both" if "actor" in fields else "neither"
             raise wrong(self.file, key.rstrip("."), "either actor = 'module:class' or children", got, said=got)
@@ -109,18 +107,11 @@ class _Reader:
     def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
         self.check_keys(cls, key, fields)
         try:
-            return cls(**{_in_python(name): value for name, value in fields.items()})
+            return cls(**{_ACTOR if name == "actor" else name: value for name, value in fields.items()})
         except InvalidSpec as error:
             details = error.details
-            field = _in_file(details["field"])
-            raise wrong(self.file, f"{key}{field}", details["expected"], details["got"]) from error
-
-
-def _in_python(key: str) -> str:
-    """Return the name of the field that a key in a file stands for."""
-    return "actor_class_or_manager" if key == "actor" else key
+            raise wrong(self.file, key + _in_file(details["field"]), details["expected"], details["got"]) from error
 
 
 def _in_file(field: str) -> str:
-    """Return a field's name in a file."""
-    return "actor" if field == "actor_class_or_manager" else field
+    return "actor" if field == _ACTOR else field

@@ -97,6 +97,7 @@ class Entry(msgspec.Struct, frozen=True):
         return f": {self.why}" if self.why else ""
 
 
+_AWAY = (Status.GONE, Status.DORMANT)
 _MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
 _UP = Status.UP.value + ":"
 _UP_ONCE = Status.UP.value + " once:"
@@ -271,7 +272,8 @@ class Directory:
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """Return the error for an unknown registrar; it names the known ones, and the one that was probably meant."""
         entry = self.lookup(_REGISTRAR + name)
-        known = [other for other in self.registrars() if _is_there(self.lookup(_REGISTRAR + other))]
+        entries = {other: self.lookup(_REGISTRAR + other) for other in self.registrars()}
+        known = [other for other, found in entries.items() if found and found.status not in _AWAY]
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
         what = "there is none of this name in the system"
         if entry is not None and entry.status is Status.GONE and entry.why:
@@ -289,10 +291,6 @@ def _joined(classes: Sequence[str]) -> str:
             break
         text = f"{text},{name}" if text else name
     return text or "?"
-
-
-def _is_there(entry: Entry | None) -> bool:
-    return entry is not None and entry.status not in (Status.GONE, Status.DORMANT)
 
 
 class StateDir:
@@ -374,17 +372,19 @@ def open_state_dir(path: Path | str) -> StateDir:
         CatalogLocked: a living system has locked it; `.pid` is the process of that system.
         ConfigError: the directory cannot be written, belongs to another user, or is shared with other users.
     """
-    folder = _open_private(absolute_path(path))
-    try:
-        lock = _take_lock(folder)
-        try:
-            return StateDir(folder, lock)
-        except BaseException:
-            lock.close()
-            raise
-    except BaseException:
-        folder.close()
-        raise
+    path = absolute_path(path)
+    with _named_errors("use", path):
+        if path.exists() and not path.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a directory")
+        make_directories(path)
+        folder = Folder.at(path)
+    with contextlib.ExitStack() as if_not:
+        if_not.enter_context(folder)
+        _make_private(folder)
+        lock = if_not.enter_context(_take_lock(folder))
+        opened = StateDir(folder, lock)
+        if_not.pop_all()
+        return opened
 
 
 def absolute_path(path: Path | str) -> Path:
@@ -445,26 +445,8 @@ def _take_lock(folder: Folder) -> io.FileIO:
     return lock
 
 
-def _open_private(path: Path) -> Folder:
-    """Open the directory with mode 0700; create it if it does not exist.
-
-    Raises:
-        ConfigError: the directory cannot be opened, or is not this user's alone.
-    """
-    with _named_errors("use", path):
-        if path.exists() and not path.is_dir():
-            raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a directory")
-        make_directories(path)
-        folder = Folder.at(path)
-    try:
-        _tighten(folder)
-    except BaseException:
-        folder.close()
-        raise
-    return folder
-
-
-def _tighten(folder: Folder) -> None:
+def _make_private(folder: Folder) -> None:
+    """Give the directory mode 0700; refuse one that is not this user's alone."""
     path = folder.path
     try:
         mode = stat.S_IMODE(folder.check_owner().st_mode)

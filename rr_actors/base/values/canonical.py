@@ -302,7 +302,10 @@ def _refuse_value(value: object, what: str, error: Exception) -> NoReturn:
             path, got = what, "one that is nested too deeply"
             break
     else:
-        got = _describe(value, error)
+        try:
+            got = _described(value, error)
+        except Exception:
+            got = f"an object of type {name_of_class(type(value))}, whose own code raised {text_of(error)}"
     raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {got}", path=path) from error
 
 
@@ -335,13 +338,6 @@ def _each_part(value: object) -> Iterator[tuple[str, object]]:
     elif isinstance(value, (list, tuple, set, frozenset)):
         for index, item in enumerate(cast("list[object]", value)):
             yield f"[{index}]", item
-
-
-def _describe(value: Any, error: Exception) -> str:
-    try:
-        return _described(value, error)
-    except Exception:
-        return f"an object of type {name_of_class(type(cast('object', value)))}, whose own code raised {text_of(error)}"
 
 
 def _described(value: Any, error: Exception) -> str:
