@@ -19,11 +19,7 @@ from rr_actors.base.names import check_name
 
 @contextlib.contextmanager
 def examined(who: str) -> Generator[None, None, None]:
-    """Turn an error of a user's code, raised while the block examines a user's value, into an InvalidSpec.
-
-    Raises:
-        InvalidSpec: `.field` is `who`.
-    """
+    """Turn an error of a user's code, which the block runs to examine a user's value, into an InvalidSpec of `who`."""
     try:
         yield
     except RrError:

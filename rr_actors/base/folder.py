@@ -95,22 +95,14 @@ class Folder:
     # -- the directory itself ------------------------------------------------------------------------------------
 
     def check_owner(self) -> os.stat_result:
-        """Return the directory's stat result.
-
-        Raises:
-            NotOurs: the directory is another user's.
-        """
+        """Return the directory's stat result; raise NotOurs if it is another user's."""
         found = os.fstat(self.fd)
         if found.st_uid != self.owner:
             raise NotOurs(self.path, self.owner, found.st_uid)
         return found
 
     def tighten(self, mask: int) -> tuple[int, int]:
-        """Remove the rights in `mask` from the directory; return its mode before and after.
-
-        Raises:
-            NotOurs: the directory is another user's; it is not changed.
-        """
+        """Remove the rights in `mask` if check_owner() allows it; return the directory's mode before and after."""
         mode = stat.S_IMODE(self.check_owner().st_mode)
         if mode & mask:
             os.fchmod(self.fd, mode & ~mask)
@@ -121,11 +113,7 @@ class Folder:
         return os.fstat(self.fd).st_nlink > 0
 
     def inner(self, name: str) -> Folder:
-        """Open a directory in this one, with mode 0700. A missing directory is made.
-
-        Raises:
-            NotOurs: the inner directory is another user's; it is not changed.
-        """
+        """Open or make a directory in this one, with mode 0700; raise NotOurs and change nothing if it is not ours."""
         with contextlib.suppress(FileExistsError):
             os.mkdir(name, 0o700, dir_fd=self.fd)
         flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC

@@ -35,8 +35,7 @@ def wrong(
 def check_keys(table: Collection[str], known: Collection[str], file: str, prefix: str = "") -> None:
     """Check that each key of the table at `prefix` ("registrars.cameras.") is known.
 
-    Raises:
-        ConfigError: a key is unknown; the text has a similar known key. `.file`, `.key`, `.expected`, `.got`
+    The text of the ConfigError has a similar known key.
     """
     for key in table:
         if key not in known:
@@ -45,11 +44,7 @@ def check_keys(table: Collection[str], known: Collection[str], file: str, prefix
 
 
 def file_name(path: object) -> str:
-    """Return the path of a TOML file as text.
-
-    Raises:
-        ConfigError: `path` is no path.
-    """
+    """Return the path of a TOML file as text; raise ConfigError if `path` is no path."""
     text = path_text(path)
     if text == "":
         raise wrong(None, "path", "the path of a TOML file", path)
@@ -57,11 +52,7 @@ def file_name(path: object) -> str:
 
 
 def read_toml(file: str) -> dict[str, Any]:
-    """Return the content of the TOML file at this path.
-
-    Raises:
-        ConfigError: the file cannot be read, or is refused by parse_toml(). `.file`, `.expected`, `.got`
-    """
+    """Return the content of the TOML file at this path; raise ConfigError if it cannot be read, or parsed."""
     try:
         data = Path(file).read_bytes()
     except (OSError, ValueError) as error:  # ValueError: no file has such a name
@@ -79,9 +70,8 @@ def read_toml(file: str) -> dict[str, Any]:
 def parse_toml(data: bytes, file: str) -> dict[str, Any]:
     """Decode the bytes of a TOML file called `file`.
 
-    Raises:
-        ConfigError: `data` is not UTF-8 text or not TOML (the error has the line), or is nested too deeply. Or it has a
-            whole number that does not fit into 64 bits. `.file`, `.expected`, `.got`
+    Raise ConfigError if they are not UTF-8 text or not TOML (the error has the line), are nested too deeply, or have a
+    whole number that does not fit into 64 bits.
     """
     try:
         table = msgspec.toml.decode(data.decode())

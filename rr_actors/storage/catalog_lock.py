@@ -68,11 +68,7 @@ class CatalogLock:
         self._write(os.getpid())
 
     def release(self, *, remove: bool = False) -> None:
-        """Release the lock; with `remove`, remove its file, too.
-
-        Raises:
-            OSError: the lock is released, but its file could not be removed.
-        """
+        """Release the lock, and with `remove` remove its file; the lock is released even if that raises an OSError."""
         _locks.discard(self)
         try:
             if remove:

@@ -232,12 +232,7 @@ class Segment:
         return End(self._records, self._checksum)
 
     def append(self, changes: Sequence[Change]) -> None:
-        """Write changes as one record.
-
-        Raises:
-            OSError: the record could not be written; the segment is as before.
-            OverflowError, UnicodeEncodeError: as JournaledStore.commit() describes.
-        """
+        """Write changes as one record, or write nothing and raise an OSError or an error of JournaledStore.commit()."""
         body = _encode([(TABLE_OF[type(c.row)], c.row) if type(c) is Put else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
             _check_lengths(changes)
@@ -335,8 +330,7 @@ def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Pl
 def read(folder: Folder, catalog: Path) -> Found:
     """Read the files of this catalog's journal; a segment that is removed during this is folded, and left out.
 
-    Raises:
-        Damage: a file with a segment's name is not a segment.
+    Raise Damage for a file that has a segment's name and is none.
     """
     found = Found(catalog, [], {})
     for name in segments_among(folder.names(), catalog):

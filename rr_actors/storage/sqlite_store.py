@@ -326,12 +326,9 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
 
 
 def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
-    """Check that a -wal belongs to the file that it is about to change: SQLite does not check that.
+    """Raise Damage if a -wal belongs to another file than it is about to change, which SQLite does not check.
 
     No process may have the file open.
-
-    Raises:
-        Damage: the file is another catalog's.
     """
     if folder.look(files_of(path)[1].name) is None:
         return

@@ -104,11 +104,7 @@ class FrameReader(Generic[T]):
 
 
 def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
-    """Return a message's frame.
-
-    Raises:
-        NotSerializable: it has no MessagePack form, or one longer than `limit`, which is the setting `key`.
-    """
+    """Return a message's frame; raise NotSerializable if it has none, or is longer than `limit`, the setting `key`."""
     try:
         body = _encode(message)
     except _NOT_ENCODED as error:

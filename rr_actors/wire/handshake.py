@@ -59,11 +59,7 @@ _decode_reply = msgspec.msgpack.Decoder(Welcomed | Refused).decode
 
 
 def check_key(key: bytes) -> bytes:
-    """Return a system's key if it has the right length.
-
-    Raises:
-        ConfigError: the key is shorter or longer.
-    """
+    """Return a system's key; raise ConfigError if it is shorter or longer than KEY_BYTES."""
     if len(key) != KEY_BYTES:
         raise ConfigError(f"a system's key has {KEY_BYTES} bytes, got {len(key)}", expected=KEY_BYTES, got=len(key))
     return key
@@ -175,11 +171,7 @@ class DiallerHandshake(_Handshake):
     """The side that connects. Once `done`, either `welcome` or `refusal` is set."""
 
     def __init__(self, key: bytes, hello: Hello) -> None:
-        """Make the handshake of a link.
-
-        Raises:
-            NotSerializable: the Hello is too long.
-        """
+        """Make the handshake of a link; raise NotSerializable if the Hello is too long."""
         super().__init__(key)
         self._hello = framed(hello, HELLO_LIMIT_BYTES, "names and paths are to be shorter")
         self._expected = b""

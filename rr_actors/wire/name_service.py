@@ -390,8 +390,7 @@ def open_state_dir(path: Path | str) -> StateDir:
 def absolute_path(path: Path | str) -> Path:
     """Return the real path of a state directory.
 
-    Raises:
-        ConfigError: the path is relative, and the current directory was removed; or it is longer than PATH_BYTES.
+    Raise ConfigError if it is relative to a current directory that was removed, or longer than PATH_BYTES.
     """
     try:
         absolute = Path(os.path.realpath(path))

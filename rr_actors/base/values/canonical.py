@@ -251,10 +251,9 @@ def _is_class(part: Any) -> bool:
 
 
 def _value_of(type_: Any, read: Any) -> Any:
-    """Return the value of a type that msgspec does not know (msgspec's dec_hook), in whose place `read` was read.
+    """Return the value of a type that msgspec does not know (its dec_hook), made of the plain value or mark `read`.
 
-    Raises:
-        TypeError, ValueError: `read`, a plain value or a mark, is not a value of the type.
+    Raise TypeError or ValueError if `read` is not a value of the type.
     """
     cls: Any = typing.get_origin(type_) or type_
     if issubclass(cls, Tagged):

@@ -161,11 +161,7 @@ def numpy_form(value: Any) -> tuple[int, list[Any]] | None:
 
 
 def numpy_value(code: int, plain: Any) -> Any:
-    """Return the array or scalar of this plain form.
-
-    Raises:
-        ValueError: numpy is not imported in this process, or the form is wrong.
-    """
+    """Return the array or scalar of this plain form; raise ValueError if it is wrong, or numpy is not imported here."""
     numpy: Any = sys.modules.get("numpy")
     if numpy is None:
         raise ValueError("a numpy value, where numpy is not imported: import it in the module of the callbacks")
@@ -194,11 +190,7 @@ def is_pydantic_model(cls: object) -> bool:
 
 
 def pydantic_form(model: Any) -> Any:
-    """Return the plain form of a pydantic model, from which its class makes an equal model.
-
-    Raises:
-        NoForm: the class does not, or the model has a set of several items.
-    """
+    """Return the plain form of a pydantic model; raise NoForm if its class may not make an equal model of that."""
     if _has_set(model.model_dump()):
         raise NoForm(f"a {type(model).__name__} with a set, whose JSON has no order: give it an rr.codec")
     cls: Any = model.__class__

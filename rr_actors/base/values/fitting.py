@@ -171,9 +171,7 @@ def bare(raw: bytes) -> bytes:
 def fit(node: Any, shape: Shape, path: str) -> Any:
     """Open each mark for which the shape declares a type, and return the tree.
 
-    Raises:
-        Unfit: this process cannot open a mark.
-        Exception: a mark is damaged.
+    Raise Unfit for a mark that this process cannot open, and any error for a damaged one.
     """
     if isinstance(shape, inspect.UnionType):
         shape = _chosen(shape, node)
