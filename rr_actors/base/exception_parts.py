@@ -23,25 +23,16 @@ Loads = Callable[[bytes], Any]
 
 
 class Parts(NamedTuple):
-    """The parts of an exception; bytes are pickles, b"" stands for a part that could not be pickled.
+    """The parts of an exception; bytes are pickles, b"" stands for a part that could not be pickled."""
 
-    Attributes:
-        name: the name of its class.
-        classes: its class and the bases, up to the first builtin class.
-        args: the arguments for that builtin class; text in the place of an argument that could not be pickled.
-        own: the result of the class's own `__reduce__`, if it has one that does not raise.
-        attributes: its `__dict__`, and the fields of the builtin class.
-        text: the result of str(); None if str() failed.
-    """
-
-    name: str
-    classes: tuple[bytes, ...]
-    args: tuple[bytes | str, ...]
-    own: bytes
-    attributes: dict[str, bytes]
+    name: str  # of its class
+    classes: tuple[bytes, ...]  # its class and the bases, up to the first builtin class
+    args: tuple[bytes | str, ...]  # for that builtin class; text in the place of what could not be pickled
+    own: bytes  # the result of the class's own `__reduce__`, if it has one that does not raise
+    attributes: dict[str, bytes]  # its `__dict__`, and the fields of the builtin class
     cause: bytes
     suppress_context: bool
-    text: str | None
+    text: str | None  # the result of str(); None if str() failed
 
 
 _ORIGIN = "__rr_made_from__"  # attribute of a class that was made here: the class it was made from

@@ -27,7 +27,7 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
 from rr_actors.storage import checked_records
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.sql_tables import net_of
+from rr_actors.storage.sql_tables import Meta, net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
 
 _AT_MOST = 100_000  # changes in the journal; with more, the committing thread folds them itself
@@ -129,10 +129,12 @@ class JournaledStore:
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
-        owner = Owner(self._tables.meta.id, self.epoch)
-        full = self._full  # a folding that ends now replaces the list; the tables have its last number by then
-        number = (full[-1].number if full else self._tables.meta.folded) + 1
-        segment = Segment(self._tables.folder, self.path, owner, number, self._end)
+        full, meta = (
+            self._full,
+            self._tables.meta,
+        )  # a folding that ends now replaces the list: so the meta row comes next
+        number = (full[-1].number if full else meta.folded) + 1
+        segment = Segment(self._tables.folder, self.path, meta, number, self._end)
         self._tables.note(number)
         return segment
 
@@ -184,13 +186,6 @@ _LONGEST = 10**9 - 1000  # bytes: about the longest row that SQLite takes
 _encode = msgspec.msgpack.Encoder().encode
 
 
-class Owner(msgspec.Struct, frozen=True, gc=False):
-    """The owner of a journal: the catalog's id, and how often the catalog had been opened."""
-
-    id: str
-    epoch: int
-
-
 class End(msgspec.Struct, frozen=True, gc=False):
     """The end of a segment: the number of its records, and the checksum of the last."""
 
@@ -203,6 +198,7 @@ class Segment:
 
     Args:
         folder, catalog: the catalog's directory, and its SQLite file there.
+        meta: the catalog's meta row.
         number: the segment's number. A file of that name is from a failed attempt, and is written over.
         before: the end of the segment before; any value if that is folded.
 
@@ -210,11 +206,11 @@ class Segment:
         OSError: the segment cannot be made; at most an empty file is left.
     """
 
-    def __init__(self, folder: Folder, catalog: Path, owner: Owner, number: int, before: End) -> None:
+    def __init__(self, folder: Folder, catalog: Path, meta: Meta, number: int, before: End) -> None:
         self.number = number
         self.name = f"{segment_prefix(catalog)}{number}"
         self._folder = folder
-        place = (owner.id.encode(), owner.epoch, number)
+        place = (meta.id.encode(), meta.epoch, number)
         header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
         self._records = 0
@@ -272,10 +268,11 @@ class Found(msgspec.Struct, frozen=True):
         later = (data for number, data in self.contents.items() if number > folded and data is not None)
         return max((_HEADER.unpack_from(data)[2] for data in later), default=0)
 
-    def since(self, folded: int, owner: Owner, begun: int = 0) -> list[Change]:
-        """Return the changes after segment `folded`, up to the first that is missing; log a warning about the rest.
+    def since(self, meta: Meta, begun: int = 0) -> list[Change]:
+        """Return the changes after those in the tables, up to the first that is missing; log a warning about the rest.
 
         Args:
+            meta: the meta row in the tables.
             begun: the last segment that is known to have been begun, even if its file is missing.
 
         Raises:
@@ -283,13 +280,13 @@ class Found(msgspec.Struct, frozen=True):
         """
         changes: list[Change] = []
         end: End | None = None
-        for number in range(folded + 1, max(self.last, begun) + 1):
+        for number in range(meta.folded + 1, max(self.last, begun) + 1):
             data = self.contents.get(number)
             if data is None and number == self.last > begun:
                 break  # begun, and nothing written to it
             name = f"{segment_prefix(self.catalog)}{number}"
             if data is not None:
-                _check_owner(name, data, owner)
+                _check_owner(name, data, meta)
             if data is None or (end is not None and End(*_HEADER.unpack_from(data)[4:6]) != end):
                 _log.warning(
                     "%s: %s: missing, or not what was written next; it and what came later is ignored: what was"
@@ -377,13 +374,13 @@ def _checked(name: str, number: int, data: bytes) -> bytes | None:
     return data
 
 
-def _check_owner(name: str, data: bytes, owner: Owner) -> None:
+def _check_owner(name: str, data: bytes, meta: Meta) -> None:
     """Check that a segment belongs to this catalog.
 
     A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the catalog's -wal.
     """
     id_, epoch = _HEADER.unpack_from(data)[1:3]
-    if id_ != owner.id.encode().ljust(16, b"\0") or epoch < owner.epoch:
+    if id_ != meta.id.encode().ljust(16, b"\0") or epoch < meta.epoch:
         raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
 
 

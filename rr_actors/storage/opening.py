@@ -23,7 +23,7 @@ from rr_actors.registrar.model.rows import Change, Content, Row, apply, content_
 from rr_actors.storage import journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
-from rr_actors.storage.journaled_store import JournaledStore, Owner
+from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness, missing_text
 
@@ -193,7 +193,7 @@ def _read(
             path,
             reached.number - meta.folded,
         )
-    changes = found.since(meta.folded, Owner(meta.id, meta.epoch), begun)
+    changes = found.since(meta, begun)
     apply(content, changes)
     last = max(found.last, begun, 0 if reached is None else reached.number)
     epoch = max(found.epoch_after(meta.folded), 0 if reached is None else reached.epoch)

@@ -195,11 +195,11 @@ class DiallerHandshake(_Handshake):
         return self._hello
 
     def _take_reply(self, block: bytes) -> bytes:
-        match _decode(_read_answer, block, "answer to Hello"):
-            case Welcome() as welcome:
-                self.welcome = welcome
-            case refusal:
-                self.refusal = refusal
+        answer = _decode(_read_answer, block, "answer to Hello")
+        if isinstance(answer, Welcome):
+            self.welcome = answer
+        else:
+            self.refusal = answer
         self.done = True
         return b""
 

@@ -34,19 +34,12 @@ class NoForm(TypeError):
 
 
 class Kind(msgspec.Struct, frozen=True):
-    """One builtin type that keeps its type without annotations.
+    """One builtin type that keeps its type without annotations."""
 
-    Attributes:
-        code: the code of the extension.
-        type: the class; exactly this one, no subclass.
-        plain: returns a value's plain form, which MessagePack can carry.
-        make: returns the value of a plain form. It may raise any error.
-    """
-
-    code: int
-    type: type
-    plain: Callable[[Any], Any]
-    make: Callable[[Any], Any]
+    code: int  # of the extension
+    type: type  # exactly this class, no subclass
+    plain: Callable[[Any], Any]  # returns a value's plain form, which MessagePack can carry
+    make: Callable[[Any], Any]  # returns the value of a plain form, or raises any error
 
 
 def _made_of(cls: Callable[..., Any], parts: Any) -> Callable[[Any], Any]:
@@ -229,15 +222,10 @@ class _OfAny(type):
 
 
 class Tagged(metaclass=_OfAny):
-    """A type in the place of a union of classes that msgspec cannot tell apart: bytes tell them apart by name.
+    """A type in the place of a union of classes that msgspec cannot tell apart: bytes tell them apart by name."""
 
-    Attributes:
-        classes: the classes by their names.
-        others: the type of the other values; None if the union has only classes.
-    """
-
-    classes: dict[str, Any]
-    others: Any
+    classes: dict[str, Any]  # by their names
+    others: Any  # the type of the other values; None if the union has only classes
 
 
 def is_known(cls: Any) -> bool:
