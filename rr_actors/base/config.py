@@ -144,8 +144,7 @@ class SystemConfig:
         table = _checked_table(table, _SYSTEM_RULES, file)
         defaults = {"durability": table.get("durability", "process")}
         return cls(
-            **table,
-            registrars={name: _registrar_of(name, entry, defaults, file) for name, entry in registrars.items()},
+            **table, registrars={name: _registrar_of(name, entry, defaults, file) for name, entry in registrars.items()}
         )
 
     def registrar(self, name: str) -> RegistrarConfig:

@@ -305,23 +305,16 @@ class Found(msgspec.Struct, frozen=True):
 def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Place) -> None:
     left = len(data) - end.at
     if checked_records.is_torn(data, end):
-        _log.warning(
-            "%s: %s: its last record is not whole (%d bytes from byte %d on), and ignored: its process died while it"
-            " wrote it, and nobody heard that it was written; or the file was cut off there later",
-            catalog,
-            name,
-            left,
-            end.at,
+        text = (
+            f"its last record is not whole ({left} bytes from byte {end.at} on), and ignored: its process died while it"
+            " wrote it, and nobody heard that it was written; or the file was cut off there later"
         )
     else:
-        _log.warning(
-            "%s: %s: wrong from byte %d on, and ignored from there: what was committed in these %d bytes, and later,"
-            " is lost. Compare it with a copy, and see whether the disk is good",
-            catalog,
-            name,
-            end.at,
-            left,
+        text = (
+            f"wrong from byte {end.at} on, and ignored from there: what was committed in these {left} bytes, and later,"
+            " is lost. Compare it with a copy, and see whether the disk is good"
         )
+    _log.warning("%s: %s: %s", catalog, name, text)
 
 
 def read(folder: Folder, catalog: Path) -> Found:

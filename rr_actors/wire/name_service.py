@@ -433,11 +433,7 @@ def _take_lock(folder: Folder) -> io.FileIO:
         if pid == os.getpid():
             who = f"a system of this same process (pid {pid})"
             instead = f"rr_actors.System.running({str(path)!r}) returns it; use it, or stop it first"
-        raise CatalogLocked(
-            f"state directory {path} is in use by {who}: {instead}",
-            path=str(path),
-            pid=pid,
-        ) from error
+        raise CatalogLocked(f"state directory {path} is in use by {who}: {instead}", path=str(path), pid=pid) from error
     except BaseException:
         lock.close()
         raise
