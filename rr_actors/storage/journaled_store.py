@@ -142,7 +142,12 @@ class JournaledStore:
         changes: list[Change] = []
         try:
             with self._lock:
-                self._end_segment()
+                segment = self._segment
+                if segment is not None and segment.end.records:
+                    self._end = segment.end
+                    self._full.append(segment)
+                    self._segment = None
+                    segment.close()
                 changes, self._pending = self._pending, []
             if changes:
                 self._tables.fold(net_of(changes), self._full[-1].number)
@@ -153,14 +158,6 @@ class JournaledStore:
         full, self._full = self._full, []
         for segment in full:
             segment.remove()
-
-    def _end_segment(self) -> None:
-        segment = self._segment
-        if segment is not None and segment.end.records:
-            self._end = segment.end
-            self._full.append(segment)
-            self._segment = None
-            segment.close()
 
 
 # -- the journal -------------------------------------------------------------------------------------------------------
@@ -286,7 +283,10 @@ class Found(msgspec.Struct, frozen=True):
                 break  # begun, and nothing written to it
             name = f"{segment_prefix(self.catalog)}{number}"
             if data is not None:
-                _check_owner(name, data, meta)
+                # A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the -wal.
+                id_, epoch = _HEADER.unpack_from(data)[1:3]
+                if id_ != meta.id.encode().ljust(16, b"\0") or epoch < meta.epoch:
+                    raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
             if data is None or (end is not None and End(*_HEADER.unpack_from(data)[4:6]) != end):
                 _log.warning(
                     "%s: %s: missing, or not what was written next; it and what came later is ignored: what was"
@@ -365,16 +365,6 @@ def _checked(name: str, number: int, data: bytes) -> bytes | None:
     if _HEADER.unpack(header)[3] != number or zlib.crc32(header[: -_CHECKSUM.size]) != _HEADER.unpack(header)[-1]:
         raise Damage(f"{name}, whose beginning is damaged, or another file's")
     return data
-
-
-def _check_owner(name: str, data: bytes, meta: Meta) -> None:
-    """Check that a segment belongs to this catalog.
-
-    A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the catalog's -wal.
-    """
-    id_, epoch = _HEADER.unpack_from(data)[1:3]
-    if id_ != meta.id.encode().ljust(16, b"\0") or epoch < meta.epoch:
-        raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
 
 
 def _read_records(data: bytes, changes: list[Change]) -> tuple[End, checked_records.Place]:
