@@ -314,7 +314,11 @@ def _is_too_deep(error: Exception) -> bool:
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
     if _instead_of(value) is not None or _refuses(value):
         return None  # the value's own error says more than an error about one of its parts
-    for name, part in _parts(value):
+    try:
+        parts = list(_each_part(value))
+    except Exception:  # of the value's own code
+        return None
+    for name, part in parts:
         if id(part) in above:
             continue  # it contains itself
         try:
@@ -332,14 +336,6 @@ def _refuses(value: object) -> bool:
     except Exception:
         return False
     return False
-
-
-def _parts(value: Any) -> list[tuple[str, object]]:
-    """Return the parts of a value; [] if its own code raises."""
-    try:
-        return list(_each_part(value))
-    except Exception:
-        return []
 
 
 def _each_part(value: Any) -> Iterator[tuple[str, object]]:

@@ -78,7 +78,7 @@ class _Handshake:
     """Collects the block of each step and hands it to the step; the two roles are below.
 
     Attributes:
-        rest: the bytes after the last block, once `done`; they belong to the link.
+        rest: the bytes that no step has taken yet; once `done`, they belong to the link.
     """
 
     _step: _Step
@@ -86,7 +86,6 @@ class _Handshake:
     def __init__(self, key: bytes) -> None:
         self._key = key
         self._nonce = os.urandom(_NONCE_BYTES)
-        self._buffer = b""
         self.done = False
         self.rest = b""
 
@@ -96,14 +95,11 @@ class _Handshake:
         Raises:
             Unavailable: the peer is not of this system, or breaks the protocol. Close the connection.
         """
-        self._buffer += data
+        self.rest += data
         reply = b""
         while not self.done and (size := self._block_size()) is not None:
-            block, self._buffer = self._buffer[:size], self._buffer[size:]
+            block, self.rest = self.rest[:size], self.rest[size:]
             reply += self._step.take(block)
-        if self.done:
-            self.rest += self._buffer
-            self._buffer = b""
         return reply
 
     @property
@@ -115,13 +111,13 @@ class _Handshake:
         """Return the length of the next block if all of it has arrived, else None."""
         size = self._step.size
         if not size:
-            if len(self._buffer) < _LENGTH.size:
+            if len(self.rest) < _LENGTH.size:
                 return None
-            length: int = _LENGTH.unpack_from(self._buffer)[0]
+            length: int = _LENGTH.unpack_from(self.rest)[0]
             if length > self._step.limit:
                 raise Unavailable(f"{self.waits_for} has {length} bytes, over the limit of {self._step.limit}")
             size = _LENGTH.size + length
-        return size if len(self._buffer) >= size else None
+        return size if len(self.rest) >= size else None
 
     def _mac(self, role: bytes, acceptor_nonce: bytes, dialler_nonce: bytes) -> bytes:
         text = _MAGIC + _LENGTH.pack(PROTOCOL) + role + acceptor_nonce + dialler_nonce

@@ -309,20 +309,16 @@ def _refuse_value(value: object, what: str, error: Exception) -> NoReturn:
 
 
 def _failing_part(value: object) -> tuple[str, object, Exception] | None:
-    for suffix, part in _parts(value):
+    try:
+        parts = list(_each_part(value))
+    except Exception:  # of the value's own code
+        return None
+    for suffix, part in parts:
         try:
             packed(part)
         except Exception as error:
             return suffix, part, error
     return None
-
-
-def _parts(value: object) -> list[tuple[str, object]]:
-    """Return the parts of a value; [] if its own code raises."""
-    try:
-        return list(_each_part(value))
-    except Exception:
-        return []
 
 
 def _each_part(value: object) -> Iterator[tuple[str, object]]:
