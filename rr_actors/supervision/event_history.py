@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.base.pictures.notebook import bundle, table
+from rr_actors.base.notebook import bundle, table
 
 logger = logging.getLogger("rr_actors.supervision")
 
