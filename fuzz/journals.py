@@ -29,8 +29,9 @@ from rr_actors.registrar.model.rows import (
 )
 from rr_actors.storage import checked_records, journaled_store
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.journaled_store import End, Owner, Segment
+from rr_actors.storage.journaled_store import End, Segment
 from rr_actors.storage.opening import open_store, read_rows
+from rr_actors.storage.sql_tables import Meta
 from rr_actors.storage.sqlite_store import read_catalog
 
 _Segments = list[bytes | None]
@@ -59,11 +60,11 @@ def _states() -> list[set[Row]]:
     return found
 
 
-def _written(folder: Folder, catalog: Path, owner: Owner) -> list[bytes]:
+def _written(folder: Folder, catalog: Path, meta: Meta) -> list[bytes]:
     found: list[bytes] = []
     end = End()
     for number, part in enumerate(_PARTS, 1):
-        segment = Segment(folder, catalog, owner, number, end)
+        segment = Segment(folder, catalog, meta, number, end)
         for changes in part:
             segment.append(changes)
         end = segment.end
@@ -152,8 +153,7 @@ def _prepare(directory: Path) -> Feed:
     empty = path.read_bytes()
     folder = Folder.at(place)
     meta, _ = read_catalog(folder, path)
-    owner = Owner(meta.id, meta.epoch)
-    good = _written(folder, path, owner)
+    good = _written(folder, path, meta)
     states = _states()
     folded_at = [sum(map(len, _PARTS[:n])) for n in range(len(_PARTS) + 1)]
 
@@ -173,7 +173,7 @@ def _prepare(directory: Path) -> Feed:
             if content is not None:
                 (place / f"catalog.journal.{number}").write_bytes(content)
         expected = None if forged else states[folded_at[folded] :]
-        _read(folder, path, owner, folded, states[folded_at[folded]], expected)
+        _read(folder, path, msgspec.structs.replace(meta, folded=folded), states[folded_at[folded]], expected)
         if first == 255:  # a hundred times as slow
             path.write_bytes(empty)
             _open(path, segments, None if forged else states)
@@ -181,12 +181,10 @@ def _prepare(directory: Path) -> Feed:
     return feed
 
 
-def _read(
-    folder: Folder, path: Path, owner: Owner, folded: int, base: set[Row], expected: list[set[Row]] | None
-) -> None:
+def _read(folder: Folder, path: Path, meta: Meta, base: set[Row], expected: list[set[Row]] | None) -> None:
     content = content_of(base)
     try:
-        apply(content, journaled_store.read(folder, path).since(folded, owner))
+        apply(content, journaled_store.read(folder, path).since(meta))
     except Damage:
         return
     rows = set(rows_of(content))

@@ -123,7 +123,7 @@ def _feed_handshake(data: bytes) -> None:
             assert type(error) is Unavailable
             refused = True
             break
-        assert side.done or len(cast("Any", side)._buffer) <= 4 + (handshake.REPLY_LIMIT_BYTES if known else 0) + 128
+        assert side.done or len(side.rest) <= 4 + (handshake.REPLY_LIMIT_BYTES if known else 0) + 128
     if side.done:
         assert known
         assert not refused

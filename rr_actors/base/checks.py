@@ -19,11 +19,7 @@ from rr_actors.base.names import check_name
 
 @contextlib.contextmanager
 def examined(who: str) -> Generator[None, None, None]:
-    """Turn an error of a user's code, raised while the block examines a user's value, into an InvalidSpec.
-
-    Raises:
-        InvalidSpec: `.field` is `who`.
-    """
+    """Turn an error of a user's code, which the block runs to examine a user's value, into an InvalidSpec of `who`."""
     try:
         yield
     except RrError:
@@ -56,9 +52,7 @@ def check_number(
     """Check that the value is a finite number from `least` to `most`; `also` names an alternative, for the error."""
     expected = f"a number of at least {least:g}" if most is None else f"a number from {least:g} to {most:g}"
     expected += also
-    if not is_number(value):
-        raise invalid(who, field, expected, value)
-    if value < least or (most is not None and value > most):
+    if not is_number(value) or value < least or (most is not None and value > most):
         raise invalid(who, field, expected, value)
 
 

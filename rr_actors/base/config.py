@@ -81,11 +81,7 @@ class RegistrarConfig:
 
 
 def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
-    """Return the configuration for the registrar `name`.
-
-    Raises:
-        ConfigError: `config` is another registrar's. `.key`, `.expected`, `.got`
-    """
+    """Return the configuration for the registrar `name`; raise ConfigError if `config` is another registrar's."""
     if config.name not in (name, _UNTITLED):
         expected = f"{name!r}, as the registrar is called, or none"
         raise wrong(None, "name", expected, config.name, where=type(config).__name__)
@@ -148,8 +144,7 @@ class SystemConfig:
         table = _checked_table(table, _SYSTEM_RULES, file)
         defaults = {"durability": table.get("durability", "process")}
         return cls(
-            **table,
-            registrars={name: _registrar_of(name, entry, defaults, file) for name, entry in registrars.items()},
+            **table, registrars={name: _registrar_of(name, entry, defaults, file) for name, entry in registrars.items()}
         )
 
     def registrar(self, name: str) -> RegistrarConfig:

@@ -8,6 +8,7 @@ base. If the remade exception has another text, it gets a subclass with the orig
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any, NamedTuple, cast
@@ -22,25 +23,16 @@ Loads = Callable[[bytes], Any]
 
 
 class Parts(NamedTuple):
-    """The parts of an exception; bytes are pickles, b"" stands for a part that could not be pickled.
+    """The parts of an exception; bytes are pickles, b"" stands for a part that could not be pickled."""
 
-    Attributes:
-        name: the name of its class.
-        classes: its class and the bases, up to the first builtin class.
-        args: the arguments for that builtin class; text in the place of an argument that could not be pickled.
-        own: the result of the class's own `__reduce__`, if it has one that does not raise.
-        attributes: its `__dict__`, and the fields of the builtin class.
-        text: the result of str(); None if str() failed.
-    """
-
-    name: str
-    classes: tuple[bytes, ...]
-    args: tuple[bytes | str, ...]
-    own: bytes
-    attributes: dict[str, bytes]
+    name: str  # of its class
+    classes: tuple[bytes, ...]  # its class and the bases, up to the first builtin class
+    args: tuple[bytes | str, ...]  # for that builtin class; text in the place of what could not be pickled
+    own: bytes  # the result of the class's own `__reduce__`, if it has one that does not raise
+    attributes: dict[str, bytes]  # its `__dict__`, and the fields of the builtin class
     cause: bytes
     suppress_context: bool
-    text: str | None
+    text: str | None  # the result of str(); None if str() failed
 
 
 _ORIGIN = "__rr_made_from__"  # attribute of a class that was made here: the class it was made from
@@ -71,14 +63,12 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
         except Exception:
             return b""
 
-    def own_part() -> bytes:
-        try:
-            return dumps(error.__reduce_ex__(4))
-        except Exception:
-            return b""
-
     made = type(error)
     origin: type[BaseException] = vars(made).get(_ORIGIN, made)
+    own = b""
+    if _reduces_itself(origin):
+        with contextlib.suppress(Exception):
+            own = dumps(error.__reduce_ex__(4))
     above = _up_to_pythons_own(origin)
     classes = [part(cls) for cls in above]
     pythons_own: Any = above[-1]
@@ -88,7 +78,7 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
         name=made.__qualname__,
         classes=tuple(blob for blob in classes if blob),
         args=tuple(part(arg) or shown(arg) for arg in args),
-        own=own_part() if _reduces_itself(origin) else b"",
+        own=own,
         attributes={name: blob for name, blob in attributes.items() if blob},
         cause=b"" if error.__cause__ is None else part(error.__cause__),
         suppress_context=error.__suppress_context__,

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import io
 import os
 import stat
 from pathlib import Path
@@ -93,22 +95,14 @@ class Folder:
     # -- the directory itself ------------------------------------------------------------------------------------
 
     def check_owner(self) -> os.stat_result:
-        """Return the directory's stat result.
-
-        Raises:
-            NotOurs: the directory is another user's.
-        """
+        """Return the directory's stat result; raise NotOurs if it is another user's."""
         found = os.fstat(self.fd)
         if found.st_uid != self.owner:
             raise NotOurs(self.path, self.owner, found.st_uid)
         return found
 
     def tighten(self, mask: int) -> tuple[int, int]:
-        """Remove the rights in `mask` from the directory; return its mode before and after.
-
-        Raises:
-            NotOurs: the directory is another user's; it is not changed.
-        """
+        """Remove the rights in `mask` if check_owner() allows it; return the directory's mode before and after."""
         mode = stat.S_IMODE(self.check_owner().st_mode)
         if mode & mask:
             os.fchmod(self.fd, mode & ~mask)
@@ -119,11 +113,7 @@ class Folder:
         return os.fstat(self.fd).st_nlink > 0
 
     def inner(self, name: str) -> Folder:
-        """Open a directory in this one, with mode 0700. A missing directory is made.
-
-        Raises:
-            NotOurs: the inner directory is another user's; it is not changed.
-        """
+        """Open or make a directory in this one, with mode 0700; raise NotOurs and change nothing if it is not ours."""
         with contextlib.suppress(FileExistsError):
             os.mkdir(name, 0o700, dir_fd=self.fd)
         flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -142,8 +132,8 @@ class Folder:
 
     # -- files ---------------------------------------------------------------------------------------------------
 
-    def open(self, name: str, flags: int = os.O_RDONLY) -> int:
-        """Open a file; return its descriptor. A new file has mode 0600. O_TRUNC empties the file after the checks.
+    def open(self, name: str, flags: int = os.O_RDONLY) -> io.FileIO:
+        """Open a file. A new file has mode 0600. O_TRUNC empties the file after the checks.
 
         Raises:
             NotAFile: the name belongs to a link, a pipe, a device, a directory or a file with several names; nothing is
@@ -153,25 +143,27 @@ class Folder:
         """
         self.look(name)
         safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # nonblocking: the file may have become a pipe by now
+        opening = functools.partial(os.open, mode=0o600, dir_fd=self.fd)
         try:
-            fd = os.open(name, (flags & ~os.O_TRUNC) | safe, 0o600, dir_fd=self.fd)
+            # One call, for which Python runs no instruction of its own: an interrupt finds no descriptor without owner.
+            file = next(map(io.FileIO, map(opening, (name,), ((flags & ~os.O_TRUNC) | safe,)), ("r+",)))
         except OSError as error:
             error.filename = str(self.path / name)
             raise
         try:
-            found = os.fstat(fd)
+            found = os.fstat(file.fileno())
             self._check(name, found)
             if flags & os.O_TRUNC and found.st_size:
-                os.ftruncate(fd, 0)
+                file.truncate(0)
         except BaseException:
-            os.close(fd)
+            file.close()
             raise
-        return fd
+        return file
 
     def read(self, name: str) -> bytes:
         """Return the content of a file, which open() opens and checks."""
-        with os.fdopen(self.open(name), "rb") as file:
-            return file.read()
+        with self.open(name) as file:
+            return file.readall()
 
     def look(self, name: str) -> os.stat_result | None:
         """Return a file's stat result, checked as by open(), without opening the file; None if there is no file."""

@@ -32,11 +32,7 @@ class ServerId(NamedTuple):
 
 
 def check_name(name: object, what: str = "name") -> str:
-    """Return `name` if it may name a registrar, server or child.
-
-    Raises:
-        InvalidName: the name breaks a rule, which the text states.
-    """
+    """Return `name` if it may name a registrar, server or child; raise InvalidName, with the rule, if not."""
     if not is_a(name, str):
         raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
     name = exact_text(cast("str", name))
@@ -49,11 +45,7 @@ def check_name(name: object, what: str = "name") -> str:
 
 
 def parse_server_id(text: object) -> ServerId:
-    """Split "registrar/server" into its two names.
-
-    Raises:
-        InvalidName: the text is not two valid names with one "/" between them.
-    """
+    """Split "registrar/server" into its two names; raise InvalidName if the text is anything else."""
     if not is_a(text, str):
         raise InvalidName(
             f"server id: expected a string 'registrar/server', got {type(text).__name__} ({shown(text)})", name=text

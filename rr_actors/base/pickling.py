@@ -38,7 +38,7 @@ from typing import Any, NoReturn, cast
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
-from rr_actors.base import exception_parts, immovable
+from rr_actors.base import exception_parts
 from rr_actors.base.errors import NotSerializable, shown, text_of
 from rr_actors.base.values.codecs import codec, codec_of
 
@@ -48,8 +48,9 @@ CUT_OFF = (EOFError, pickle.UnpicklingError)
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
 
-_NEEDLES = (b"__main__", *immovable.NEEDLES)
-"""A pickle that contains one of these is made again by cloudpickle, which is slower and handles more objects."""
+_NEEDLES = (b"__main__", b"multiprocessing.connection", b"asyncio.locks", b"asyncio.queues")
+"""A pickle that contains one of these is made again by cloudpickle, which is slower and handles more objects. Three are
+the modules of objects that plain pickle accepts, although they cannot leave their process."""
 
 
 def dumps(value: object, what: str = "value") -> bytes:
@@ -107,8 +108,7 @@ def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
         return file.getvalue()
 
 
-def _dumps_part(value: object) -> bytes:
-    return _dumps_by_value(value, resolve=False)
+_dumps_part = functools.partial(_dumps_by_value, resolve=False)
 
 
 def _made_of(parts: exception_parts.Parts) -> BaseException:
@@ -119,8 +119,10 @@ class _Pickler(_CloudPickler):
     resolve = True
 
     def reducer_override(self, obj: Any) -> Any:
-        if immovable.instead_of(obj) is not None:
-            raise TypeError(f"cannot pickle {immovable.name_of(obj)!r} object")
+        if _instead_of(obj) is not None:
+            cls = type(cast("object", obj))
+            name = cls.__qualname__ if cls.__module__ == "builtins" else f"{cls.__module__}.{cls.__qualname__}"
+            raise TypeError(f"cannot pickle {name!r} object")
         if obj is dataclasses.MISSING:
             return "MISSING"  # a copy would count as the default of a field that has no default
         if isinstance(obj, msgspec.Meta):
@@ -136,10 +138,11 @@ class _Pickler(_CloudPickler):
             return reduced  # by reference
         if isinstance(obj, types.FunctionType):
             if self.resolve:
-                _resolve_function(obj, reduced[2][1])
+                _resolve(reduced[2][1], obj.__globals__, lambda: inspect.getclosurevars(obj).nonlocals)
         elif isinstance(obj, type):
-            if self.resolve:
-                _resolve_class(obj, reduced[2][0])
+            module = sys.modules.get(obj.__module__)
+            if self.resolve and module is not None:
+                _resolve(reduced[2][0], vars(module), lambda: vars(obj))
             return _adapt_class(obj, reduced)
         return reduced
 
@@ -220,30 +223,18 @@ def _set_class_state(cls: type, state: tuple[Any, ...]) -> None:
 # -- annotations ---------------------------------------------------------------------------------------------------
 
 
-def _resolve_function(function: types.FunctionType, attributes: dict[str, Any]) -> None:
+def _resolve(attributes: dict[str, Any], names: Mapping[str, Any], inner: Callable[[], Mapping[str, Any]]) -> None:
+    """Replace text in the annotations among the attributes by the type that it names, if that type can be found."""
     annotations: dict[str, Any] = attributes.get("__annotations__") or {}
-    if annotations:
-        closure = inspect.getclosurevars(function).nonlocals
-        attributes["__annotations__"] = _resolved(annotations, function.__globals__, closure)
-
-
-def _resolve_class(cls: type, attributes: dict[str, Any]) -> None:
-    annotations: dict[str, Any] = attributes.get("__annotations__") or {}
-    module = sys.modules.get(cls.__module__)
-    if annotations and module is not None:
-        attributes["__annotations__"] = _resolved(annotations, vars(module), vars(cls))
-
-
-def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the annotations, with text replaced by the type that it names, if that type can be found."""
-    found = dict(annotations)
-    names, inner = dict(names), dict(inner)  # eval writes to them
+    if not annotations:
+        return
+    attributes["__annotations__"] = found = dict(annotations)
+    scopes = dict(names), dict(inner())  # eval writes to them
     for key, annotation in annotations.items():
         if not isinstance(annotation, type):
             alone = type("Alone", (), {"__annotations__": {key: annotation}})
             with contextlib.suppress(Exception):  # a name under TYPE_CHECKING, for instance
-                found[key] = typing.get_type_hints(alone, names, inner, include_extras=True)[key]
-    return found
+                found[key] = typing.get_type_hints(alone, *scopes, include_extras=True)[key]
 
 
 _BOUNDS = [name for name in dir(msgspec.Meta) if not name.startswith("_")]
@@ -308,7 +299,7 @@ def _refuse(value: object, what: str, error: Exception) -> NoReturn:
         problem = "nested too deeply"
     elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
         problem = text_of(error)
-    instead = immovable.instead_of(value)
+    instead = _instead_of(value)
     if instead is None:
         advice = "it has to travel to another process: pass plain data, and make such an object there"
     else:
@@ -321,9 +312,13 @@ def _is_too_deep(error: Exception) -> bool:
 
 
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
-    if immovable.instead_of(value) is not None or _refuses(value):
+    if _instead_of(value) is not None or _refuses(value):
         return None  # the value's own error says more than an error about one of its parts
-    for name, part in _parts(value):
+    try:
+        parts = list(_each_part(value))
+    except Exception:  # of the value's own code
+        return None
+    for name, part in parts:
         if id(part) in above:
             continue  # it contains itself
         try:
@@ -341,14 +336,6 @@ def _refuses(value: object) -> bool:
     except Exception:
         return False
     return False
-
-
-def _parts(value: Any) -> list[tuple[str, object]]:
-    """Return the parts of a value; [] if its own code raises."""
-    try:
-        return list(_each_part(value))
-    except Exception:
-        return []
 
 
 def _each_part(value: Any) -> Iterator[tuple[str, object]]:
@@ -394,3 +381,103 @@ def _attributes(names: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
     for name, part in names.items():
         if name not in _NOT_PICKLED and not isinstance(part, types.MemberDescriptorType):
             yield f"attribute {name!r}", part
+
+
+# -- objects that are of use in their own process only, and what to use instead -------------------------------------
+#
+# They hold a descriptor, a lock, a thread or a loop. Some can be pickled, as numbers and settings: the copy of a pipe's
+# end would close a descriptor of the receiver, and the copy of an asyncio.Event would never be set. Types are known by
+# name, so none of their modules has to be imported.
+
+_REPORT = "pass the reference of an actor (self.actor_ref) and tell it what you would send"
+_PIPE = f"{_REPORT}; messages between actors need no pipe"
+_QUEUE = f"{_REPORT}: an actor's mailbox is the queue"
+_LOCK = "let one actor own what the lock protects, and ask that actor"
+_EVENT = f"{_REPORT}; or watch for an actor's end with rr_actors.monitor"
+_SHARED = "let one actor own the value, and ask that actor; multiprocessing.shared_memory.SharedMemory may travel"
+_FUTURE = "send its result (.result(), .get()), or return the future's value from the handler"
+_FILE = "send the path and open it there, or send what you have read"
+_OPEN_THERE = "send what is needed to open it (an address, a path), and open it there"
+_PROCESS = "make what it runs a child of a supervisor (ChildSpec), and send that child's reference"
+_ACTOR = "send its reference (actor_ref)"
+_PLAIN_REF = (
+    "only references of rr_actors reach other processes: derive the actor from rr_actors.Actor, or make it a child "
+    "(ChildSpec) and send what system.ref(id) returns"
+)
+_LAZY = "send a list of what it yields"
+
+_INSTEAD: dict[str, str | None] = {
+    "_io.StringIO": None,
+    "_io.BytesIO": None,
+    "multiprocessing.connection._ConnectionBase": _PIPE,
+    "multiprocessing.connection.Listener": _OPEN_THERE,
+    "multiprocessing.queues.Queue": _QUEUE,
+    "multiprocessing.queues.SimpleQueue": _QUEUE,
+    "multiprocessing.synchronize.SemLock": _LOCK,
+    "multiprocessing.synchronize.Condition": _LOCK,
+    "multiprocessing.synchronize.Event": _EVENT,
+    "multiprocessing.sharedctypes.SynchronizedBase": _SHARED,
+    "multiprocessing.process.BaseProcess": _PROCESS,
+    "multiprocessing.pool.Pool": _PROCESS,
+    "_socket.socket": _OPEN_THERE,
+    "sqlite3.Connection": _OPEN_THERE,
+    "sqlite3.Cursor": _OPEN_THERE,
+    "subprocess.Popen": _PROCESS,
+    "mmap.mmap": _SHARED,
+    "_io._IOBase": _FILE,
+    "tempfile._TemporaryFileWrapper": _FILE,
+    "_thread.lock": _LOCK,
+    "_thread.RLock": _LOCK,
+    "threading.Condition": _LOCK,
+    "threading.Semaphore": _LOCK,
+    "threading.Barrier": _LOCK,
+    "threading.Event": _EVENT,
+    "threading.Thread": _PROCESS,
+    "queue.Queue": _QUEUE,
+    "_queue.SimpleQueue": _QUEUE,
+    "asyncio.locks.Lock": _LOCK,
+    "asyncio.locks.Condition": _LOCK,
+    "asyncio.locks.Semaphore": _LOCK,
+    "asyncio.locks.Barrier": _LOCK,
+    "asyncio.locks.Event": _EVENT,
+    "asyncio.queues.Queue": _QUEUE,
+    "_asyncio.Future": _FUTURE,
+    "asyncio.futures.Future": _FUTURE,
+    "concurrent.futures._base.Future": _FUTURE,
+    "concurrent.futures._base.Executor": _PROCESS,
+    "pykka._future.Future": _FUTURE,
+    "pykka._actor.Actor": _ACTOR,
+    "pykka._ref.ActorRef": _PLAIN_REF,
+    "builtins.generator": _LAZY,
+    "builtins.coroutine": "await it here, and send its result",
+}
+
+_STREAMS = ("stdin", "stdout", "stderr", "__stdin__", "__stdout__", "__stderr__")
+
+_known: weakref.WeakKeyDictionary[type, str | None] = weakref.WeakKeyDictionary()
+
+
+def _instead_of(value: object) -> str | None:
+    """Return what to use instead of `value`, if it cannot leave its process; None if it can."""
+    cls = type(value)
+    try:
+        hint = _known[cls]
+    except KeyError:
+        hint = _known[cls] = _hint(cls)
+    if hint is _FILE and any(value is getattr(sys, name, None) for name in _STREAMS):
+        return None  # travels as "the standard output of the process it comes to"
+    return hint
+
+
+def _hint(cls: type) -> str | None:
+    for base in cls.__mro__:
+        name = f"{base.__module__}.{base.__qualname__}"
+        if name in _INSTEAD:
+            return _INSTEAD[name]
+        if base.__module__ not in _MODULES and not _TAUGHT.isdisjoint(vars(base)):
+            return None  # this class has pickling code of its own
+    return None
+
+
+_TAUGHT = {"__reduce__", "__reduce_ex__", "__getstate__"}
+_MODULES = {name.rpartition(".")[0] for name in _INSTEAD} | {"socket", "builtins"}

@@ -50,11 +50,7 @@ class Steps:
             raise error
 
     def report(self, logger: logging.Logger, text: str) -> None:
-        """Log the errors of the steps, if no caller could handle them.
-
-        Raises:
-            BaseException: an interruption.
-        """
+        """Log the errors of the steps, if no caller could handle them; raise an interruption."""
         for error in self._errors:
             logger.error("%s: %s", text, "; ".join(error.__notes__), exc_info=error)
         if self._interruption is not None:

@@ -1,20 +1,24 @@
 """TOML: the one place that reads it. Every fault is a ConfigError, also a fault that the standard library accepts.
 
-The errors for wrong keys and values are made here, too, for files and for arguments.
+The errors for wrong keys and values are made here, too, for files and for arguments. The end reads supervision trees.
 
 msgspec imports the standard library's reader when the first file is read: most programs read none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import dataclasses
+import functools
+import importlib
+import os
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 
 from rr_actors.base.checks import path_text
-from rr_actors.base.errors import ConfigError, did_you_mean, shortened, shown
+from rr_actors.base.errors import ConfigError, InvalidSpec, did_you_mean, shortened, shown
 
 _INTEGERS = range(-(2**63), 2**63)  # the range that TOML requires of a reader
 
@@ -35,8 +39,7 @@ def wrong(
 def check_keys(table: Collection[str], known: Collection[str], file: str, prefix: str = "") -> None:
     """Check that each key of the table at `prefix` ("registrars.cameras.") is known.
 
-    Raises:
-        ConfigError: a key is unknown; the text has a similar known key. `.file`, `.key`, `.expected`, `.got`
+    The text of the ConfigError has a similar known key.
     """
     for key in table:
         if key not in known:
@@ -45,11 +48,7 @@ def check_keys(table: Collection[str], known: Collection[str], file: str, prefix
 
 
 def file_name(path: object) -> str:
-    """Return the path of a TOML file as text.
-
-    Raises:
-        ConfigError: `path` is no path.
-    """
+    """Return the path of a TOML file as text; raise ConfigError if `path` is no path."""
     text = path_text(path)
     if text == "":
         raise wrong(None, "path", "the path of a TOML file", path)
@@ -57,11 +56,7 @@ def file_name(path: object) -> str:
 
 
 def read_toml(file: str) -> dict[str, Any]:
-    """Return the content of the TOML file at this path.
-
-    Raises:
-        ConfigError: the file cannot be read, or is refused by parse_toml(). `.file`, `.expected`, `.got`
-    """
+    """Return the content of the TOML file at this path; raise ConfigError if it cannot be read, or parsed."""
     try:
         data = Path(file).read_bytes()
     except (OSError, ValueError) as error:  # ValueError: no file has such a name
@@ -79,30 +74,24 @@ def read_toml(file: str) -> dict[str, Any]:
 def parse_toml(data: bytes, file: str) -> dict[str, Any]:
     """Decode the bytes of a TOML file called `file`.
 
-    Raises:
-        ConfigError: `data` is not UTF-8 text or not TOML (the error has the line), or is nested too deeply. Or it has a
-            whole number that does not fit into 64 bits. `.file`, `.expected`, `.got`
+    Raise ConfigError if they are not UTF-8 text or not TOML (the error has the line), are nested too deeply, or have a
+    whole number that does not fit into 64 bits.
     """
-    try:
-        return _parsed(data)
-    except ValueError as error:
-        lines = len(data.splitlines()) or 1
-        problem = str(error).replace("(at end of document)", f"(at line {lines}, end of the file)")
-        raise ConfigError(
-            f"{file}: not valid TOML: {problem}", file=file, key=None, expected="valid TOML", got=problem
-        ) from error
-
-
-def _parsed(data: bytes) -> dict[str, Any]:
     try:
         table = msgspec.toml.decode(data.decode())
         _check_integers(table)
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise ValueError(f"not UTF-8 text (at line {line})") from error
-    except RecursionError as error:
-        raise ValueError("nested too deeply") from error
-    return table
+        return table
+    except (ValueError, RecursionError) as error:
+        lines = len(data.splitlines()) or 1
+        problem = str(error).replace("(at end of document)", f"(at line {lines}, end of the file)")
+        if isinstance(error, RecursionError):
+            problem = "nested too deeply"
+        elif isinstance(error, UnicodeDecodeError):
+            line = data[: error.start].count(b"\n") + 1
+            problem = f"not UTF-8 text (at line {line})"
+        raise ConfigError(
+            f"{file}: not valid TOML: {problem}", file=file, key=None, expected="valid TOML", got=problem
+        ) from error
 
 
 def _check_integers(value: object) -> None:
@@ -114,3 +103,111 @@ def _check_integers(value: object) -> None:
             _check_integers(inner)
     elif isinstance(value, int) and value not in _INTEGERS:
         raise ValueError("a whole number that does not fit into 64 bits")
+
+
+# -- supervision trees -----------------------------------------------------------------------------------------------
+#
+# A table with `children` is a Supervisor, one with `actor` a ChildSpec::
+#
+#     id = "root"
+#     strategy = "rest_for_one"
+#
+#     [[children]]
+#     actor = "robots.cameras:Cameras"       # module:class
+#     id = "cameras"
+#     kwargs = { quality = "low" }
+#     backoff = { delay_s = 0.1, maximum_s = 10.0 }
+#
+#     [[children]]
+#     id = "arms"                            # a supervisor below the first
+#     max_restarts = 1
+#
+#     [[children.children]]
+#     actor = "robots.arms:Arm"
+#     args = ["left"]
+#
+# Every other key is a field of the same name of ChildSpec, Supervisor or Backoff.
+
+FilePath = str | os.PathLike[str]
+_T = TypeVar("_T")
+_ACTOR = "actor_class_or_manager"  # ChildSpec's field for the key `actor`
+
+
+def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], backoff: type[Any]) -> _T:
+    """Read the tree in a file, made of these three classes: supervision/core/specs.py passes them, so that this module
+    need not import a core.
+    """
+    file = file_name(path)
+    table = read_toml(file)
+    reader = _Reader(file, supervisor, child, backoff)
+    reader.check_keys(supervisor, "", table)
+    if "children" not in table:
+        raise wrong(file, "children", "a list of tables, [[children]]", None)
+    return reader.supervisor_at("", table)
+
+
+def parse_child(text: bytes, file: str, supervisor: type[Any], child: type[_T], backoff: type[Any]) -> _T | Any:
+    """Make the child or supervisor in the text of a TOML file called `file`, of these three classes."""
+    return _Reader(file, supervisor, child, backoff).child_at("", parse_toml(text, file))
+
+
+class _Reader:
+    def __init__(self, file: str, supervisor: type[Any], child: type[Any], backoff: type[Any]) -> None:
+        self.file, self.supervisor, self.child, self.backoff = file, supervisor, child, backoff
+
+    def supervisor_at(self, key: str, table: Mapping[str, Any]) -> Any:
+        children = table["children"]
+        if not isinstance(children, list):
+            raise wrong(self.file, f"{key}children", "a list of tables, [[children]]", children)
+        entries = enumerate(cast("list[object]", children))
+        made = [self.child_at(f"{key}children[{index}].", entry) for index, entry in entries]
+        return self._make(self.supervisor, key, {**table, "children": made})
+
+    def child_at(self, key: str, table: object) -> Any:
+        """Make the child or supervisor in a table; `key` is the prefix of the table's keys, "children[0]."."""
+        if not isinstance(table, dict):
+            raise wrong(self.file, key.rstrip("."), "a table", table)
+        fields = dict(cast("dict[str, Any]", table))
+        if ("children" in fields) == ("actor" in fields):
+            got = "both" if "actor" in fields else "neither"
+            raise wrong(self.file, key.rstrip("."), "either actor = 'module:class' or children", got, said=got)
+        if "children" in fields:
+            return self.supervisor_at(key, fields)
+        fields["actor"] = self._class_at(f"{key}actor", fields["actor"])
+        if "backoff" in fields:
+            backoff = fields["backoff"]
+            if not isinstance(backoff, dict):
+                raise wrong(self.file, f"{key}backoff", "a table", backoff)
+            fields["backoff"] = self._make(self.backoff, f"{key}backoff.", cast("dict[str, Any]", backoff))
+        return self._make(self.child, key, fields)
+
+    def _class_at(self, key: str, name: object) -> type[Any]:
+        expected = "'module:class', a class that can be imported"
+        if not isinstance(name, str) or name.count(":") != 1:
+            raise wrong(self.file, key, expected, name)
+        try:
+            module, _, path_in_it = name.partition(":")
+            found = functools.reduce(getattr, path_in_it.split("."), cast(object, importlib.import_module(module)))
+        except Exception as error:  # importing runs the module: it may raise anything
+            said = shortened(f"{shown(name)} ({type(error).__name__}: {error})")
+            raise wrong(self.file, key, expected, name, said=said) from error
+        if not isinstance(found, type):
+            raise wrong(self.file, key, expected, name, said=f"{shown(name)}, which is not a class")
+        return cast("type[Any]", found)
+
+    def check_keys(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> None:
+        """Check that each key is a field of the class."""
+        known = [_in_file(field.name) for field in dataclasses.fields(cls)]
+        check_keys(fields, known, self.file, key)
+
+    def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
+        self.check_keys(cls, key, fields)
+        try:
+            return cls(**{_ACTOR if name == "actor" else name: value for name, value in fields.items()})
+        except InvalidSpec as error:
+            details = error.details
+            raise wrong(self.file, key + _in_file(details["field"]), details["expected"], details["got"]) from error
+
+
+def _in_file(field: str) -> str:
+    return "actor" if field == _ACTOR else field

@@ -198,6 +198,7 @@ class Components(Manager):
         given: Parameters = {"here": str(self._path.parent), "python": sys.executable, "name": component.name}
         parameters = fill_all(component.parameters, {**given, **request.parameters}, f"{where}: parameters")
         program = component.program
+        name = component.name.replace("%", "%25").replace(":", "%3A")  # so the first ":" below is the one in between
 
         def filled(text: str, key: str) -> str:
             return fill(text, parameters, f"{where}: program.{key}")
@@ -207,10 +208,10 @@ class Components(Manager):
             program,
             command=filled(program.command, "command"),
             arguments=tuple(filled(text, "arguments") for text in program.arguments),
-            environment={name: filled(text, f"environment.{name}") for name, text in program.environment.items()},
+            environment={key: filled(text, f"environment.{key}") for key, text in program.environment.items()},
             directory=str(self._path.parent / filled(program.directory or ".", "directory")),
             ready=msgspec.structs.replace(program.ready, file=ready_file and filled(ready_file, "ready.file")),
-            instance=f"{component.name}:{request.instance}",  # two components never share a program
+            instance=f"{name}:{request.instance}",  # two components never share a program
         ), parameters
 
 

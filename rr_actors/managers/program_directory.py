@@ -64,19 +64,17 @@ class Home:
         """Hold the directory's lock in the with block; yield False if a shim holds it, or the directory is gone."""
         try:
             with Folder.at(self.path) as folder:
-                descriptor = folder.open("lock", os.O_RDWR | os.O_CREAT)
+                lock = folder.open("lock", os.O_RDWR | os.O_CREAT)
         except FileNotFoundError:
             yield False  # the directory has gone meanwhile
             return
-        try:
+        with lock:
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 yield False
             else:
                 yield True
-        finally:
-            os.close(descriptor)
 
     def is_held(self) -> bool:
         """Return whether a living shim holds the directory's lock."""

@@ -6,6 +6,7 @@ the registry's values.
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 from typing import Annotated
@@ -52,6 +53,6 @@ class Reliabilities:
         new = self._path.with_suffix(".new").name
         with Folder.at(self._path.parent) as folder:
             folder.discard(new)
-            with os.fdopen(folder.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY), "wb") as file:
+            with io.BufferedWriter(folder.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)) as file:
                 file.write(msgspec.json.format(msgspec.json.encode(self._record)))
             folder.rename(new, self._path.name)

@@ -17,8 +17,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.errors import LoadTimeout, Unavailable, UnknownQuery, shown
 from rr_actors.base.names import ServerId, parse_server_id
-from rr_actors.base.pictures.html_tables import table
-from rr_actors.base.pictures.mime_bundles import bundle_or_text
+from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.status import Status, state_of, status_of

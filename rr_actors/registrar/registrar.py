@@ -22,8 +22,7 @@ from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
 from rr_actors.base.names import ServerId, check_name, new_id, parse_server
-from rr_actors.base.pictures.html_tables import table
-from rr_actors.base.pictures.mime_bundles import bundle_or_text
+from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.arguments import (
     check_text,

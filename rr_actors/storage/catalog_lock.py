@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import io
 import logging
 import os
+import weakref
 import zlib
 from pathlib import Path
 
@@ -51,13 +53,13 @@ class CatalogLock:
         self._folder = folder
         self._catalog = catalog
         self._name = catalog.with_suffix(".lock").name
-        self._fd = self._taken()
+        self._file = self._taken()
         while not self.is_there():  # its last holder erased the catalog, and this file with it
-            os.close(self._fd)
-            self._fd = self._taken()
+            self._file.close()
+            self._file = self._taken()
         _locks.add(self)
-        self._size = os.fstat(self._fd).st_size
-        self.reached = _read(self._fd)[1]
+        self._size = os.fstat(self._file.fileno()).st_size
+        self.reached = _read(self._file)[1]
         self._write(os.getpid())
 
     def note(self, reached: Reached | None) -> None:
@@ -66,11 +68,7 @@ class CatalogLock:
         self._write(os.getpid())
 
     def release(self, *, remove: bool = False) -> None:
-        """Release the lock; with `remove`, remove its file, too.
-
-        Raises:
-            OSError: the lock is released, but its file could not be removed.
-        """
+        """Release the lock, and with `remove` remove its file; the lock is released even if that raises an OSError."""
         _locks.discard(self)
         try:
             if remove:
@@ -79,18 +77,18 @@ class CatalogLock:
                     self._folder.unlink(self._name)
             self._write(None)
         finally:
-            os.close(self._fd)
+            self._file.close()
 
     def forget(self) -> None:
         """Close the descriptors in a forked child, which would otherwise hold the lock after its parent's end."""
-        os.close(self._fd)
+        self._file.close()
         self._folder.close()
 
     def is_there(self) -> bool:
         """Return whether the locked file still has its name: otherwise another process can lock a new file."""
         try:
             return os.path.samestat(
-                os.stat(self._name, dir_fd=self._folder.fd, follow_symlinks=False), os.fstat(self._fd)
+                os.stat(self._name, dir_fd=self._folder.fd, follow_symlinks=False), os.fstat(self._file.fileno())
             )
         except FileNotFoundError:
             return False
@@ -111,15 +109,15 @@ class CatalogLock:
             " temporary files",
             self._folder.path / self._name,
         )
-        fd = self._taken()
-        lost, self._fd, self._size = self._fd, fd, os.fstat(fd).st_size
-        os.close(lost)
+        file = self._taken()
+        lost, self._file, self._size = self._file, file, os.fstat(file.fileno()).st_size
+        lost.close()
         self._write(os.getpid())
 
-    def _taken(self) -> int:
-        """Open and lock the lock's file; return its descriptor."""
+    def _taken(self) -> io.FileIO:
+        """Open and lock the lock's file, and return it."""
         try:
-            fd = self._folder.open(self._name, os.O_RDWR | os.O_CREAT)
+            file = self._folder.open(self._name, os.O_RDWR | os.O_CREAT)
         except NotAFile as error:
             raise CatalogError(
                 f"{error.filename}: expected the catalog's lock, a file of its own, got {error.got}; it is left as it"
@@ -127,10 +125,10 @@ class CatalogLock:
                 path=str(self._catalog),
             ) from error
         try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            pid = _read(fd)[0]
-            os.close(fd)
+            pid = _read(file)[0]
+            file.close()
             holder = "another process" if pid is None else "this process" if pid == os.getpid() else f"process {pid}"
             raise CatalogLocked(
                 f"{self._catalog}: expected a catalog that nobody has open, got one that {holder} holds; close it there"
@@ -138,7 +136,7 @@ class CatalogLock:
                 path=str(self._catalog),
                 pid=pid,
             ) from error
-        return fd
+        return file
 
     def _write(self, pid: int | None) -> None:
         """Write pid and progress in one call, with a fixed length: a killed process leaves the old text or the new."""
@@ -150,15 +148,15 @@ class CatalogLock:
             noted = f"{reached.id} {reached.epoch} {kind} {reached.number:020}"
             text = f"{'' if pid is None else pid}\n{noted} {zlib.crc32(noted.encode()):08x}\n"
         with contextlib.suppress(OSError):  # a full disk: the commits are elsewhere, and safe
-            os.pwrite(self._fd, text.encode(), 0)
+            os.pwrite(self._file.fileno(), text.encode(), 0)
             if len(text) < self._size:
-                os.ftruncate(self._fd, len(text))
+                self._file.truncate(len(text))
             self._size = len(text)
 
 
-def _read(fd: int) -> tuple[int | None, Reached | None]:
+def _read(file: io.FileIO) -> tuple[int | None, Reached | None]:
     """Return the holder's pid and the noted progress; None for one that is missing or damaged."""
-    first, _, second = os.pread(fd, 200, 0).decode(errors="replace").partition("\n")
+    first, _, second = os.pread(file.fileno(), 200, 0).decode(errors="replace").partition("\n")
     pid = int(first) if first.isascii() and first.isdigit() else None
     noted, _, checksum = second.rstrip("\n").rpartition(" ")
     if f"{zlib.crc32(noted.encode()):08x}" != checksum or not noted:
@@ -167,12 +165,12 @@ def _read(fd: int) -> tuple[int | None, Reached | None]:
     return pid, Reached(id_, int(epoch), int(number), in_tables=kind == "tables")
 
 
-_locks: set[CatalogLock] = set()
+_locks: weakref.WeakSet[CatalogLock] = weakref.WeakSet()  # weak: an interrupted caller may never get its lock
 
 
 def _forget_locks() -> None:
-    while _locks:
-        _locks.pop().forget()
+    for lock in list(_locks):
+        lock.forget()
 
 
 os.register_at_fork(after_in_child=_forget_locks)

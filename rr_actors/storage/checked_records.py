@@ -62,12 +62,9 @@ def is_torn(data: bytes, end: Place) -> bool:
 
 
 def write_whole(fd: int, data: bytes, begin: int) -> int:
-    """Write all of `data`, or nothing, at the file's end, which is at `begin`; return the new end.
+    """Write all of `data` at the file's end, which is at `begin`, or nothing and raise an OSError; return the new end.
 
     The rest of a failed attempt is cut off. If that fails, the next record overwrites it, and readers ignore it.
-
-    Raises:
-        OSError: the data could not be written.
     """
     end = begin + len(data)
     try:

@@ -27,7 +27,7 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
 from rr_actors.storage import checked_records
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.sql_tables import net_of
+from rr_actors.storage.sql_tables import Meta, net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
 
 _AT_MOST = 100_000  # changes in the journal; with more, the committing thread folds them itself
@@ -129,10 +129,12 @@ class JournaledStore:
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
-        owner = Owner(self._tables.meta.id, self.epoch)
-        full = self._full  # a folding that ends now replaces the list; the tables have its last number by then
-        number = (full[-1].number if full else self._tables.meta.folded) + 1
-        segment = Segment(self._tables.folder, self.path, owner, number, self._end)
+        full, meta = (
+            self._full,
+            self._tables.meta,
+        )  # a folding that ends now replaces the list: so the meta row comes next
+        number = (full[-1].number if full else meta.folded) + 1
+        segment = Segment(self._tables.folder, self.path, meta, number, self._end)
         self._tables.note(number)
         return segment
 
@@ -140,7 +142,12 @@ class JournaledStore:
         changes: list[Change] = []
         try:
             with self._lock:
-                self._end_segment()
+                segment = self._segment
+                if segment is not None and segment.end.records:
+                    self._end = segment.end
+                    self._full.append(segment)
+                    self._segment = None
+                    segment.close()
                 changes, self._pending = self._pending, []
             if changes:
                 self._tables.fold(net_of(changes), self._full[-1].number)
@@ -151,14 +158,6 @@ class JournaledStore:
         full, self._full = self._full, []
         for segment in full:
             segment.remove()
-
-    def _end_segment(self) -> None:
-        segment = self._segment
-        if segment is not None and segment.end.records:
-            self._end = segment.end
-            self._full.append(segment)
-            self._segment = None
-            segment.close()
 
 
 # -- the journal -------------------------------------------------------------------------------------------------------
@@ -184,13 +183,6 @@ _LONGEST = 10**9 - 1000  # bytes: about the longest row that SQLite takes
 _encode = msgspec.msgpack.Encoder().encode
 
 
-class Owner(msgspec.Struct, frozen=True, gc=False):
-    """The owner of a journal: the catalog's id, and how often the catalog had been opened."""
-
-    id: str
-    epoch: int
-
-
 class End(msgspec.Struct, frozen=True, gc=False):
     """The end of a segment: the number of its records, and the checksum of the last."""
 
@@ -203,6 +195,7 @@ class Segment:
 
     Args:
         folder, catalog: the catalog's directory, and its SQLite file there.
+        meta: the catalog's meta row.
         number: the segment's number. A file of that name is from a failed attempt, and is written over.
         before: the end of the segment before; any value if that is folded.
 
@@ -210,15 +203,16 @@ class Segment:
         OSError: the segment cannot be made; at most an empty file is left.
     """
 
-    def __init__(self, folder: Folder, catalog: Path, owner: Owner, number: int, before: End) -> None:
+    def __init__(self, folder: Folder, catalog: Path, meta: Meta, number: int, before: End) -> None:
         self.number = number
         self.name = f"{segment_prefix(catalog)}{number}"
         self._folder = folder
-        place = (owner.id.encode(), owner.epoch, number)
+        place = (meta.id.encode(), meta.epoch, number)
         header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
         self._records = 0
-        self._fd = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
+        self._file = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
+        self._fd = self._file.fileno()
         try:
             self._size = checked_records.write_whole(self._fd, header + _CHECKSUM.pack(self._checksum), 0)
         except BaseException:
@@ -231,12 +225,7 @@ class Segment:
         return End(self._records, self._checksum)
 
     def append(self, changes: Sequence[Change]) -> None:
-        """Write changes as one record.
-
-        Raises:
-            OSError: the record could not be written; the segment is as before.
-            OverflowError, UnicodeEncodeError: as JournaledStore.commit() describes.
-        """
+        """Write changes as one record, or write nothing and raise an OSError or an error of JournaledStore.commit()."""
         body = _encode([(TABLE_OF[type(c.row)], c.row) if type(c) is Put else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
             _check_lengths(changes)
@@ -254,10 +243,9 @@ class Segment:
 
     def close(self) -> None:
         """Close the segment's descriptor. A second call does nothing."""
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            with contextlib.suppress(OSError):  # it is closed even so
-                os.close(fd)
+        self._fd = -1
+        with contextlib.suppress(OSError):  # it is closed even so
+            self._file.close()
 
 
 class Found(msgspec.Struct, frozen=True):
@@ -277,10 +265,11 @@ class Found(msgspec.Struct, frozen=True):
         later = (data for number, data in self.contents.items() if number > folded and data is not None)
         return max((_HEADER.unpack_from(data)[2] for data in later), default=0)
 
-    def since(self, folded: int, owner: Owner, begun: int = 0) -> list[Change]:
-        """Return the changes after segment `folded`, up to the first that is missing; log a warning about the rest.
+    def since(self, meta: Meta, begun: int = 0) -> list[Change]:
+        """Return the changes after those in the tables, up to the first that is missing; log a warning about the rest.
 
         Args:
+            meta: the meta row in the tables.
             begun: the last segment that is known to have been begun, even if its file is missing.
 
         Raises:
@@ -288,14 +277,17 @@ class Found(msgspec.Struct, frozen=True):
         """
         changes: list[Change] = []
         end: End | None = None
-        for number in range(folded + 1, max(self.last, begun) + 1):
+        for number in range(meta.folded + 1, max(self.last, begun) + 1):
             data = self.contents.get(number)
             if data is None and number == self.last > begun:
                 break  # begun, and nothing written to it
             name = f"{segment_prefix(self.catalog)}{number}"
             if data is not None:
-                _check_owner(name, data, owner)
-            if data is None or (end is not None and _before(data) != end):
+                # A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the -wal.
+                id_, epoch = _HEADER.unpack_from(data)[1:3]
+                if id_ != meta.id.encode().ljust(16, b"\0") or epoch < meta.epoch:
+                    raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
+            if data is None or (end is not None and End(*_HEADER.unpack_from(data)[4:6]) != end):
                 _log.warning(
                     "%s: %s: missing, or not what was written next; it and what came later is ignored: what was"
                     " committed since then is lost. A power cut may do that (with durability 'power' it does not), and"
@@ -313,30 +305,22 @@ class Found(msgspec.Struct, frozen=True):
 def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Place) -> None:
     left = len(data) - end.at
     if checked_records.is_torn(data, end):
-        _log.warning(
-            "%s: %s: its last record is not whole (%d bytes from byte %d on), and ignored: its process died while it"
-            " wrote it, and nobody heard that it was written; or the file was cut off there later",
-            catalog,
-            name,
-            left,
-            end.at,
+        text = (
+            f"its last record is not whole ({left} bytes from byte {end.at} on), and ignored: its process died while it"
+            " wrote it, and nobody heard that it was written; or the file was cut off there later"
         )
     else:
-        _log.warning(
-            "%s: %s: wrong from byte %d on, and ignored from there: what was committed in these %d bytes, and later,"
-            " is lost. Compare it with a copy, and see whether the disk is good",
-            catalog,
-            name,
-            end.at,
-            left,
+        text = (
+            f"wrong from byte {end.at} on, and ignored from there: what was committed in these {left} bytes, and later,"
+            " is lost. Compare it with a copy, and see whether the disk is good"
         )
+    _log.warning("%s: %s: %s", catalog, name, text)
 
 
 def read(folder: Folder, catalog: Path) -> Found:
     """Read the files of this catalog's journal; a segment that is removed during this is folded, and left out.
 
-    Raises:
-        Damage: a file with a segment's name is not a segment.
+    Raise Damage for a file that has a segment's name and is none.
     """
     found = Found(catalog, [], {})
     for name in segments_among(folder.names(), catalog):
@@ -381,20 +365,6 @@ def _checked(name: str, number: int, data: bytes) -> bytes | None:
     if _HEADER.unpack(header)[3] != number or zlib.crc32(header[: -_CHECKSUM.size]) != _HEADER.unpack(header)[-1]:
         raise Damage(f"{name}, whose beginning is damaged, or another file's")
     return data
-
-
-def _check_owner(name: str, data: bytes, owner: Owner) -> None:
-    """Check that a segment belongs to this catalog.
-
-    A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the catalog's -wal.
-    """
-    id_, epoch = _HEADER.unpack_from(data)[1:3]
-    if id_ != owner.id.encode().ljust(16, b"\0") or epoch < owner.epoch:
-        raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
-
-
-def _before(data: bytes) -> End:
-    return End(*_HEADER.unpack_from(data)[4:6])
 
 
 def _read_records(data: bytes, changes: list[Change]) -> tuple[End, checked_records.Place]:

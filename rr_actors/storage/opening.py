@@ -5,10 +5,13 @@ The files do not change before all of them are known to be good.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import logging
 import os
 import sqlite3
-from collections.abc import Sequence
+import stat
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -20,8 +23,7 @@ from rr_actors.registrar.model.rows import Change, Content, Row, apply, content_
 from rr_actors.storage import journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
-from rr_actors.storage.journaled_store import JournaledStore, Owner
-from rr_actors.storage.permissions import make_files_private, make_private
+from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness, missing_text
 
@@ -61,20 +63,16 @@ def open_store(
         raise CatalogError(f"{text} no longer one; choose a shorter state_dir, or another location", path=str(path))
     with errors_named(path):
         make_directories(path.parent)
-        folder = Folder.at(path.parent)
-        try:
-            make_private(folder)
+        with contextlib.ExitStack() as if_not:
+            folder = if_not.enter_context(Folder.at(path.parent))
+            _make_private(folder)
             files = [file.name for file in (path.with_suffix(".lock"), *sqlite_store.files_of(path))]
-            make_files_private(folder, [*files, *sqlite_store.segments_among(folder.names(), path)])
+            _make_files_private(folder, [*files, *sqlite_store.segments_among(folder.names(), path)])
             lock = CatalogLock(folder, path)
-            try:
-                return _open_locked(folder, path, lock, durability, on_damage, witness)
-            except BaseException:
-                lock.release()
-                raise
-        except BaseException:
-            folder.close()
-            raise
+            if_not.callback(lock.release)
+            store = _open_locked(folder, path, lock, durability, on_damage, witness)
+            if_not.pop_all()
+            return store
 
 
 def read_rows(path: str | os.PathLike[str]) -> list[Row]:
@@ -195,7 +193,7 @@ def _read(
             path,
             reached.number - meta.folded,
         )
-    changes = found.since(meta.folded, Owner(meta.id, meta.epoch), begun)
+    changes = found.since(meta, begun)
     apply(content, changes)
     last = max(found.last, begun, 0 if reached is None else reached.number)
     epoch = max(found.epoch_after(meta.folded), 0 if reached is None else reached.epoch)
@@ -230,10 +228,8 @@ def _compared(path: Path, meta: sql_tables.Meta, left: _Left, witness: Witness) 
 
 def _set_aside(folder: Folder, path: Path) -> Path:
     names = folder.names()
-    n = 1
-    while any(name.startswith(_aside(path, n).name) for name in names):
-        n += 1
-    aside = _aside(path, n)
+    places = (path.with_name(f"{path.name}.damaged-{n}") for n in itertools.count(1))
+    aside = next(place for place in places if not any(name.startswith(place.name) for name in names))
     for old, new in zip(sqlite_store.files_of(path), sqlite_store.files_of(aside), strict=True):
         if old.name in names:
             folder.rename(old.name, new.name)
@@ -242,5 +238,36 @@ def _set_aside(folder: Folder, path: Path) -> Path:
     return aside
 
 
-def _aside(path: Path, n: int) -> Path:
-    return path.with_name(f"{path.name}.damaged-{n}")
+# -- the rights of other users are removed, or the catalog is refused ------------------------------------------------
+#
+# A catalog may hold pickles (stored servers, types). A user that can write it, or put a -wal beside it, can run code as
+# the user that opens it. No other user can do that inside a system's state directory; a `location` elsewhere is checked
+# here. The directory comes first: from then on no other user can add a file. The older files are checked one by one.
+
+
+def _make_private(folder: Folder) -> None:
+    """Remove the right of other users to write the directory; refuse one that all users share (sticky bit)."""
+    mode = stat.S_IMODE(folder.check_owner().st_mode)
+    if mode & 0o022 and mode & stat.S_ISVTX:
+        raise CatalogError(
+            f"{folder.path}: expected a directory for catalogs that one user writes, got one that all share"
+            f" (mode {mode:o}); choose a directory in it as location",
+            path=str(folder.path),
+        )
+    before, after = folder.tighten(0o022)
+    if before != after:
+        _log.info("%s: mode %o tightened to %o", folder.path, before, after)
+
+
+def _make_files_private(folder: Folder, names: Iterable[str]) -> None:
+    """Remove all rights of other users to these files. Skip an entry that is no file: the reader refuses it."""
+    for name in names:
+        try:
+            found = folder.look(name)
+        except NotAFile:
+            continue
+        if found is None or not stat.S_IMODE(found.st_mode) & 0o077:
+            continue
+        with folder.open(name) as file:
+            os.fchmod(file.fileno(), 0o600)
+        _log.info("%s: mode %o tightened to 600", folder.path / name, stat.S_IMODE(found.st_mode))

@@ -128,11 +128,7 @@ def _in_parts(items: list[T]) -> Iterator[list[T]]:
 
 
 def read_all(connection: sqlite3.Connection) -> Content:
-    """Return every row of a catalog.
-
-    Raises:
-        Damage: a row differs from the one that was written.
-    """
+    """Return every row of a catalog; raise Damage for a row that differs from the one that was written."""
     content: Content = {}
     for table, type_ in TABLES.items():
         rows = content[table] = {}
@@ -143,11 +139,7 @@ def read_all(connection: sqlite3.Connection) -> Content:
 
 
 def read_meta(connection: sqlite3.Connection) -> Meta:
-    """Return the catalog's meta row.
-
-    Raises:
-        Damage: the row is missing, or differs from the one that was written.
-    """
+    """Return the catalog's meta row; raise Damage if it is missing, or differs from the one that was written."""
     rows: list[Meta] = _rows_of("meta", connection.execute("SELECT * FROM meta").fetchall(), Meta)
     if len(rows) != 1:
         raise Damage(f"{len(rows)} rows in its table meta instead of one")

@@ -93,7 +93,7 @@ class SqliteStore:
             raise
         self.note(meta.folded)
         if witness is not None:
-            witness.note(Known(meta.id, meta.epoch, str(path)))
+            witness.note(Known(meta.id, meta.epoch, str(path)), synced=durability == "power")
         self._content: Content | None = content  # as read at the opening; None once returned or out of date
         self._wal = files_of(path)[1]  # SQLite fills it again from its beginning: its size is not that of its content
         self._pages = 0  # an estimate of the pages written since the last copy
@@ -201,28 +201,23 @@ class SqliteStore:
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
         """Close the store as the contract says. `settled`: whether the journal has no change of its own."""
         with self._tidying, errors_named(self.path):
-            self._close(erase=erase, settled=settled)
-
-    def _close(self, *, erase: bool, settled: bool) -> None:
-        self._closed = True
-        try:
+            self._closed = True
+            with self.folder:
+                try:
+                    if erase:
+                        with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
+                            self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+                    self._cursor.close()  # a failed statement in it would keep SQLite's files open
+                    self._connection.close()
+                    if erase:
+                        self._erase()
+                    elif settled and not self.folder.has(self._wal.name):
+                        self._lock.note(None)
+                finally:
+                    self._lock.release(remove=erase)
             if erase:
-                with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
-                    self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-            self._cursor.close()  # a failed statement in it would keep SQLite's files open
-            self._connection.close()
-            if erase:
-                self._erase()
-            elif settled and not self.folder.has(self._wal.name):
-                self._lock.note(None)
-        finally:
-            try:
-                self._lock.release(remove=erase)
-            finally:
-                self.folder.close()
-        if erase:
-            with contextlib.suppress(OSError):  # something else is in the directory
-                self.path.parent.rmdir()
+                with contextlib.suppress(OSError):  # something else is in the directory
+                    self.path.parent.rmdir()
 
     def _erase(self) -> None:
         self._lock.note(None)  # a noted catalog without its file would count as damaged
@@ -266,8 +261,7 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
         with contextlib.suppress(FileNotFoundError):  # left by a crash
             folder.unlink(file.name)
-    fd = folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    try:
+    with folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
         with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
             connection.execute("PRAGMA synchronous = OFF")  # fsync once, below
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -276,9 +270,7 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
                 connection.execute(sql)
             connection.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
             connection.execute("PRAGMA journal_mode = WAL").fetchall()
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+        os.fsync(file.fileno())
     folder.rename(new.name, path.name)
     if durability == "power":
         os.fsync(folder.fd)
@@ -316,7 +308,7 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
         if left is not None and left.st_size > 0:
             damaged(path, f"no such file, but {wal.name}, which belongs to it")
         return NONE, content_of(())
-    with os.fdopen(folder.open(file.name), "rb") as header:
+    with folder.open(file.name) as header:
         _check_header(path, header.read(_HEADER_BYTES))
     # Without a -wal no process has the file open; with "immutable" SQLite makes no -wal of its own.
     uri = f"{path.as_uri()}?{'mode=ro' if left is not None else 'immutable=1'}"
@@ -334,12 +326,9 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
 
 
 def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
-    """Check that a -wal belongs to the file that it is about to change: SQLite does not check that.
+    """Raise Damage if a -wal belongs to another file than it is about to change, which SQLite does not check.
 
     No process may have the file open.
-
-    Raises:
-        Damage: the file is another catalog's.
     """
     if folder.look(files_of(path)[1].name) is None:
         return

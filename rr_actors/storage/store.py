@@ -1,5 +1,7 @@
 """Store: the contract of a catalog's storage. This room has its implementations; one test suite checks all of them.
 
+The simplest one, MemoryStore, is here.
+
 Each implementation guarantees:
 
 - `commit` is atomic: after a crash, all of its changes are stored, or none. If it has returned, they are stored
@@ -16,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from rr_actors.registrar.model.rows import Change, Content
+from rr_actors.registrar.model.rows import Change, Content, apply, content_of
 
 
 class Store(Protocol):
@@ -64,3 +66,26 @@ class Store(Protocol):
             CatalogError: the catalog could not be removed; it is as before, or only files without meaning are left.
         """
         ...
+
+
+class MemoryStore:
+    """A Store of a catalog in memory, which is lost with this object: for durability "none"."""
+
+    def __init__(self) -> None:
+        self.epoch = 1
+        self._content: Content = content_of(())
+
+    def load(self) -> Content:
+        return {table: dict(rows) for table, rows in self._content.items()}
+
+    def commit(self, changes: Sequence[Change]) -> None:
+        apply(self._content, changes)
+
+    def wants_tidying(self) -> bool:
+        return False
+
+    def tidy(self) -> None:
+        """Do nothing."""
+
+    def close(self, *, erase: bool = False) -> None:
+        """Do nothing."""

@@ -6,9 +6,11 @@ It tells a new catalog from one whose directory was removed, swapped or put back
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import zlib
+from collections.abc import Generator
 from pathlib import Path
 
 import msgspec
@@ -43,48 +45,43 @@ class Witness:
 
     def known(self) -> Known | None:
         """Return the catalog at its last opening; None if there was none, or the record cannot be read."""
-        try:
-            with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
-                return _read(place, self.registrar)
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            self._tell(error)
-            return None
+        with self._errors_logged(), Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+            return _read(place, self.registrar)
+        return None
 
-    def note(self, known: Known) -> None:
-        """Record that the catalog was opened."""
+    def note(self, known: Known, *, synced: bool = False) -> None:
+        """Record that the catalog was opened. `synced`: a power cut neither loses the record nor damages it."""
         new = f".{self.registrar}.new"
-        try:
-            with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
-                if place.has(new):
-                    place.unlink(new)
-                fd = place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-                try:
-                    body = msgspec.json.encode(known)
-                    write_whole(fd, b"%08x %b\n" % (zlib.crc32(body), body), 0)
-                finally:
-                    os.close(fd)
-                place.rename(new, self.registrar)
-        except OSError as error:
-            self._tell(error)
+        with self._errors_logged(), Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+            if place.has(new):
+                place.unlink(new)
+            with place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
+                body = msgspec.json.encode(known)
+                write_whole(file.fileno(), b"%08x %b\n" % (zlib.crc32(body), body), 0)
+                if synced:
+                    os.fsync(file.fileno())
+            place.rename(new, self.registrar)
+            if synced:
+                os.fsync(place.fd)
+                os.fsync(state.fd)
 
     def forget(self) -> None:
         """Remove the record, because the catalog is erased on purpose."""
-        try:
-            with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
-                place.discard(self.registrar)
-        except OSError as error:
-            self._tell(error)
+        with self._errors_logged(), Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+            place.discard(self.registrar)
 
-    def _tell(self, error: OSError) -> None:
-        _log.warning(
-            "%s: what is known of the catalog of %s cannot be read or written: %s; if that catalog is removed or"
-            " replaced, nobody will notice",
-            self._state_dir / _PLACE,
-            self.registrar,
-            error,
-        )
+    @contextlib.contextmanager
+    def _errors_logged(self) -> Generator[None]:
+        try:
+            yield
+        except OSError as error:
+            _log.warning(
+                "%s: what is known of the catalog of %s cannot be read or written: %s; if that catalog is removed or"
+                " replaced, nobody will notice",
+                self._state_dir / _PLACE,
+                self.registrar,
+                error,
+            )
 
 
 def tell_of_missing(state_dir: str | os.PathLike[str]) -> list[str]:

@@ -13,8 +13,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.base.pictures.html_tables import table
-from rr_actors.base.pictures.mime_bundles import bundle
+from rr_actors.base.notebook import bundle, table
 
 logger = logging.getLogger("rr_actors.supervision")
 

@@ -6,7 +6,7 @@ import subprocess
 from typing import Any, Literal
 
 from rr_actors.base.errors import RrError, UsageError
-from rr_actors.base.pictures.svg_pictures import Box, draw
+from rr_actors.base.svg_pictures import Box, draw
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.supervision.core.rendering import Tree, dot_text, mermaid_text, svg_boxes, tree_edges
 from rr_actors.system.console.console_messages import ChildRow

@@ -38,13 +38,7 @@ class BlockingLink:
     """
 
     def __init__(
-        self,
-        sockets: SocketDir,
-        key: bytes,
-        address: str,
-        hello: Hello,
-        wire: Wire,
-        timeout_s: float,
+        self, sockets: SocketDir, key: bytes, address: str, hello: Hello, wire: Wire, timeout_s: float
     ) -> None:
         self._limit = wire.frame_limit_bytes
         self._reader: FrameReader[Any] = FrameReader(wire.decoder, self._limit)

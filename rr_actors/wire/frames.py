@@ -75,6 +75,7 @@ class FrameReader(Generic[T]):
         limit = self._limit
         size = len(data)
         start = 4
+        wanted = 4
         while start <= size:
             length = _unpack_length(data, start - 4)[0]
             end = start + length
@@ -82,8 +83,8 @@ class FrameReader(Generic[T]):
                 self.error = Unavailable(f"a frame of {length} bytes, over the limit of {limit} (frame_limit_bytes)")
                 return messages
             if end > size:
-                self._keep(data, start - 4, length + 4)
-                return messages
+                wanted += length
+                break
             try:
                 messages.append(decode(data[start:end]))
             except Exception as error:  # as above
@@ -91,12 +92,9 @@ class FrameReader(Generic[T]):
                 return messages
             start = end + 4
         if start - 4 < size:
-            self._keep(data, start - 4, 4)
+            self._wanted = wanted
+            self._buffer += data[start - 4 :]
         return messages
-
-    def _keep(self, data: bytes, start: int, wanted: int) -> None:
-        self._wanted = wanted
-        self._buffer += data[start:]
 
     def _not_a_message(self, length: int, error: Exception) -> None:
         if length == 0:
@@ -106,11 +104,7 @@ class FrameReader(Generic[T]):
 
 
 def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
-    """Return a message's frame.
-
-    Raises:
-        NotSerializable: it has no MessagePack form, or one longer than `limit`, which is the setting `key`.
-    """
+    """Return a message's frame; raise NotSerializable if it has none, or is longer than `limit`, the setting `key`."""
     try:
         body = _encode(message)
     except _NOT_ENCODED as error:

@@ -59,11 +59,7 @@ _decode_reply = msgspec.msgpack.Decoder(Welcomed | Refused).decode
 
 
 def check_key(key: bytes) -> bytes:
-    """Return a system's key if it has the right length.
-
-    Raises:
-        ConfigError: the key is shorter or longer.
-    """
+    """Return a system's key; raise ConfigError if it is shorter or longer than KEY_BYTES."""
     if len(key) != KEY_BYTES:
         raise ConfigError(f"a system's key has {KEY_BYTES} bytes, got {len(key)}", expected=KEY_BYTES, got=len(key))
     return key
@@ -82,7 +78,7 @@ class _Handshake:
     """Collects the block of each step and hands it to the step; the two roles are below.
 
     Attributes:
-        rest: the bytes after the last block, once `done`; they belong to the link.
+        rest: the bytes that no step has taken yet; once `done`, they belong to the link.
     """
 
     _step: _Step
@@ -90,7 +86,6 @@ class _Handshake:
     def __init__(self, key: bytes) -> None:
         self._key = key
         self._nonce = os.urandom(_NONCE_BYTES)
-        self._buffer = b""
         self.done = False
         self.rest = b""
 
@@ -100,14 +95,11 @@ class _Handshake:
         Raises:
             Unavailable: the peer is not of this system, or breaks the protocol. Close the connection.
         """
-        self._buffer += data
+        self.rest += data
         reply = b""
         while not self.done and (size := self._block_size()) is not None:
-            block, self._buffer = self._buffer[:size], self._buffer[size:]
+            block, self.rest = self.rest[:size], self.rest[size:]
             reply += self._step.take(block)
-        if self.done:
-            self.rest += self._buffer
-            self._buffer = b""
         return reply
 
     @property
@@ -119,13 +111,13 @@ class _Handshake:
         """Return the length of the next block if all of it has arrived, else None."""
         size = self._step.size
         if not size:
-            if len(self._buffer) < _LENGTH.size:
+            if len(self.rest) < _LENGTH.size:
                 return None
-            length: int = _LENGTH.unpack_from(self._buffer)[0]
+            length: int = _LENGTH.unpack_from(self.rest)[0]
             if length > self._step.limit:
                 raise Unavailable(f"{self.waits_for} has {length} bytes, over the limit of {self._step.limit}")
             size = _LENGTH.size + length
-        return size if len(self._buffer) >= size else None
+        return size if len(self.rest) >= size else None
 
     def _mac(self, role: bytes, acceptor_nonce: bytes, dialler_nonce: bytes) -> bytes:
         text = _MAGIC + _LENGTH.pack(PROTOCOL) + role + acceptor_nonce + dialler_nonce
@@ -175,11 +167,7 @@ class DiallerHandshake(_Handshake):
     """The side that connects. Once `done`, either `welcome` or `refusal` is set."""
 
     def __init__(self, key: bytes, hello: Hello) -> None:
-        """Make the handshake of a link.
-
-        Raises:
-            NotSerializable: the Hello is too long.
-        """
+        """Make the handshake of a link; raise NotSerializable if the Hello is too long."""
         super().__init__(key)
         self._hello = framed(hello, HELLO_LIMIT_BYTES, "names and paths are to be shorter")
         self._expected = b""
@@ -203,11 +191,11 @@ class DiallerHandshake(_Handshake):
         return self._hello
 
     def _take_reply(self, block: bytes) -> bytes:
-        match _decode(_read_answer, block, "answer to Hello"):
-            case Welcome() as welcome:
-                self.welcome = welcome
-            case refusal:
-                self.refusal = refusal
+        answer = _decode(_read_answer, block, "answer to Hello")
+        if isinstance(answer, Welcome):
+            self.welcome = answer
+        else:
+            self.refusal = answer
         self.done = True
         return b""
 

@@ -36,27 +36,23 @@ class LocalTransport:
             raise Unavailable(f"cannot connect to {hello.to}: this transport is closed")
         if address != self.address or self._accept is None:
             raise Unavailable(f"nobody listens for {hello.to} at {address}")
-        near, far = self._open(self._accept, hello)
+        try:
+            welcome, attach_far = self._accept(hello)
+            near = LocalLink(self._links, hello, welcome, hello.to)
+            far = LocalLink(self._links, hello, welcome, hello.origin)
+            near.other, far.other = far, near
+            far.attach(attach_far)
+        except RrError:
+            raise
+        except Exception as error:
+            _log.exception("refusing a link of %s (this process): accepting it failed", hello.origin)
+            raise error_of(failure_of(error)) from error
         try:
             near.attach(attach)
         except BaseException:
             far.close()
             raise
         return near
-
-    def _open(self, accept: Accept, hello: Hello) -> tuple[LocalLink, LocalLink]:
-        try:
-            welcome, attach = accept(hello)
-            near = LocalLink(self._links, hello, welcome, hello.to)
-            far = LocalLink(self._links, hello, welcome, hello.origin)
-            near.other, far.other = far, near
-            far.attach(attach)
-        except RrError:
-            raise
-        except Exception as error:
-            _log.exception("refusing a link of %s (this process): accepting it failed", hello.origin)
-            raise error_of(failure_of(error)) from error
-        return near, far
 
     async def close(self) -> None:
         self._closed = True

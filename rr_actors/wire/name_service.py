@@ -22,6 +22,7 @@ import errno
 import fcntl
 import functools
 import hashlib
+import io
 import itertools
 import logging
 import os
@@ -96,6 +97,7 @@ class Entry(msgspec.Struct, frozen=True):
         return f": {self.why}" if self.why else ""
 
 
+_AWAY = (Status.GONE, Status.DORMANT)
 _MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
 _UP = Status.UP.value + ":"
 _UP_ONCE = Status.UP.value + " once:"
@@ -270,7 +272,8 @@ class Directory:
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """Return the error for an unknown registrar; it names the known ones, and the one that was probably meant."""
         entry = self.lookup(_REGISTRAR + name)
-        known = [other for other in self.registrars() if _is_there(self.lookup(_REGISTRAR + other))]
+        entries = {other: self.lookup(_REGISTRAR + other) for other in self.registrars()}
+        known = [other for other, found in entries.items() if found and found.status not in _AWAY]
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
         what = "there is none of this name in the system"
         if entry is not None and entry.status is Status.GONE and entry.why:
@@ -290,10 +293,6 @@ def _joined(classes: Sequence[str]) -> str:
     return text or "?"
 
 
-def _is_there(entry: Entry | None) -> bool:
-    return entry is not None and entry.status not in (Status.GONE, Status.DORMANT)
-
-
 class StateDir:
     """A state directory opened by the one living system that uses it.
 
@@ -303,9 +302,9 @@ class StateDir:
         key: 32 secret bytes, new each time; only the system's own processes get them.
     """
 
-    def __init__(self, folder: Folder, lock: int) -> None:
+    def __init__(self, folder: Folder, lock: io.FileIO) -> None:
         self.path = folder.path
-        self.lock = lock
+        self._lock = lock
         self.key = os.urandom(_KEY_BYTES)
         self._folder = folder
         with _named_errors("use", self.path / "run"), folder.inner("run") as run:
@@ -322,26 +321,26 @@ class StateDir:
         Raises:
             CatalogLocked: another system has taken the lock already; both use the directory, and one must be stopped.
         """
-        if self.lock < 0:
+        if self._lock.closed:
             return
         found = self._folder.look(_LOCK)
-        if found is not None and os.path.samestat(found, os.fstat(self.lock)):
+        if found is not None and os.path.samestat(found, os.fstat(self._lock.fileno())):
             return
         _log.error("state directory %s: its lock, %s, was removed; it is taken again", self.path, _LOCK)
-        lost, self.lock = self.lock, _take_lock(self._folder)
-        os.close(lost)
+        lost, self._lock = self._lock, _take_lock(self._folder)
+        lost.close()
 
     def close(self) -> None:
         """Remove the files that only a running system needs, and release the lock. A second call does nothing.
 
         Each step is tried. The next start removes the files that cannot be removed now.
         """
-        if self.lock < 0:
+        if self._lock.closed:
             return
         steps = Steps()
         steps.take("removing what only a running system needs", self._clear)
         with contextlib.suppress(OSError):  # the pid in the file is only for people
-            os.ftruncate(self.lock, 0)
+            self._lock.truncate(0)
         steps.take("giving its lock back", self.forget)
         steps.end(f"state directory {self.path}: not closed altogether")
 
@@ -355,8 +354,7 @@ class StateDir:
 
     def forget(self) -> None:
         """Close the lock and the directories, and remove nothing. A forked child must not keep its parent's lock."""
-        lock, self.lock = self.lock, -1
-        os.close(lock)
+        self._lock.close()
         self._run.close()
         self._folder.close()
 
@@ -374,24 +372,25 @@ def open_state_dir(path: Path | str) -> StateDir:
         CatalogLocked: a living system has locked it; `.pid` is the process of that system.
         ConfigError: the directory cannot be written, belongs to another user, or is shared with other users.
     """
-    folder = _open_private(absolute_path(path))
-    try:
-        lock = _take_lock(folder)
-        try:
-            return StateDir(folder, lock)
-        except BaseException:
-            os.close(lock)
-            raise
-    except BaseException:
-        folder.close()
-        raise
+    path = absolute_path(path)
+    with _named_errors("use", path):
+        if path.exists() and not path.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a directory")
+        make_directories(path)
+        folder = Folder.at(path)
+    with contextlib.ExitStack() as if_not:
+        if_not.enter_context(folder)
+        _make_private(folder)
+        lock = if_not.enter_context(_take_lock(folder))
+        opened = StateDir(folder, lock)
+        if_not.pop_all()
+        return opened
 
 
 def absolute_path(path: Path | str) -> Path:
     """Return the real path of a state directory.
 
-    Raises:
-        ConfigError: the path is relative, and the current directory was removed; or it is longer than PATH_BYTES.
+    Raise ConfigError if it is relative to a current directory that was removed, or longer than PATH_BYTES.
     """
     try:
         absolute = Path(os.path.realpath(path))
@@ -415,7 +414,7 @@ def _unusable(path: object, text: str, expected: object, got: object) -> ConfigE
     return ConfigError(f"state directory {text}", file=str(path), key="state_dir", expected=expected, got=got)
 
 
-def _take_lock(folder: Folder) -> int:
+def _take_lock(folder: Folder) -> io.FileIO:
     path = folder.path
     lock_path = path / _LOCK
     with _named_errors("write", lock_path):
@@ -423,52 +422,26 @@ def _take_lock(folder: Folder) -> int:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with _named_errors("write", lock_path):
-            os.ftruncate(lock, 0)
-            os.write(lock, b"%d\n" % os.getpid())
+            lock.truncate(0)
+            lock.write(b"%d\n" % os.getpid())
     except BlockingIOError as error:
-        pid = _pid_in(lock)
-        os.close(lock)
+        text = os.pread(lock.fileno(), 20, 0).strip()
+        pid = int(text) if text.isdigit() else None
+        lock.close()
         who = f"pid {pid}" if pid else "another process"
         instead = "stop that system or choose another state_dir"
         if pid == os.getpid():
             who = f"a system of this same process (pid {pid})"
             instead = f"rr_actors.System.running({str(path)!r}) returns it; use it, or stop it first"
-        raise CatalogLocked(
-            f"state directory {path} is in use by {who}: {instead}",
-            path=str(path),
-            pid=pid,
-        ) from error
+        raise CatalogLocked(f"state directory {path} is in use by {who}: {instead}", path=str(path), pid=pid) from error
     except BaseException:
-        os.close(lock)
+        lock.close()
         raise
     return lock
 
 
-def _pid_in(lock: int) -> int | None:
-    text = os.pread(lock, 20, 0).strip()
-    return int(text) if text.isdigit() else None
-
-
-def _open_private(path: Path) -> Folder:
-    """Open the directory with mode 0700; create it if it does not exist.
-
-    Raises:
-        ConfigError: the directory cannot be opened, or is not this user's alone.
-    """
-    with _named_errors("use", path):
-        if path.exists() and not path.is_dir():
-            raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a directory")
-        make_directories(path)
-        folder = Folder.at(path)
-    try:
-        _tighten(folder)
-    except BaseException:
-        folder.close()
-        raise
-    return folder
-
-
-def _tighten(folder: Folder) -> None:
+def _make_private(folder: Folder) -> None:
+    """Give the directory mode 0700; refuse one that is not this user's alone."""
     path = folder.path
     try:
         mode = stat.S_IMODE(folder.check_owner().st_mode)

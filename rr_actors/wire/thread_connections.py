@@ -65,28 +65,25 @@ class ThreadConnections(Generic[E]):
                 if self.closed or len(self._in_use) + len(self._dialling) >= _LIMIT:
                     return None
                 self._dialling.add(me)
-            return self._open(me, _DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
+            if time.monotonic() < self._dial_after:
+                return None
+            try:
+                line = self._dial(_DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
+            except RrError:
+                line = None
+            if line is None:
+                self._dial_after = time.monotonic() + _AGAIN_S
+                return None
+            self._in_use[line] = me
+            if self.closed:
+                self.drop(line)
+                return None
+            return line
         except BaseException:  # such as KeyboardInterrupt: no caller gets the connection
             self.drop_mine()
             raise
         finally:
             self._dialling.discard(me)
-
-    def _open(self, me: int, timeout_s: float) -> E | None:
-        if time.monotonic() < self._dial_after:
-            return None
-        try:
-            line = self._dial(timeout_s)
-        except RrError:
-            line = None
-        if line is None:
-            self._dial_after = time.monotonic() + _AGAIN_S
-            return None
-        self._in_use[line] = me
-        if self.closed:
-            self.drop(line)
-            return None
-        return line
 
     def give_back(self, line: E) -> None:
         """Make a connection available to other threads: its question has been answered."""

@@ -32,14 +32,11 @@ class Wire(msgspec.Struct, frozen=True):
     buffer_limit_bytes: int
 
 
-def _nobody(_link: Any, message: Any) -> None:
-    raise AssertionError(f"{type(message).__name__} came before there was anybody to receive it")
-
-
 class UnixLink(asyncio.Protocol):
     """A Link, and the protocol of its connection. `closed` is set when `lost` is called."""
 
     more = False
+    _received: Callable[[Any, Any], None]  # set by attach(), before the transport reads
 
     def __init__(
         self,
@@ -66,7 +63,6 @@ class UnixLink(asyncio.Protocol):
         self._open = True
         self._reason: Exception | None = None
         self._receiver: Receiver | None = None
-        self._received: Callable[[Any, Any], None] = _nobody
         self._timer: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
         self._outlet: Outlet | None = None

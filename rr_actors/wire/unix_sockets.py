@@ -89,8 +89,7 @@ class SocketDir:
     def bind(self, name: str) -> socket.socket:
         """Make the socket file with mode 0600; it refuses connections until the caller listens.
 
-        Raises:
-            ConfigError: the file cannot be made, or a file of this name exists.
+        Raise ConfigError if the file cannot be made, or exists.
         """
         unbound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:

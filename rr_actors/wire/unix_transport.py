@@ -80,11 +80,7 @@ class UnixTransport:
         self.links: set[UnixLink] = set()
 
     async def listen(self, accept: Accept) -> None:
-        """Accept links from now on.
-
-        Raises:
-            ConfigError: the socket cannot be made in the socket directory.
-        """
+        """Accept links from now on; raise ConfigError if the socket cannot be made."""
         if self._server is not None or self._closed:
             raise UsageError(f"transport {self.address}: listens already, or is closed")
         self.accept = accept
@@ -96,10 +92,9 @@ class UnixTransport:
         return await loop.create_unix_server(lambda: _Acceptor(self, self._key), sock=listener, backlog=_BACKLOG)
 
     async def keep(self) -> bool:
-        """Make the socket's file again if it was removed, and return whether it was. Open links are not affected.
+        """Make the socket's file again if it was removed, or raise ConfigError; return whether it was.
 
-        Raises:
-            ConfigError: the file cannot be made.
+        Open links are not affected.
         """
         if self._server is None or self._closed or self._sockets.has(self.address):
             return False
@@ -128,11 +123,7 @@ class UnixTransport:
                 raise
 
     def dial(self, address: str, hello: Hello, timeout_s: float) -> BlockingLink:
-        """Open a connection for the calling thread alone. From any thread.
-
-        Raises:
-            RrError: the errors of connect().
-        """
+        """Open a connection for the calling thread alone. From any thread. Raises the errors of connect()."""
         return BlockingLink(self._sockets, self._key, address, hello, self.wires[hello.kind], timeout_s)
 
     async def _dial(self, address: str, hello: Hello, deadline: float) -> socket.socket:
@@ -152,11 +143,7 @@ class UnixTransport:
                 raise Unavailable(f"nobody listens for {hello.to} at {address}: {error}") from error
 
     def sweep(self) -> None:
-        """Remove the sockets of dead processes from the socket directory. From any thread.
-
-        Raises:
-            OSError: the directory cannot be read.
-        """
+        """Remove the sockets of dead processes; raise OSError if the directory cannot be read. From any thread."""
         self._sockets.sweep()
 
     async def close(self) -> None:

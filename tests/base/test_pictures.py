@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rr_actors as rr
-from rr_actors.base.pictures.html_tables import table
-from rr_actors.base.pictures.mime_bundles import bundle_or_text
-from rr_actors.base.pictures.svg_pictures import Box, draw
+from rr_actors.base.notebook import bundle_or_text, table
+from rr_actors.base.svg_pictures import Box, draw
 from support import serve
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -71,6 +71,18 @@ def test_the_most_reliable_component_of_the_type_is_loaded_with_its_parameters_f
     assert not running_programs()
 
 
+def test_components_whose_names_and_instances_have_colons_share_no_program(begin: Begin) -> None:
+    program = 'command = "${python}"\narguments = ["-c", "import time; time.sleep(600)"]\ngrace_s = 1\n'
+    entry = '[[component]]\nname = "{0}"\ntype = "{0}"\n[component.program]\n'
+    _, app = begin(*(entry.format(name) + program for name in ("arm", "arm:left")))
+    with (
+        app.load("components/component", LoadComponent("arm", instance="left:1")) as one,
+        app.load("components/component", LoadComponent("arm:left", instance="1")) as other,
+    ):
+        assert one.response.pid != other.response.pid
+        assert set(running_programs()) == {one.response.pid, other.response.pid}
+
+
 def test_a_component_that_fails_is_replaced_by_the_next_best_and_its_holders_hear_update(begin: Begin) -> None:
     _, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8))
     heard = Calls()

@@ -51,8 +51,8 @@ PURE_WORDS = tuple(
     f"rr_actors.{name}"
     for name in (
         "registrar.core", "registrar.model", "supervision.core",
-        "base.errors", "base.names", "base.values", "base.checks", "base.spec_files", "base.scarcity",
-        "base.pictures",
+        "base.errors", "base.names", "base.values", "base.checks", "base.toml", "base.scarcity",
+        "base.notebook", "base.svg_pictures",
     )
 )  # fmt: skip
 

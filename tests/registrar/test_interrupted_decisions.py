@@ -23,7 +23,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Hold, Notice, State
-from rr_actors.storage.memory_store import MemoryStore
+from rr_actors.storage.store import MemoryStore
 from simulation.quiescence import compared
 
 HERE = Path(rr_actors.__file__).parent

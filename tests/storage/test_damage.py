@@ -260,3 +260,38 @@ def test_a_full_disk_leaves_the_record_of_a_catalog_as_it_was(
     assert witness.known() == Known("id", 1, "/nowhere")
     witness.note(Known("id", 3, "/nowhere"))
     assert witness.known() == Known("id", 3, "/nowhere")
+
+
+def test_a_power_cut_leaves_the_record_of_a_catalog_for_which_commits_survive_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of what was not synced, it takes a file's content, and the new name of a file."""
+    path, record, fsync = left_by(tmp_path, "power"), tmp_path / "left" / ".catalogs" / "app", os.fsync
+    older = shutil.copytree(path.parent, tmp_path / "older")
+    synced: list[tuple[int, bool]] = []  # what, and whether the new record had its name by then
+    before = record.stat().st_ino
+
+    def synced_to_disk(fd: int) -> None:
+        synced.append((os.fstat(fd).st_ino, record.stat().st_ino != before))
+        fsync(fd)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", synced_to_disk)
+        opened(path, "power").close()
+    assert (record.stat().st_ino, False) in synced
+    assert (record.parent.stat().st_ino, True) in synced
+    shutil.rmtree(path.parent)
+    shutil.copytree(older, path.parent)
+    opened(path, "power").close()
+    assert "it was put back from an older copy" in caplog.text
+
+
+def test_records_that_cannot_be_reached_are_told_of_and_hold_up_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / ".catalogs").write_bytes(b"something else")
+    witness = Witness(tmp_path, "app")
+    for use in (witness.known, lambda: witness.note(Known("id", 1, "/nowhere")), witness.forget):
+        assert use() is None
+        assert "cannot be read or written" in caplog.text
+        caplog.clear()

@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, apply, content_of, rows_of
 from rr_actors.storage import journaled_store
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.journaled_store import End, Owner, Segment
+from rr_actors.storage.journaled_store import End, Segment
+from rr_actors.storage.sql_tables import Meta
 from support_stores import CHANGES, folder_of, in_order, part, query, segments_of, states
 
-OWNER = Owner("0123456789abcdef", 3)
+OWNER = Meta("0123456789abcdef", 3, 0)
 HISTORY: list[list[list[Change]]] = [
     [[Put(query("a")), Put(part("r", b"x" * 50))], [Put(query("a", 2)), Put(Peer("hub"))]],
     [[Drop("queries", "a"), Put(query("b", 2**62))]],
@@ -40,7 +41,7 @@ def catalog(tmp_path: Path) -> Path:
     return tmp_path / "reg" / "catalog.sqlite3"
 
 
-def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Owner = OWNER) -> list[Path]:
+def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Meta = OWNER) -> list[Path]:
     """Write segments as a store does, each with some commits; return them."""
     for path in segments_of(catalog):
         path.unlink()
@@ -54,9 +55,9 @@ def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Own
     return segments_of(catalog)
 
 
-def rows(catalog: Path, folded: int = 0, base: Sequence[Row] = (), owner: Owner = OWNER) -> list[Row]:
+def rows(catalog: Path, folded: int = 0, base: Sequence[Row] = (), owner: Meta = OWNER) -> list[Row]:
     content = content_of(base)
-    apply(content, journaled_store.read(folder_of(catalog), catalog).since(folded, owner))
+    apply(content, journaled_store.read(folder_of(catalog), catalog).since(Meta(owner.id, owner.epoch, folded)))
     return in_order(rows_of(content))
 
 
@@ -118,9 +119,9 @@ def test_segments_are_read_in_the_order_of_their_numbers_and_other_files_are_non
 def test_catalogs_in_one_directory_have_journals_of_their_own(catalog: Path) -> None:
     write(catalog, [[[Put(query("a"))]]])
     another = catalog.with_name("another.sqlite3")
-    write(another, [[[Put(query("b"))]]], Owner("another", 1))
+    write(another, [[[Put(query("b"))]]], Meta("another", 1, 0))
     assert rows(catalog) == [query("a")]
-    assert rows(another, owner=Owner("another", 1)) == [query("b")]
+    assert rows(another, owner=Meta("another", 1, 0)) == [query("b")]
 
 
 # -- cut off -------------------------------------------------------------------------------------------------------
@@ -247,14 +248,14 @@ def test_a_segment_that_is_known_to_be_begun_is_missed_though_it_is_the_last(
 ) -> None:
     paths = write(catalog, HISTORY)
     found = journaled_store.read(folder_of(catalog), catalog)
-    assert len(found.since(0, OWNER, 4)) == len([change for changes in flat(HISTORY) for change in changes])
+    assert len(found.since(OWNER, 4)) == len([change for changes in flat(HISTORY) for change in changes])
     assert caplog.text == ""
     for spoil in (Path.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(bytes(500))):
         paths[-1].touch()
         spoil(paths[-1])
-        assert journaled_store.read(folder_of(catalog), catalog).since(0, OWNER, 3) != []
+        assert journaled_store.read(folder_of(catalog), catalog).since(OWNER, 3) != []
         assert caplog.text == ""
-        journaled_store.read(folder_of(catalog), catalog).since(0, OWNER, 4)
+        journaled_store.read(folder_of(catalog), catalog).since(OWNER, 4)
         assert "catalog.journal.4: missing" in caplog.text
         caplog.clear()
 
@@ -341,10 +342,12 @@ def test_swapped_segments_are_damage(catalog: Path) -> None:
     assert rows(catalog) == states(flat(HISTORY))[-1]
 
 
-@pytest.mark.parametrize("owner", [Owner("another", 3), Owner(OWNER.id, 2), Owner("", 3), Owner(OWNER.id[:15], 3)])
+@pytest.mark.parametrize(
+    "owner", [Meta("another", 3, 0), Meta(OWNER.id, 2, 0), Meta("", 3, 0), Meta(OWNER.id[:15], 3, 0)]
+)
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_a_segment_of_another_catalog_or_an_earlier_epoch_is_damage_unless_it_is_folded(
-    catalog: Path, owner: Owner, number: int, tmp_path: Path
+    catalog: Path, owner: Meta, number: int, tmp_path: Path
 ) -> None:
     (tmp_path / "other").mkdir()
     theirs = write(tmp_path / "other" / "catalog.sqlite3", HISTORY, owner)
@@ -358,7 +361,7 @@ def test_a_segment_of_another_catalog_or_an_earlier_epoch_is_damage_unless_it_is
 
 def test_a_segment_of_a_later_epoch_is_read(catalog: Path) -> None:
     """A power cut has taken the -wal in which that epoch was counted."""
-    write(catalog, HISTORY, Owner(OWNER.id, 4))
+    write(catalog, HISTORY, Meta(OWNER.id, 4, 0))
     assert rows(catalog) == states(flat(HISTORY))[-1]
 
 

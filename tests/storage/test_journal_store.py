@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import gc
 import json
 import os
 import resource
@@ -29,12 +31,14 @@ from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, rows_of
 from rr_actors.storage import journaled_store, opening
 from rr_actors.storage import journaled_store as journaled_module
+from rr_actors.storage.catalog_lock import CatalogLock
 from rr_actors.storage.journaled_store import JournaledStore, Segment
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import SqliteStore
 from rr_actors.storage.store import Store
 from rr_actors.system.registrar_lookup import forget
 from support import REPOSITORY
+from support_interrupts import interrupted
 from support_stores import belonging_to_another, in_order, part, query, segments_of
 
 
@@ -352,6 +356,34 @@ def test_an_interrupt_after_a_segment_is_begun_loses_nothing_that_is_committed_l
     assert in_order(read_rows(left_by(path))) == [query("b")]
     store.close()
     assert in_order(read_rows(path)) == [query("b")]
+
+
+def test_an_interrupt_of_a_commit_leaves_no_descriptor(path: Path) -> None:
+    """Where Python delivers a signal, and so between the opening of a journal's file and the next instruction, too."""
+    point, where = 0, "not yet"
+    while where:
+        point += 1
+        store = journaled(path)
+        where = interrupted(functools.partial(store.commit, [Put(query("a"))]), point).where
+        store.commit([Put(query("b"))])
+        assert query("b") in content(store), where
+        store.close()
+        gc.collect()  # an error holds what its traceback leads to
+        assert descriptors(path) == 0, where
+    assert point > 20
+
+
+def test_an_interrupt_while_a_catalog_is_locked_leaves_it_free(path: Path) -> None:
+    path.parent.mkdir()
+    with Folder.at(path.parent) as folder:
+        point, where = 0, "not yet"
+        while where:
+            point += 1
+            where = interrupted(lambda: CatalogLock(folder, path).release(), point).where
+            gc.collect()
+            assert descriptors(path) == 1, where  # the directory's
+            CatalogLock(folder, path).release()
+    assert point > 20
 
 
 def interrupt(*_: object) -> None:

@@ -276,7 +276,7 @@ def test_somebody_who_exchanges_a_file_all_the_time_gets_nothing_emptied(tmp_pat
         with Folder.at(place) as folder:
             while refused < 20 or opened < 20:
                 try:
-                    os.close(folder.open("file", os.O_RDWR | os.O_CREAT | os.O_TRUNC))
+                    folder.open("file", os.O_RDWR | os.O_CREAT | os.O_TRUNC).close()
                     opened += 1
                 except OSError:
                     refused += 1

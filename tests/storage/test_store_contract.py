@@ -30,10 +30,9 @@ from rr_actors.base.pickling import dumps, loads
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, content_of, rows_of
 from rr_actors.storage.checked_records import errors_named
-from rr_actors.storage.memory_store import MemoryStore
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sql_tables import SCHEMA_VERSION
-from rr_actors.storage.store import Store
+from rr_actors.storage.store import MemoryStore, Store
 from support_stores import COMMITS, in_order, part, query, states
 
 ROOT = Path(__file__).parents[2]

@@ -30,7 +30,8 @@ from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import Held, Hold, Put, State
-from rr_actors.storage.journaled_store import End, Owner, Segment
+from rr_actors.storage.journaled_store import End, Segment
+from rr_actors.storage.sql_tables import Meta
 from support import Calls
 
 LOADS = 100
@@ -250,7 +251,7 @@ def test_rows_that_might_have_too_large_a_number_are_looked_at_quickly(tmp_path:
     response = b"\x81" + bytes(0xCF - 1)
     rows = [Put(Held(str(n), "p", "s", b"", response, "r", "", 0, n, Hold.HELD, State.OK)) for n in range(LOADS)]
     folder = Folder.at(tmp_path)
-    segment = Segment(folder, tmp_path / "catalog.db", Owner("0" * 16, 1), 1, End())
+    segment = Segment(folder, tmp_path / "catalog.db", Meta("0" * 16, 1, 0), 1, End())
     try:
         segment.append(rows[:1])
         calls = calls_of(lambda: segment.append(rows), c_calls=True)

@@ -8,9 +8,12 @@ a type, the provider decodes to it and encodes again. Then a dict equals the dat
 
 from __future__ import annotations
 
+import pathlib
 import re
-from collections.abc import Iterator
-from typing import Any, NoReturn, cast
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, NoReturn, cast
 
 import msgspec
 from msgspec.inspect import AnyType, DictType
@@ -25,9 +28,17 @@ from rr_actors.base.errors import (
     shown,
     text_of,
 )
-from rr_actors.base.values.codecs import NoForm
-from rr_actors.base.values.declared_types import declared_type, value_of
+from rr_actors.base.values.codecs import (
+    NAMED,
+    NoForm,
+    Tagged,
+    is_numpy_type,
+    is_pydantic_model,
+    pydantic_value,
+    split_name,
+)
 from rr_actors.base.values.fitting import (
+    Mark,
     Misfit,
     Unfit,
     bare,
@@ -78,14 +89,14 @@ class Codec:
 
     def __init__(self, type_: Any = None, what: str = "request") -> None:
         self.type = type_
-        wanted = Any if type_ is None else declared_type(type_)
+        wanted = Any if type_ is None else _declared_type(type_)
         self._shape = shape_of(wanted, what)
         self._gaps = gaps_of(self._shape)
         self._has_class = has_class(self._shape)
         self._runs_code = runs_code(self._shape)
         self._takes_any = any(isinstance(part, AnyType) for _, part in walk(self._shape, ""))
-        self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=self._declared).decode
-        self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=self._declared).decode
+        self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=_value_of).decode
+        self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=_value_of).decode
 
     def encode(self, value: object, server: str = "", what: str = "response") -> bytes:
         """Return the canonical bytes of a value of this type. They are decoded once as a check.
@@ -127,16 +138,6 @@ class Codec:
             return self._read_marked(fitted)
         except Exception as error:
             _refuse(_misfit(error, fitted, self._shape, what), server, what, error)
-
-    def _declared(self, type_: Any, read: Any) -> Any:
-        """Return the value of a type that msgspec does not know (msgspec's dec_hook)."""
-        return value_of(type_, read, self._of)
-
-    def _of(self, type_: Any, raw: bytes) -> Any:
-        """Decode bytes to one type of a union."""
-        codec = Codec(type_)
-        codec.canonical(raw)  # refuses unknown fields
-        return codec.decode(raw)
 
     def runs_code(self, raw: bytes) -> bool:
         """Return whether decoding these bytes may run a user's code: a __post_init__, a pydantic model, an rr.codec."""
@@ -191,6 +192,98 @@ def shown_plain(raw: bytes) -> Any:
         return None
 
 
+# -- declared types that msgspec does not know, and unions of classes that it cannot tell apart -----------------------
+
+
+def _declared_type(type_: Any) -> Any:
+    """Return the type with a Tagged class in place of each union that msgspec cannot tell apart."""
+    try:
+        msgspec.msgpack.Decoder(type_)
+    except Exception:  # shape_of() reports the error
+        return _replaced(type_)
+    return type_
+
+
+def _replaced(type_: Any) -> Any:
+    origin, arguments = typing.get_origin(type_), typing.get_args(type_)
+    if origin in (typing.Union, types.UnionType):
+        return _tagged(arguments) if _needs_names(type_) else type_
+    if origin is Annotated:
+        return Annotated[(_replaced(arguments[0]), *arguments[1:])]
+    if origin is None or not isinstance(origin, type) or not issubclass(origin, (list, dict, tuple, set, frozenset)):
+        return type_
+    return cast("Any", origin)[tuple(argument if argument is ... else _replaced(argument) for argument in arguments)]
+
+
+def _needs_names(type_: Any) -> bool:
+    try:
+        msgspec.msgpack.Decoder(type_)
+    except TypeError as error:
+        return any(text in str(error) for text in ("may not contain more than one", "must be tagged", "a custom type"))
+    except Exception:
+        return False
+    return False
+
+
+def _tagged(alternatives: tuple[Any, ...]) -> Any:
+    classes = [part for part in alternatives if isinstance(part, type) and _is_class(part)]
+    names = [part.__name__ for part in classes]
+    rest = [part for part in alternatives if part not in classes and part is not type(None)]
+    if len(set(names)) != len(names):
+        return _union(alternatives)  # their names do not tell either
+    members = {"classes": dict(zip(names, classes, strict=True)), "others": _union(rest) if rest else None}
+    tagged = cast("Any", type(Tagged))(" | ".join(names), (Tagged,), members)
+    return tagged | None if type(None) in alternatives else tagged
+
+
+def _union(types_: Sequence[Any]) -> Any:
+    return cast("Any", typing.Union)[tuple(types_)]
+
+
+def _is_class(part: Any) -> bool:
+    """Return whether bytes carry the name of this class."""
+    return (
+        hasattr(part, "__dataclass_fields__")
+        or hasattr(part, "__attrs_attrs__")
+        or issubclass(part, msgspec.Struct)
+        or is_pydantic_model(part)
+    )
+
+
+def _value_of(type_: Any, read: Any) -> Any:
+    """Return the value of a type that msgspec does not know (its dec_hook), made of the plain value or mark `read`.
+
+    Raise TypeError or ValueError if `read` is not a value of the type.
+    """
+    cls: Any = typing.get_origin(type_) or type_
+    if issubclass(cls, Tagged):
+        return _one_of(cls, read)
+    if isinstance(read, cls):
+        return read
+    if is_pydantic_model(cls):
+        return pydantic_value(cls, plain(read))
+    if cls is complex and isinstance(read, (int, float)):
+        return complex(read)
+    if is_numpy_type(cls) and cls.__name__ != "ndarray" and isinstance(read, (bool, int, float, complex)):
+        return cls(read)
+    if issubclass(cls, pathlib.PurePath) and isinstance(read, str):
+        return cls(read)
+    raise TypeError(f"expected {cls.__name__}, got {type(read).__name__} ({shown(read)})")
+
+
+def _one_of(cls: type[Tagged], read: Any) -> Any:
+    if isinstance(read, Mark) and read.code == NAMED:
+        name, body = split_name(read.data)
+        if name in cls.classes:
+            codec = Codec(cls.classes[name])
+            codec.canonical(body)  # refuses unknown fields
+            return codec.decode(body)
+        raise TypeError(f"expected one of {', '.join(cls.classes)}, got a {shown(name)}")
+    if cls.others is not None:
+        return msgspec.convert(read, cls.others)
+    raise TypeError(f"expected a value of one of the classes {', '.join(cls.classes)}, got {type(read).__name__}")
+
+
 # -- a value that cannot be encoded: where and why -----------------------------------------------------------------
 
 
@@ -208,25 +301,24 @@ def _refuse_value(value: object, what: str, error: Exception) -> NoReturn:
             path, got = what, "one that is nested too deeply"
             break
     else:
-        got = _describe(value, error)
+        try:
+            got = _described(value, error)
+        except Exception:
+            got = f"an object of type {name_of_class(type(value))}, whose own code raised {text_of(error)}"
     raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {got}", path=path) from error
 
 
 def _failing_part(value: object) -> tuple[str, object, Exception] | None:
-    for suffix, part in _parts(value):
+    try:
+        parts = list(_each_part(value))
+    except Exception:  # of the value's own code
+        return None
+    for suffix, part in parts:
         try:
             packed(part)
         except Exception as error:
             return suffix, part, error
     return None
-
-
-def _parts(value: object) -> list[tuple[str, object]]:
-    """Return the parts of a value; [] if its own code raises."""
-    try:
-        return list(_each_part(value))
-    except Exception:
-        return []
 
 
 def _each_part(value: object) -> Iterator[tuple[str, object]]:
@@ -241,13 +333,6 @@ def _each_part(value: object) -> Iterator[tuple[str, object]]:
     elif isinstance(value, (list, tuple, set, frozenset)):
         for index, item in enumerate(cast("list[object]", value)):
             yield f"[{index}]", item
-
-
-def _describe(value: Any, error: Exception) -> str:
-    try:
-        return _described(value, error)
-    except Exception:
-        return f"an object of type {name_of_class(type(cast('object', value)))}, whose own code raised {text_of(error)}"
 
 
 def _described(value: Any, error: Exception) -> str:

@@ -34,19 +34,12 @@ class NoForm(TypeError):
 
 
 class Kind(msgspec.Struct, frozen=True):
-    """One builtin type that keeps its type without annotations.
+    """One builtin type that keeps its type without annotations."""
 
-    Attributes:
-        code: the code of the extension.
-        type: the class; exactly this one, no subclass.
-        plain: returns a value's plain form, which MessagePack can carry.
-        make: returns the value of a plain form. It may raise any error.
-    """
-
-    code: int
-    type: type
-    plain: Callable[[Any], Any]
-    make: Callable[[Any], Any]
+    code: int  # of the extension
+    type: type  # exactly this class, no subclass
+    plain: Callable[[Any], Any]  # returns a value's plain form, which MessagePack can carry
+    make: Callable[[Any], Any]  # returns the value of a plain form, or raises any error
 
 
 def _made_of(cls: Callable[..., Any], parts: Any) -> Callable[[Any], Any]:
@@ -161,11 +154,7 @@ def numpy_form(value: Any) -> tuple[int, list[Any]] | None:
 
 
 def numpy_value(code: int, plain: Any) -> Any:
-    """Return the array or scalar of this plain form.
-
-    Raises:
-        ValueError: numpy is not imported in this process, or the form is wrong.
-    """
+    """Return the array or scalar of this plain form; raise ValueError if it is wrong, or numpy is not imported here."""
     numpy: Any = sys.modules.get("numpy")
     if numpy is None:
         raise ValueError("a numpy value, where numpy is not imported: import it in the module of the callbacks")
@@ -194,11 +183,7 @@ def is_pydantic_model(cls: object) -> bool:
 
 
 def pydantic_form(model: Any) -> Any:
-    """Return the plain form of a pydantic model, from which its class makes an equal model.
-
-    Raises:
-        NoForm: the class does not, or the model has a set of several items.
-    """
+    """Return the plain form of a pydantic model; raise NoForm if its class may not make an equal model of that."""
     if _has_set(model.model_dump()):
         raise NoForm(f"a {type(model).__name__} with a set, whose JSON has no order: give it an rr.codec")
     cls: Any = model.__class__
@@ -237,15 +222,10 @@ class _OfAny(type):
 
 
 class Tagged(metaclass=_OfAny):
-    """A type in the place of a union of classes that msgspec cannot tell apart: bytes tell them apart by name.
+    """A type in the place of a union of classes that msgspec cannot tell apart: bytes tell them apart by name."""
 
-    Attributes:
-        classes: the classes by their names.
-        others: the type of the other values; None if the union has only classes.
-    """
-
-    classes: dict[str, Any]
-    others: Any
+    classes: dict[str, Any]  # by their names
+    others: Any  # the type of the other values; None if the union has only classes
 
 
 def is_known(cls: Any) -> bool:

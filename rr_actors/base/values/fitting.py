@@ -171,9 +171,7 @@ def bare(raw: bytes) -> bytes:
 def fit(node: Any, shape: Shape, path: str) -> Any:
     """Open each mark for which the shape declares a type, and return the tree.
 
-    Raises:
-        Unfit: this process cannot open a mark.
-        Exception: a mark is damaged.
+    Raise Unfit for a mark that this process cannot open, and any error for a damaged one.
     """
     if isinstance(shape, inspect.UnionType):
         shape = _chosen(shape, node)
@@ -230,8 +228,9 @@ def _fit_list(node: list[Any], shape: Shape, path: str) -> list[Any]:
 def _chosen(shape: inspect.UnionType, node: Any) -> Shape:
     """Return the one type of a union that fits the node."""
     if isinstance(node, Mark):
-        if any(isinstance(part, inspect.CustomType) for part in shape.types):
-            return inspect.AnyType() if node.code not in (NAMED, CODEC) else _custom_of(shape)
+        customs = [part for part in shape.types if isinstance(part, inspect.CustomType)]
+        if customs:
+            return customs[0] if node.code in (NAMED, CODEC) else inspect.AnyType()
         node = opened(node)
     if not isinstance(node, (dict, list)):
         return inspect.NoneType()  # the node is plain, or becomes plain when it is opened
@@ -241,10 +240,6 @@ def _chosen(shape: inspect.UnionType, node: Any) -> Shape:
             if field is not None and cast("dict[Any, Any]", node).get(field) == cast("inspect.StructType", part).tag:
                 return part
     return alternative(shape, cast("object", node))
-
-
-def _custom_of(shape: inspect.UnionType) -> Shape:
-    return next(part for part in shape.types if isinstance(part, inspect.CustomType))
 
 
 def _check_marks(node: Any, path: str) -> None:

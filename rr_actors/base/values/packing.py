@@ -138,16 +138,10 @@ _encode = msgspec.msgpack.Encoder(order="sorted", enc_hook=_pack_unknown).encode
 
 
 class _Layout(msgspec.Struct, frozen=True):
-    """How the values of one class are packed.
+    """How the values of one class are packed."""
 
-    Attributes:
-        head: the class's name, packed.
-        open: the attributes that may hold any value, by the class's annotations.
-        cls: a weak reference to the class.
-    """
-
-    head: bytes
-    open: tuple[str, ...]
+    head: bytes  # the class's name, packed
+    open: tuple[str, ...]  # the attributes that may hold any value, by the class's annotations
     cls: weakref.ref[type]
 
 

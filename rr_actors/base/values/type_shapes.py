@@ -28,8 +28,7 @@ _LISTS = (
 def shape_of(type_: Any, what: str) -> Shape:
     """Return the type's shape; None stands for any plain value.
 
-    Raises:
-        NotSerializable: plain data cannot have that type; `.path` leads to the part.
+    Raise NotSerializable for a type that plain data cannot have; `.path` leads to the part.
     """
     if type_ is None:
         return inspect.AnyType()

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal, cast
 
 from rr_actors.base.errors import UsageError, shown
-from rr_actors.base.pictures.mime_bundles import bundle
-from rr_actors.base.pictures.svg_pictures import Box, draw
+from rr_actors.base.notebook import bundle
+from rr_actors.base.svg_pictures import Box, draw
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 
 Node = Mapping[str, Any]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args
 
 from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
-from rr_actors.base.spec_files import FilePath, parse_child, read_supervisor
+from rr_actors.base.toml import FilePath, parse_child, read_supervisor
 
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one"]
 RestartType = Literal["permanent", "transient", "temporary"]

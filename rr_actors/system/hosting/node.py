@@ -42,9 +42,8 @@ from rr_actors.registrar.model.messages import Failure, Gone, Message, retired
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
 from rr_actors.runtime.garbage import left_alone
 from rr_actors.runtime.processes.process import Spawner
-from rr_actors.storage.memory_store import MemoryStore
 from rr_actors.storage.opening import open_store
-from rr_actors.storage.store import Store
+from rr_actors.storage.store import MemoryStore, Store
 from rr_actors.storage.witness import Witness
 from rr_actors.system.hosting.recorder import Recorder
 from rr_actors.system.hosting.remote_calls import KIND, Door, HandleLine, HandleMessage

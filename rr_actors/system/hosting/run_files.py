@@ -47,14 +47,10 @@ class Watched:
 
     def _open(self) -> mmap.mmap:
         try:
-            with Folder.at(self._run_dir) as run:
-                fd = run.open(_NAME, os.O_RDWR | os.O_CREAT)
-            try:
-                os.ftruncate(fd, 1)
-                self._file = os.fstat(fd)
-                return mmap.mmap(fd, 1)
-            finally:
-                os.close(fd)
+            with Folder.at(self._run_dir) as run, run.open(_NAME, os.O_RDWR | os.O_CREAT) as file:
+                file.truncate(1)
+                self._file = os.fstat(file.fileno())
+                return mmap.mmap(file.fileno(), 1)
         except OSError as error:
             path = self._run_dir / _NAME
             advice = wanted_by(error) or "remove it, or choose another state_dir"

@@ -14,8 +14,7 @@ import msgspec
 
 from rr_actors.base.checks import Extra
 from rr_actors.base.errors import NotFound, UsageError, shown
-from rr_actors.base.pictures.html_tables import table
-from rr_actors.base.pictures.mime_bundles import bundle
+from rr_actors.base.notebook import bundle, table
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.timings import Timing, timings_of

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from rr_actors.base.pictures.html_tables import escape
+from rr_actors.base.notebook import escape
 
 MOST = 500
 """The most boxes of a picture; its last line counts the boxes that are left out."""
