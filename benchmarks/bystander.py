@@ -72,11 +72,7 @@ def beside(opens: Opens, times: int, small: int) -> Iterator[tuple[Grown, Bystan
 
     Both on one core where that can be chosen: else the one or the other is quicker for where the kernel has put it.
     """
-    with (
-        placement.here(placement.placements()[0]),
-        Bystander(opens, times, small) as bystander,
-        opens(times) as grown,
-    ):
+    with placement.here(placement.placements()[0]), Bystander(opens, times, small) as bystander, opens(times) as grown:
         yield grown, bystander
 
 

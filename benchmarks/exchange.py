@@ -81,12 +81,7 @@ def exchange(many: int, loads: int) -> list[Row]:
         _beside(few_rate, f"{what} pair", pair_rate),
         _beside(few_rate, what, many_rate),
         Row("threads in each process, 2 managers", few_threads, ""),
-        Row(
-            f"threads in each process, {many} managers",
-            max(pair_threads, many_threads),
-            "",
-            at_most=few_threads + 1,
-        ),
+        Row(f"threads in each process, {many} managers", max(pair_threads, many_threads), "", at_most=few_threads + 1),
         *_floor(many),
     ]
 

@@ -43,11 +43,7 @@ def same_process(times: int) -> list[Row]:
     for placement in placement_of.placements():
         if placement == placement_of.TWO_CORES:
             continue  # its threads cannot be told apart from outside
-        with (
-            placement_of.here(placement),
-            pykka_ask(PAYLOAD) as ask,
-            running("none", "thread") as (system, consumer),
-        ):
+        with placement_of.here(placement), pykka_ask(PAYLOAD) as ask, running("none", "thread") as (system, consumer):
             asked, load = _measure(ask, system, consumer, times)
         rows.append(Row(f"pykka ask, this process, {placement}", asked.median * 1e6, "µs", asked.p99 * 1e6))
         rows.append(_row("warm load, this process", load, asked, "ask", 1.5))

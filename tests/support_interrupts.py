@@ -545,10 +545,7 @@ def scenes() -> Iterator[Scene]:
         _remove("extra"),
     )
     yield Scene(
-        "restart_child",
-        lambda world: world.system.supervisor().restart_child("extra"),
-        _terminated,
-        _remove("extra"),
+        "restart_child", lambda world: world.system.supervisor().restart_child("extra"), _terminated, _remove("extra")
     )
 
 

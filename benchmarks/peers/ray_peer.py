@@ -51,10 +51,7 @@ def contest() -> Iterator[Contest]:
                 return seconds_away(lambda: os.kill(pid, signal.SIGKILL), call)
 
             yield Contest(
-                ray.__version__,
-                lambda times: time_each(call, times),
-                lambda times: seconds_of(many, times),
-                kill,
+                ray.__version__, lambda times: time_each(call, times), lambda times: seconds_of(many, times), kill
             )
         finally:
             ray.shutdown()

@@ -50,10 +50,7 @@ def ahead(pose: Pose, route: Sequence[Point]) -> Point:
     for _, end in legs[nearest:]:
         length = distance(point, end)
         if length >= left_m:
-            return Point(
-                point.x + (end.x - point.x) * left_m / length,
-                point.y + (end.y - point.y) * left_m / length,
-            )
+            return Point(point.x + (end.x - point.x) * left_m / length, point.y + (end.y - point.y) * left_m / length)
         point, left_m = end, left_m - length
     return point
 

@@ -60,13 +60,7 @@ class Driver:
     """
 
     def __init__(
-        self,
-        dispatcher: Dispatcher,
-        life: Coroutine[Request, Any, None],
-        mailbox: Mailbox,
-        name: str,
-        *,
-        on_loop: bool,
+        self, dispatcher: Dispatcher, life: Coroutine[Request, Any, None], mailbox: Mailbox, name: str, *, on_loop: bool
     ) -> None:
         self._dispatcher = dispatcher
         self._life = life

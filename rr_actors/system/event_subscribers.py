@@ -28,15 +28,7 @@ class _ChildEvent(TypedDict):
     """The keys that every ChildEvent has."""
 
     event: Literal[
-        "started",
-        "restarted",
-        "ignored",
-        "start_failed",
-        "exited",
-        "stopped",
-        "deleted",
-        "gave_up",
-        "auto_shutdown",
+        "started", "restarted", "ignored", "start_failed", "exited", "stopped", "deleted", "gave_up", "auto_shutdown"
     ]
     path: str
     kind: Literal["manager", "actor", "supervisor"]

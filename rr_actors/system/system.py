@@ -69,23 +69,10 @@ from rr_actors.system.hosting.node import Node, SystemInfo
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings, begin
-from rr_actors.system.registrar_lookup import (
-    give_up,
-    give_up_clients,
-    left_behind,
-    open_registrar,
-    registrar_in,
-)
+from rr_actors.system.registrar_lookup import give_up, give_up_clients, left_behind, open_registrar, registrar_in
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.web_process import WebPage
-from rr_actors.wire.name_service import (
-    StateDir,
-    Status,
-    absolute_path,
-    actor_key,
-    open_state_dir,
-    registrar_key,
-)
+from rr_actors.wire.name_service import StateDir, Status, absolute_path, actor_key, open_state_dir, registrar_key
 
 logger = logging.getLogger("rr_actors")
 

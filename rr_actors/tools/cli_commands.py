@@ -38,11 +38,7 @@ class _Commands(TyperGroup):
 
 
 app = typer.Typer(
-    name="rr-actors",
-    cls=_Commands,
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
+    name="rr-actors", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
 )
 _PIPED_WIDTH = 200
 

@@ -507,11 +507,7 @@ def test_an_actor_that_never_was_is_dead(home: Home) -> None:
 
 @pytest.mark.parametrize(
     ("status", "error"),
-    [
-        (Status.STARTING, ActorUnavailable),
-        (Status.STOPPED, pykka.ActorDeadError),
-        (Status.GONE, pykka.ActorDeadError),
-    ],
+    [(Status.STARTING, ActorUnavailable), (Status.STOPPED, pykka.ActorDeadError), (Status.GONE, pykka.ActorDeadError)],
 )
 def test_the_directory_says_what_a_missing_actor_is(home: Home, status: Status, error: type[Exception]) -> None:
     home.mark("root/a", status)

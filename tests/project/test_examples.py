@@ -12,10 +12,7 @@ import pytest
 from support import REPOSITORY
 
 EXPECTED = {
-    "first_resource": [
-        "loaded: Feed(topic='/camera/dev/video0')",
-        "unloaded: nothing is held any more",
-    ],
+    "first_resource": ["loaded: Feed(topic='/camera/dev/video0')", "unloaded: nothing is held any more"],
     "sharing": [
         "two holders, one camera: True, opened 1 time",
         "first leaves: camera stays open",
@@ -47,11 +44,7 @@ EXPECTED = {
         "the counter kept its place: True",
         "nothing was loaded twice: True",
     ],
-    "run_time_registration": [
-        "twice 21 is 42",
-        "it ran in another process: True",
-        "after a respawn, twice 4 is 8",
-    ],
+    "run_time_registration": ["twice 21 is 42", "it ran in another process: True", "after a respawn, twice 4 is 8"],
     "async_load": [
         "ten loads at once: [0, 1, 4, 9, 16, 25, 36, 49, 64, 81]",
         "one at a time they would have taken longer: True",

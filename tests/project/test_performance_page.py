@@ -46,10 +46,7 @@ def test_of_figures_for_several_sizes_the_table_has_the_worst(tmp_path: Path) ->
 
     lines = markdown(results, "2026-11-23", "abc1234").splitlines()
 
-    assert [line.split(" | ")[0] for line in lines[4:]] == [
-        "| 1,000 held: unload",
-        "| memory: one of 100,000 queries",
-    ]
+    assert [line.split(" | ")[0] for line in lines[4:]] == ["| 1,000 held: unload", "| memory: one of 100,000 queries"]
 
 
 def test_only_what_is_between_the_marks_changes() -> None:

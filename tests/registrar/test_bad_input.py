@@ -20,17 +20,7 @@ import pykka
 import pytest
 
 import rr_actors as rr
-from support import (
-    REPOSITORY,
-    Calls,
-    Gate,
-    Workshop,
-    child,
-    eventually,
-    kill,
-    messages,
-    serve,
-)
+from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, messages, serve
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]

@@ -35,18 +35,7 @@ from rr_actors.storage.opening import read_rows
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Hello
-from support import (
-    Calls,
-    Gate,
-    Workshop,
-    break_exchanges,
-    catalog_path,
-    eventually,
-    hang,
-    kill,
-    serve,
-    wait_respawned,
-)
+from support import Calls, Gate, Workshop, break_exchanges, catalog_path, eventually, hang, kill, serve, wait_respawned
 from support_managers import Order, Shop
 
 # -- brief holds of real registrars ----------------------------------------------------------------------------------

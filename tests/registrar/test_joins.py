@@ -129,11 +129,7 @@ def test_what_is_not_simply_there_is_not_joined(meanwhile: Callable[[Catalog], N
 
 @pytest.mark.parametrize(
     "message",
-    [
-        ask("q"),
-        Load("new", "cam", b"back", "app", "", 0, 1),
-        Load("new", "other", b"front", "app", "", 0, 1),
-    ],
+    [ask("q"), Load("new", "cam", b"back", "app", "", 0, 1), Load("new", "other", b"front", "app", "", 0, 1)],
     ids=["asked again", "another request", "another server"],
 )
 def test_what_is_to_be_decided_as_any_load_is_not_joined(message: Load) -> None:

@@ -196,11 +196,7 @@ def test_it_gets_into_the_tables_when_it_is_quiet(provider: rr.Registrar, lines:
     ids=["process", "none", "power", "saved later"],
 )
 def test_only_where_a_commit_waits_for_the_disk_do_several_share_it(
-    system: rr.System,
-    app: rr.Registrar,
-    monkeypatch: pytest.MonkeyPatch,
-    options: dict[str, Any],
-    written: list[int],
+    system: rr.System, app: rr.Registrar, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], written: list[int]
 ) -> None:
     other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
     serve(other, "thing")

@@ -21,19 +21,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.system.hosting import remote_calls
-from support import (
-    LIMIT_S,
-    REPOSITORY,
-    Calls,
-    Gate,
-    Workshop,
-    child,
-    eventually,
-    hang,
-    kill,
-    pid_of,
-    wait_respawned,
-)
+from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, child, eventually, hang, kill, pid_of, wait_respawned
 from support_managers import Made, Order, Shop
 
 Start = Callable[..., rr.System]

@@ -11,17 +11,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import (
-    Calls,
-    Gate,
-    Workshop,
-    catalog_path,
-    eventually,
-    loaded_with_parts,
-    messages,
-    read_catalog,
-    serve,
-)
+from support import Calls, Gate, Workshop, catalog_path, eventually, loaded_with_parts, messages, read_catalog, serve
 from support_managers import Order, Shop
 
 

@@ -16,14 +16,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Query
 from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.opening import read_rows
-from support import (
-    Calls,
-    Workshop,
-    catalog_path,
-    eventually,
-    read_catalog,
-    serve,
-)
+from support import Calls, Workshop, catalog_path, eventually, read_catalog, serve
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]

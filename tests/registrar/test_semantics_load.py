@@ -19,16 +19,7 @@ import msgspec
 import pytest
 
 import rr_actors as rr
-from support import (
-    Calls,
-    Gate,
-    Workshop,
-    eventually,
-    hang,
-    messages,
-    pid_of,
-    serve,
-)
+from support import Calls, Gate, Workshop, eventually, hang, messages, pid_of, serve
 from support_managers import Order, Shop
 from support_slow import few_now
 

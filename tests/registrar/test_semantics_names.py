@@ -10,10 +10,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import (
-    Workshop,
-    serve,
-)
+from support import Workshop, serve
 from support_managers import Order, Shop
 
 GOOD = ["a", "A", "7", "camera_2", "front-left", "v1.2", "_", "-", "x" * 64]

@@ -22,18 +22,7 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.model.rows import Held, Peer
 from rr_actors.storage.opening import read_rows
 from rr_actors.wire.name_service import Directory, Status, registrar_key
-from support import (
-    LIMIT_S,
-    TEST_PATHS,
-    Calls,
-    Workshop,
-    child,
-    eventually,
-    kill,
-    messages,
-    pid_of,
-    wait_respawned,
-)
+from support import LIMIT_S, TEST_PATHS, Calls, Workshop, child, eventually, kill, messages, pid_of, wait_respawned
 from support_managers import Made, Order, Shop
 
 Start = Callable[..., rr.System]

@@ -13,17 +13,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import (
-    LIMIT_S,
-    Calls,
-    Gate,
-    Workshop,
-    eventually,
-    kill,
-    loaded_with_parts,
-    serve,
-    wait_respawned,
-)
+from support import LIMIT_S, Calls, Gate, Workshop, eventually, kill, loaded_with_parts, serve, wait_respawned
 from support_managers import Order, Shop
 
 
@@ -100,12 +90,7 @@ def test_unloading_goes_down_the_whole_graph_across_registrars(system: rr.System
     members = [system.open_registrar(f"r{n}") for n in range(depth)]
     for n, member in enumerate(members):
         below = [(f"r{n + 1}/x", None)] if n + 1 < depth else []
-        serve(
-            member,
-            "x",
-            load=loaded_with_parts(member, *below),
-            unload=lambda request, response, n=n: order(n),
-        )
+        serve(member, "x", load=loaded_with_parts(member, *below), unload=lambda request, response, n=n: order(n))
     app.load("r0/x", None).unload()
     assert order.wait(depth) == list(range(depth))
     eventually(lambda: not any(member.resources() or member.queries() for member in members))

@@ -65,13 +65,7 @@ class Ledger:
     # -- callbacks -----------------------------------------------------------------------------------------------
 
     def run_started(
-        self,
-        registrar: str,
-        id: str,
-        kind: str,
-        number: int,
-        request: tuple[str, str, bytes],
-        excused: set[str],
+        self, registrar: str, id: str, kind: str, number: int, request: tuple[str, str, bytes], excused: set[str]
     ) -> None:
         """A load or unload callback begins.
 

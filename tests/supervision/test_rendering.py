@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.supervision.supervisor import SupervisorRef
-from support import eventually
+from support import eventually, hang
 
 Start = Callable[..., rr.System]
 
@@ -157,7 +157,7 @@ def test_a_supervisor_whose_process_does_not_answer_is_shown_as_such(
     pid = system.supervisor().which_child("jobs").pid
     assert pid is not None
     monkeypatch.setattr(SupervisorRef.__init__, "__kwdefaults__", {"timeout_s": 0.3})
-    os.kill(pid, signal.SIGSTOP)
+    hang(pid)
     try:
         _, jobs = system.snapshot()["tree"]["children"]
         assert "no reply after 0.3 seconds" in jobs["error"]

@@ -68,10 +68,7 @@ class World:
     """A robot that the application holds, and its lidars."""
 
     def __init__(self, start: Start, workshop: Workshop) -> None:
-        children = [
-            rr.ChildSpec(Lidars, id="lidars"),
-            rr.ChildSpec(Robots, id="robots", args=(str(workshop.root),)),
-        ]
+        children = [rr.ChildSpec(Lidars, id="lidars"), rr.ChildSpec(Robots, id="robots", args=(str(workshop.root),))]
         self.system = start(rr.Supervisor(children, id="root", max_restarts=10_000, max_seconds=1.0))
         self.lidars = self.system.registrar("lidars")
         self.robots = self.system.registrar("robots")

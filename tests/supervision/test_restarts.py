@@ -727,13 +727,7 @@ def test_an_updated_template_is_that_of_all_dynamic_children_from_their_next_sta
 
 
 @pytest.mark.parametrize(
-    "spec",
-    [
-        Supervisor([], id="other"),
-        Supervisor([child("a")], strategy="simple_one_for_one"),
-        child("a"),
-        None,
-    ],
+    "spec", [Supervisor([], id="other"), Supervisor([child("a")], strategy="simple_one_for_one"), child("a"), None]
 )
 def test_an_invalid_update_changes_nothing(spec: Any) -> None:
     made = world(child("a"))

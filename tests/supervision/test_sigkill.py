@@ -18,17 +18,7 @@ import psutil
 import pytest
 
 import rr_actors as rr
-from support import (
-    Calls,
-    Workshop,
-    catalog_path,
-    eventually,
-    kill,
-    messages,
-    pid_of,
-    read_catalog,
-    wait_respawned,
-)
+from support import Calls, Workshop, catalog_path, eventually, kill, messages, pid_of, read_catalog, wait_respawned
 from support_managers import Order
 
 Start = Callable[..., rr.System]

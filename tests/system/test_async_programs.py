@@ -38,7 +38,7 @@ def test_async_with_starts_and_stops_a_system_while_the_loop_goes_on(state_dir: 
         assert turns > during
         return during
 
-    assert asyncio.run(program()) > 10
+    assert asyncio.run(program()) > 2  # a start that blocks the loop leaves it one turn before, and perhaps one after
 
 
 def test_a_cancelled_async_with_gives_the_start_up_and_leaves_nothing(state_dir: Path) -> None:

@@ -89,10 +89,7 @@ def tries(directory: Path, number: signal.Signals, how: str) -> list[tuple[int, 
     directory.mkdir()
     with ThreadPoolExecutor(4) as several:
         return list(
-            several.map(
-                lambda n: said_when_signalled(directory / str(n), number, how, n * 0.6 / TRIES),
-                range(TRIES),
-            )
+            several.map(lambda n: said_when_signalled(directory / str(n), number, how, n * 0.6 / TRIES), range(TRIES))
         )
 
 

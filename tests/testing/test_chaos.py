@@ -56,10 +56,7 @@ def test_a_soak_says_how_much_each_figure_grew(tmp_path: Path) -> None:
     options = ["--soak", "4", "--churn", "0.5", "--state-dir", str(tmp_path / "state"), "--json", str(result)]
 
     ran = subprocess.run(
-        [sys.executable, "-m", "rr_actors.testing", *options],
-        capture_output=True,
-        text=True,
-        timeout=50,
+        [sys.executable, "-m", "rr_actors.testing", *options], capture_output=True, text=True, timeout=50
     )
 
     report = json.loads(result.read_text())

@@ -126,9 +126,7 @@ def test_the_loop_of_a_first_load_makes_few_calls(registrars: tuple[rr.Registrar
     assert line.flushed < LOADS / 2  # the loop answers those that come while it acts on others
 
 
-def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(
-    registrars: tuple[rr.Registrar, rr.Registrar],
-) -> None:
+def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(registrars: tuple[rr.Registrar, rr.Registrar]) -> None:
     actor = actor_of(registrars[0])
     loads = list(itertools.islice(warm_loads(), LOADS))
 
@@ -198,9 +196,7 @@ def test_of_very_many_the_first_do_not_wait_for_the_last(
     assert flushed == len(committed)
 
 
-def test_a_held_query_takes_less_than_a_kilobyte_of_its_provider(
-    registrars: tuple[rr.Registrar, rr.Registrar],
-) -> None:
+def test_a_held_query_takes_less_than_a_kilobyte_of_its_provider(registrars: tuple[rr.Registrar, rr.Registrar]) -> None:
     actor = actor_of(registrars[0])
     source = warm_loads()
     many = 10 * LOADS

@@ -135,9 +135,7 @@ def test_check_finds_a_query_on_a_resource_that_does_not_exist(state: Path) -> N
     write(state, "cameras", query("q2", "nowhere"))
     write(state, "app", held("q2", "nowhere"))
 
-    assert check(read_state(state)) == [
-        "cameras: query q2 of app points to resource nowhere, which does not exist",
-    ]
+    assert check(read_state(state)) == ["cameras: query q2 of app points to resource nowhere, which does not exist"]
 
 
 def test_check_finds_a_query_that_its_origin_can_never_hear_of(state: Path) -> None:
@@ -145,7 +143,7 @@ def test_check_finds_a_query_that_its_origin_can_never_hear_of(state: Path) -> N
     write(state, "cameras", query("q2", "r1", "other"))
 
     assert check(read_state(state)) == [
-        "cameras: query q2 of other is unknown there, and other does not know that it asked cameras",
+        "cameras: query q2 of other is unknown there, and other does not know that it asked cameras"
     ]
 
 

@@ -358,9 +358,7 @@ def test_three_hundred_peers_may_connect_at_the_same_moment(run: Run, tmp_path: 
         door = Door()
         async with transports(tmp_path, 2) as [provider, consumer]:
             await provider.listen(door)
-            await asyncio.gather(
-                *(consumer.connect(provider.address, HELLO, Inbox().attach) for _ in range(300)),
-            )
+            await asyncio.gather(*(consumer.connect(provider.address, HELLO, Inbox().attach) for _ in range(300)))
             assert len(door.inboxes) == 300
 
     run(scenario())
