@@ -65,11 +65,7 @@ def _meant(name: str, node: Node) -> str:
 
 
 def codec_for(response_type: Any) -> Codec:
-    """Return the codec that reads responses of a type.
-
-    Raises:
-        NotSerializable: values of that type cannot travel.
-    """
+    """Return the codec that reads responses of a type; raise NotSerializable if values of that type cannot travel."""
     try:
         return _codec_for(response_type)
     except TypeError:  # the type has no hash: Annotated with a list, say
@@ -132,11 +128,7 @@ def state_path(state_dir: object) -> Path:
 
 
 def system_config(config: object) -> SystemConfig:
-    """Return the configuration, or the default one for None.
-
-    Raises:
-        ConfigError: `config` is no SystemConfig.
-    """
+    """Return the configuration, or the default one for None; raise ConfigError if `config` is no SystemConfig."""
     if config is None:
         return SystemConfig()
     if is_a(config, SystemConfig):
@@ -150,11 +142,7 @@ def _wrong(key: str, expected: str, got: object) -> ConfigError:
 
 
 def stop_limit(timeout_s: object) -> float:
-    """Return the seconds that a stop may take.
-
-    Raises:
-        UsageError: `timeout_s` is no number of 0 or more.
-    """
+    """Return the seconds that a stop may take; raise UsageError if `timeout_s` is no number of 0 or more."""
     if is_a(timeout_s, (int, float)) and not is_a(timeout_s, bool):
         seconds = exact_number(cast("float", timeout_s))
         if seconds >= 0:  # NaN is not

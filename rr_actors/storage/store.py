@@ -30,11 +30,7 @@ class Store(Protocol):
         ...
 
     def load(self) -> Content:
-        """Return every row; the caller may keep and change the result.
-
-        Raises:
-            CatalogDamaged: a row cannot be read.
-        """
+        """Return every row, for the caller to keep and change; raise CatalogDamaged if a row cannot be read."""
         ...
 
     def commit(self, changes: Sequence[Change]) -> None:

@@ -202,11 +202,7 @@ class Mailbox:
             return None
 
     def get(self) -> PykkaEnvelope[Any]:
-        """Take the next message, without waiting; Pykka calls this name.
-
-        Raises:
-            LookupError: the mailbox is empty.
-        """
+        """Take the next message without waiting (Pykka calls this); raise LookupError if the mailbox is empty."""
         envelope = self.next()
         if envelope is None:
             raise LookupError(f"mailbox of {self._owner}: empty")

@@ -90,11 +90,7 @@ class View:
 
     @property
     def system(self) -> Viewed:
-        """The system that the console looks at.
-
-        Raises:
-            Unavailable: the system was dropped.
-        """
+        """Return the system that the console looks at; raise Unavailable if it was dropped."""
         if (system := self._system()) is None:
             raise Unavailable("the system was dropped, and is being stopped")
         return system

@@ -31,11 +31,7 @@ class Entry:
         self._place: tuple[str, str] | None = None
 
     def make(self) -> None:
-        """Put the entry into the list.
-
-        Raises:
-            ConfigError: no directory can keep the list.
-        """
+        """Put the entry into the list; raise ConfigError if no directory can keep the list."""
         failure: OSError | None = None
         for place in _places():
             try:
