@@ -48,7 +48,7 @@ class CannedLine:
     def __init__(self) -> None:
         self._response = encode(Answer(PAYLOAD))
 
-    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+    def exchange(self, message: Any, deadline: float) -> Any:
         return Loaded(message.query_id, "resource", self._response)
 
     def cut(self) -> None:

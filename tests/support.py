@@ -37,11 +37,11 @@ def break_exchanges(monkeypatch: Any, error: BaseException, *, sends: bool, kind
     """Have connections of threads fail with `error` for messages of a kind: before they are sent, or when answered."""
 
     def broken(exchange: Any) -> Any:
-        def fail(self: Any, message: Any, timeout_s: float | None) -> Any:
+        def fail(self: Any, message: Any, deadline: float) -> Any:
             if type(message) is not kind:
-                return exchange(self, message, timeout_s)
+                return exchange(self, message, deadline)
             if sends:
-                exchange(self, message, timeout_s)
+                exchange(self, message, deadline)
             raise error
 
         return fail

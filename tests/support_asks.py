@@ -15,6 +15,7 @@ from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.remote.peer import Call, Line
 from rr_actors.actors.remote.protocol import Answered, Ask, Letter
 from rr_actors.base import pickling
+from rr_actors.runtime.time_limits import left_until
 from support_refs import Home
 
 
@@ -119,15 +120,15 @@ class FakeExchange:
 
     epoch = 0
 
-    def __init__(self, exchange: Callable[[Any, float | None], Any]) -> None:
+    def __init__(self, exchange: Callable[[Any, float], Any]) -> None:
         self.here, self.there = socket.socketpair()
         self._exchange = exchange
         self.limits: list[float | None] = []
         self.was_cut = threading.Event()
 
-    def exchange(self, message: Any, timeout_s: float | None) -> Any:
-        self.limits.append(timeout_s)
-        return self._exchange(message, timeout_s)
+    def exchange(self, message: Any, deadline: float) -> Any:
+        self.limits.append(left_until(deadline))
+        return self._exchange(message, deadline)
 
     def fileno(self) -> int:
         return self.here.fileno()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from types import EllipsisType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
@@ -21,7 +20,7 @@ from rr_actors.actors.remote.proxy import Attributes, DistantInbox, DistantProxy
 from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError, is_a, shown
 from rr_actors.base.values.codecs import NoForm, codec, codec_of_subclass
 from rr_actors.runtime import event_loop
-from rr_actors.runtime.time_limits import left_of, time_limit
+from rr_actors.runtime.time_limits import deadline_of, left_until, time_limit
 
 if TYPE_CHECKING:
     from pykka._actor import ActorInbox
@@ -364,14 +363,14 @@ class DistantRef(ActorRef[A]):
         process = hub(self.path)
         if process is None or process.local(self._target.urn) is not None:
             return super()._ask(message, reply, limit_s, left_s)
-        began = time.monotonic()
+        deadline = deadline_of(left_s)
         waiting = ask_cycles.begin_wait(reply)
         try:
             if self._ask_now(process, message, reply, limit_s):
                 return reply.get()
         finally:
             ask_cycles.end_wait(waiting, reply)
-        return super()._ask(message, reply, limit_s, left_of(left_s, began))
+        return super()._ask(message, reply, limit_s, left_until(deadline))
 
     def _ask_now(self, process: ActorHub, message: Any, reply: Reply[Any], limit_s: float | None) -> bool:
         try:

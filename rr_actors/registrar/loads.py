@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import functools
 import threading
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -39,7 +38,7 @@ from rr_actors.registrar.model.messages import (
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers, on_this_loop
 from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
-from rr_actors.runtime.time_limits import TimeLimits, left_of
+from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until
 from rr_actors.wire.name_service import Status
 from rr_actors.wire.transport import Exchange
 
@@ -179,11 +178,11 @@ def with_notes(errors: Sequence[RrError]) -> RrError:
 Ended = Callable[[Held | None, RrError | None], None]
 
 
-def _recorded(actor: RegistrarActor, line: Exchange, provider: str, message: Message, timeout_s: float | None) -> Any:
+def _recorded(actor: RegistrarActor, line: Exchange, provider: str, message: Message, deadline: float) -> Any:
     """Send a message and return the answer, as `line.exchange` does, and record both."""
     recorder = actor.node.recorder
     recorder.message("sent", actor.name, provider, message)
-    answer = line.exchange(message, timeout_s)
+    answer = line.exchange(message, deadline)
     recorder.message("received", actor.name, provider, answer)
     return answer
 
@@ -403,7 +402,7 @@ class Loads:
                 over.append(error)
                 connections.cut(line)
 
-        began = time.monotonic()
+        deadline = deadline_of(timeout_s)
         try:
             line = connections.take(timeout_s)
             if line is None:
@@ -414,9 +413,9 @@ class Loads:
                 return False
             self.views.add(query)
             if actor.node.watched.level[0] <= 1:
-                answer = line.exchange(load, left_of(timeout_s, began))
+                answer = line.exchange(load, deadline)
             else:
-                answer = _recorded(actor, line, query.registrar, load, left_of(timeout_s, began))
+                answer = _recorded(actor, line, query.registrar, load, deadline)
             connections.give_back(line)
         except TimeoutError:
             command = c.GiveUp(query.id, _too_late(actor, query, timeout_s), unheard=True)
@@ -434,7 +433,7 @@ class Loads:
             command = self._not_held(query, answer)
         connections.drop_mine()
         if not over:
-            left_s = left_of(timeout_s, began)
+            left_s = left_until(deadline)
             try:
                 self._go_on(query, command, left_s, timeout_s)
             except RrError:
@@ -633,7 +632,7 @@ class Unloads:
         connections = None if client is None else client.connections
         if client is None or connections is None or not self.calls.dispatcher.may_block():
             return False
-        began = time.monotonic()
+        deadline = deadline_of(timeout_s)
         answer: Any = None
         try:
             line = connections.take(timeout_s)
@@ -644,9 +643,9 @@ class Unloads:
                 return False
             unload = Unload(query_id, actor.name)
             if actor.node.watched.level[0] <= 1:
-                answer = line.exchange(unload, left_of(timeout_s, began))
+                answer = line.exchange(unload, deadline)
             else:
-                answer = _recorded(actor, line, client.provider, unload, left_of(timeout_s, began))
+                answer = _recorded(actor, line, client.provider, unload, deadline)
             connections.give_back(line)
             if type(answer) is Unloaded and not actor.forget_released(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
@@ -660,7 +659,7 @@ class Unloads:
             self._views.forget(query_id)
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
-            left_s = left_of(timeout_s, began)
+            left_s = left_until(deadline)
             go_on = functools.partial(actor.go_on_unloading, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True

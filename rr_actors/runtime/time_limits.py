@@ -35,9 +35,14 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
     return number if number < _LONGEST_S else None
 
 
-def left_of(limit_s: float | None, began: float) -> float | None:
-    """Return the rest of a time limit that began at `began`, a value of time.monotonic()."""
-    return None if limit_s is None else max(0.0, limit_s - (time.monotonic() - began))
+def deadline_of(limit_s: float | None) -> float:
+    """Return when a time limit that begins now ends, as a value of time.monotonic(); infinity for None."""
+    return math.inf if limit_s is None else time.monotonic() + limit_s
+
+
+def left_until(deadline: float) -> float | None:
+    """Return the seconds that are left until a deadline of deadline_of(); None for infinity."""
+    return None if deadline == math.inf else max(0.0, deadline - time.monotonic())
 
 
 async def wait_while_running(future: asyncio.Future[Any], limit_s: float | None) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.scarcity import wanted_by
+from rr_actors.runtime.time_limits import left_until
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.handshake import DiallerHandshake
 from rr_actors.wire.transport import Hello
@@ -64,7 +65,7 @@ class BlockingLink:
     def _shake_hands(self, handshake: DiallerHandshake, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s
         while not handshake.done:
-            data = self._receive(max(0.001, deadline - time.monotonic()))
+            data = self._receive(max(deadline, time.monotonic() + 0.001))
             answer = handshake.receive(data)
             if answer:
                 self._socket.sendall(answer)
@@ -73,15 +74,12 @@ class BlockingLink:
         assert handshake.welcome is not None
         self.epoch = handshake.welcome.epoch
 
-    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+    def exchange(self, message: Any, deadline: float) -> Any:
         frame = framed(message, self._limit)
         sent = self._send(frame)
         if sent < len(frame):  # seldom: the buffer of the socket is empty before
-            timeout_s = self._send_rest(memoryview(frame)[sent:], timeout_s)
-        began = time.monotonic()
-        messages = self._reader.feed(self._receive_soon(timeout_s, began))
-        if not messages:
-            messages = self._rest(None if timeout_s is None else began + timeout_s)
+            self._send_rest(memoryview(frame)[sent:], deadline)
+        messages = self._reader.feed(self._receive_soon(deadline)) or self._rest(deadline)
         return messages[0]
 
     def _send(self, data: bytes | memoryview) -> int:
@@ -91,34 +89,31 @@ class BlockingLink:
         except BlockingIOError:
             return 0
 
-    def _send_rest(self, rest: memoryview, timeout_s: float | None) -> float | None:
-        """Write the rest as the other side reads it; return the time that is left."""
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    def _send_rest(self, rest: memoryview, deadline: float) -> None:
+        """Write the rest as the other side reads it."""
         poll = select.poll()
         poll.register(self._socket, select.POLLOUT)
         while rest:
-            left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
-            if not poll.poll(None if left_s is None else left_s * 1e3):
+            if not poll.poll(_milliseconds_until(deadline)):
                 raise TimeoutError
             rest = rest[self._send(rest) :]
-        return None if deadline is None else max(0.0, deadline - time.monotonic())
 
-    def _rest(self, deadline: float | None) -> list[Any]:
+    def _rest(self, deadline: float) -> list[Any]:
         """Read until a message is complete, and return all messages that are then complete."""
         while True:
             if self._reader.error is not None or self._reader.ended:
                 raise ConnectionResetError(f"the link has ended: {self._reader.error or 'closed'}")
-            messages = self._reader.feed(self._receive(None if deadline is None else deadline - time.monotonic()))
-            if messages:
+            if messages := self._reader.feed(self._receive(deadline)):
                 return messages
 
-    def _receive_soon(self, timeout_s: float | None, began: float) -> bytes:
+    def _receive_soon(self, deadline: float) -> bytes:
         """Wait for data as _receive() does, but spin first: a quick answer comes before a thread could wake up."""
-        if timeout_s is not None and timeout_s < SPIN_LIMIT_S:
-            return self._receive(timeout_s)
+        began = time.monotonic()
+        if deadline - began < SPIN_LIMIT_S:
+            return self._receive(deadline)
         spin = self._spin
         if not spin.worthwhile:
-            data = self._receive(timeout_s)
+            data = self._receive(deadline)
             spin.parked(time.monotonic() - began)
             return data
         while True:
@@ -131,11 +126,11 @@ class BlockingLink:
             if data or took_s >= SPIN_LIMIT_S:
                 break
         spin.spun(took_s, bool(data))
-        return data or self._receive(None if timeout_s is None else timeout_s - took_s)
+        return data or self._receive(deadline)
 
-    def _receive(self, timeout_s: float | None) -> bytes:
+    def _receive(self, deadline: float) -> bytes:
         # not recv() alone: it also wakes up when the other side has read the question, which costs both sides time
-        if not self._readable(None if timeout_s is None else max(0.0, timeout_s * 1e3)):
+        if not self._readable(_milliseconds_until(deadline)):
             raise TimeoutError
         return self._read()
 
@@ -172,6 +167,11 @@ class BlockingLink:
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
+
+
+def _milliseconds_until(deadline: float) -> float | None:
+    left_s = left_until(deadline)
+    return None if left_s is None else left_s * 1e3
 
 
 # -- spin, then park ---------------------------------------------------------------------------------------------------

@@ -100,11 +100,11 @@ class Exchange(Protocol):
 
     epoch: int
 
-    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+    def exchange(self, message: Any, deadline: float) -> Any:
         """Write a message and return the answer.
 
         Raises:
-            TimeoutError: no answer came within `timeout_s` seconds; do not use the connection again.
+            TimeoutError: no answer came until the deadline (time_limits.deadline_of); do not use the connection again.
             OSError: the connection is lost; the message may have arrived.
             NotSerializable: the message is too long for a frame; the connection can still be used.
         """

@@ -53,7 +53,7 @@ class FakeTransport:
         self.link = FakeLink()
         self.made: list[FakeExchange] = []
         self.hellos: list[Hello] = []
-        self.exchange: Callable[[Any, float | None], Any] = lambda letter, _: answered(letter)
+        self.exchange: Callable[[Any, float], Any] = lambda letter, _: answered(letter)
         self.refusal: Exception | None = None
 
     async def connect(self, address: str, hello: Hello, attach: Any, **_: Any) -> FakeLink:

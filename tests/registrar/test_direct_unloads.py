@@ -31,6 +31,7 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
 )
 from rr_actors.registrar.model.rows import Held, Hold, Notice, State
+from rr_actors.runtime.time_limits import deadline_of, left_until
 from rr_actors.storage.opening import read_rows
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.thread_connections import ThreadConnections
@@ -225,7 +226,7 @@ class Giving:
         self.connections, self.others, self.closed, self.epoch = connections, others, False, 1
         connections._in_use[self] = threading.get_ident()
 
-    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+    def exchange(self, message: Any, deadline: float) -> Any:
         raise AssertionError("not used")
 
     def close(self) -> None:
@@ -439,7 +440,7 @@ def test_a_line_whose_registrar_answers_and_closes_is_lost_after_the_answer(
     line.send(Unloaded("q"))
     line.close()
     line.close()
-    assert line.exchange(Unload("q", "app"), 10) == Unloaded("q")
+    assert line.exchange(Unload("q", "app"), deadline_of(10)) == Unloaded("q")
     line.send(Unloaded("late"))
 
 
@@ -452,9 +453,9 @@ def test_opening_a_connection_and_the_exchange_have_one_time_limit(
         time.sleep(0.2)
         return take(connections, limit_s)
 
-    def note(line: BlockingLink, message: Any, limit_s: float | None) -> Any:
-        limits(limit_s)
-        return exchange(line, message, limit_s)
+    def note(line: BlockingLink, message: Any, deadline: float) -> Any:
+        limits(left_until(deadline))
+        return exchange(line, message, deadline)
 
     monkeypatch.setattr(ThreadConnections, "take", take_slowly)
     monkeypatch.setattr(BlockingLink, "exchange", note)

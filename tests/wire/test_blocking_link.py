@@ -14,6 +14,7 @@ import pytest
 
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.runtime.time_limits import deadline_of, left_until
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.transport import Link, Welcome
 from rr_actors.wire.unix_link import Wire
@@ -93,12 +94,12 @@ def silent(_link: Link, _message: Note) -> None: ...
 def test_messages_of_any_length_go_there_and_back(line: BlockingLink, message: Note, limit_s: float | None) -> None:
     assert line.epoch == 42
     for _ in range(3):
-        assert line.exchange(message, limit_s) == message
+        assert line.exchange(message, deadline_of(limit_s)) == message
 
 
 def test_a_long_message_to_who_does_not_read_is_given_up_in_time(peer: Peer, line: BlockingLink) -> None:
     goes_on = peer.hang()
-    writer = Background(lambda: line.exchange(LONG, 0.05))
+    writer = Background(lambda: line.exchange(LONG, deadline_of(0.05)))
     with pytest.raises(TimeoutError):
         writer.result(timeout=5)
     goes_on.set()
@@ -110,7 +111,7 @@ def test_a_message_that_the_kernel_has_no_room_for_is_given_up_in_time_however_s
 ) -> None:
     line._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # pyright: ignore[reportPrivateUsage]
     goes_on = peer.hang()
-    writer = Background(lambda: line.exchange(Note(3, b"x" * 60_000), 0.05))
+    writer = Background(lambda: line.exchange(Note(3, b"x" * 60_000), deadline_of(0.05)))
     with pytest.raises(TimeoutError):
         writer.result(timeout=5)
     goes_on.set()
@@ -122,15 +123,15 @@ def test_writing_and_waiting_have_one_time_limit(
     limits: list[float | None] = []
     receive = line._receive_soon  # pyright: ignore[reportPrivateUsage]
 
-    def note(limit_s: float | None, began: float) -> bytes:
-        limits.append(limit_s)
-        return receive(limit_s, began)
+    def note(deadline: float) -> bytes:
+        limits.append(left_until(deadline))
+        return receive(deadline)
 
     monkeypatch.setattr(line, "_receive_soon", note)
     began = time.monotonic()
     peer.dispatcher.call(time.sleep, 0.2)  # it cannot all be written before
-    line.exchange(LONG, 20.0)
-    line.exchange(LONG, None)
+    line.exchange(LONG, deadline_of(20.0))
+    line.exchange(LONG, deadline_of(None))
     first, second = limits
     assert first is not None
     assert time.monotonic() - began - 20.0 <= first <= 19.9
@@ -148,7 +149,7 @@ def test_the_beginning_and_the_rest_of_an_answer_have_one_time_limit(peer: Peer,
     peer.answer = answer_the_beginning
     began = time.monotonic()
     with pytest.raises(TimeoutError):
-        line.exchange(SHORT, 2.4)
+        line.exchange(SHORT, deadline_of(2.4))
     goes_on.set()
     assert time.monotonic() - began < 2.0 + 2.4 - 0.5  # two limits would end half a second later
 
@@ -158,7 +159,7 @@ def test_the_beginning_and_the_rest_of_an_answer_have_one_time_limit(peer: Peer,
 def test_a_thread_hears_that_the_connection_is_lost(peer: Peer, line: BlockingLink, message: Note, by: str) -> None:
     peer.answer = silent
     goes_on = peer.hang() if message is LONG and by == "cut" else threading.Event()
-    waiting = Background(lambda: line.exchange(message, None))
+    waiting = Background(lambda: line.exchange(message, deadline_of(None)))
     if by == "cut":
         if message is SHORT:
             peer.messages.wait()
@@ -176,8 +177,8 @@ def test_a_message_over_the_limit_leaves_it_as_it_was(peer: Peer) -> None:
     sockets = SocketDir(peer.directory)
     line = BlockingLink(sockets, KEY, peer.transport.address, HELLO, wire, 5.0)
     with pytest.raises(NotSerializable, match="100"):
-        line.exchange(LONG, 1.0)
-    assert line.exchange(SHORT, 1.0) == SHORT
+        line.exchange(LONG, deadline_of(1.0))
+    assert line.exchange(SHORT, deadline_of(1.0)) == SHORT
     line.close()
     sockets.close()
 
@@ -186,7 +187,7 @@ def test_who_leaves_is_read_to_the_end_and_hears_when_that_is_done(peer: Peer, l
     peer.answer = silent
     goes_on = peer.hang()
     with pytest.raises(TimeoutError):
-        line.exchange(Note(3, b"x" * 50_000), 0.0)
+        line.exchange(Note(3, b"x" * 50_000), deadline_of(0.0))
     line.leave()
     assert not line.has_ended()
     goes_on.set()
@@ -204,7 +205,7 @@ def test_late_answers_are_no_end(peer: Peer, line: BlockingLink) -> None:
     peer.answer = answer_late
     goes_on = peer.hang()
     with pytest.raises(TimeoutError):
-        line.exchange(Note(3, b"x" * 60_000), 0.0)
+        line.exchange(Note(3, b"x" * 60_000), deadline_of(0.0))
     goes_on.set()
     peer.messages.wait()
     peer.dispatcher.run(_nothing())

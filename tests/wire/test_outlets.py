@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import math
 import os
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager, closing
@@ -387,7 +389,7 @@ def test_threads_that_answer_a_line_and_close_it_at_once_ring_once(provider: Pro
     provider.answer = answer
     for _ in range(100):
         with contextlib.suppress(ConnectionResetError):
-            assert line.exchange(LOAD, None) == LOADED
+            assert line.exchange(LOAD, math.inf) == LOADED
     assert rings == [1] * 100
 
 
@@ -397,7 +399,7 @@ def test_a_line_that_was_answered_is_asked_again_and_hears_nothing_of_before(
     for number in range(3):
         loaded = Loaded(f"q{number}", "q", b"")
         provider.answer = lambda line, loaded=loaded: line.answering(loaded)()
-        assert line.exchange(LOAD, None) == loaded
+        assert line.exchange(LOAD, math.inf) == loaded
         line.answering(LOADED)()
         line.send(LOADED)
         assert cast(Bell, line._bell).rings == []
@@ -405,7 +407,7 @@ def test_a_line_that_was_answered_is_asked_again_and_hears_nothing_of_before(
 
 def test_nobody_is_told_anything_by_a_line_that_was_left(provider: Provider, line: LocalLine) -> None:
     with pytest.raises(TimeoutError):
-        line.exchange(LOAD, 0.0)
+        line.exchange(LOAD, time.monotonic())
     line.close()
     line.answering(LOADED)()
     line.close()

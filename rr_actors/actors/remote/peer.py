@@ -12,7 +12,6 @@ import asyncio
 import itertools
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -39,7 +38,7 @@ from rr_actors.actors.remote.protocol import (
 from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
-from rr_actors.runtime.time_limits import left_of
+from rr_actors.runtime.time_limits import deadline_of
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Hello, Link
@@ -156,12 +155,12 @@ class Line:
             OSError: the connection is lost; the letter may have arrived.
             NotSerializable: the letter is too long for a frame.
         """
-        began = time.monotonic()
+        deadline = deadline_of(timeout_s)
         line = self._asks.take(timeout_s) if self.may_ask else None
         if line is None:
             return None
         try:
-            answer = line.exchange(letter, left_of(timeout_s, began))
+            answer = line.exchange(letter, deadline)
             if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
                 self._asks.give_back(line)
                 return answer

@@ -9,6 +9,7 @@ from typing import Any
 
 from rr_actors.registrar.model.messages import Load, Message
 from rr_actors.runtime.thread_wakeup import Bell, LockBell
+from rr_actors.runtime.time_limits import left_until
 from rr_actors.wire.transport import Hello
 
 
@@ -27,7 +28,7 @@ class LocalLine:
         self._bell: Bell = LockBell()
         self.epoch: int = registrar.epoch
 
-    def exchange(self, message: Message, timeout_s: float | None) -> Message:
+    def exchange(self, message: Message, deadline: float) -> Message:
         """Send a message and return its answer; raise TimeoutError, or ConnectionResetError once it is closed."""
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
@@ -38,7 +39,8 @@ class LocalLine:
         if not self._unanswered and not self._answers:
             self._unanswered.append(None)
         self._node.dispatcher.hand_over(consumers.received_directly, origin, epoch, self, message)
-        if not self._bell.wait(-1 if timeout_s is None else max(0.0, timeout_s)):
+        left_s = left_until(deadline)
+        if not self._bell.wait(-1 if left_s is None else left_s):
             raise TimeoutError
         answer = self._answers.popleft()
         if answer is None:
