@@ -64,7 +64,7 @@ def check_positive(value: object, who: str, field: str) -> None:
 
 def check_one_of(value: object, who: str, field: str, choices: Sequence[str]) -> None:
     """Check that the value is one of the words `choices`."""
-    if not is_a(value, str) or exact_text(cast("str", value)) not in choices:
+    if not is_a(value, str) or exact_text(value) not in choices:
         raise invalid(who, field, "one of " + ", ".join(map(repr, choices)), value)
 
 

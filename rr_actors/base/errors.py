@@ -22,9 +22,11 @@ from __future__ import annotations
 import difflib
 import reprlib
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeGuard, TypeVar
 
 import msgspec
+
+_K = TypeVar("_K")
 
 
 class Frame(msgspec.Struct, frozen=True):
@@ -73,7 +75,7 @@ def name_of_class(cls: type) -> str:
     return type.__dict__["__name__"].__get__(cls)
 
 
-def is_a(value: object, kind: type | tuple[type, ...]) -> bool:
+def is_a(value: object, kind: type[_K] | tuple[type[_K], ...]) -> TypeGuard[_K]:
     """Return whether the value's type is of this kind; isinstance() would run a user's code in `__class__`."""
     return issubclass(type(value), kind)
 

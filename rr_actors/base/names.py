@@ -11,7 +11,7 @@ import itertools
 import os
 import re
 import time
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
 
@@ -35,7 +35,7 @@ def check_name(name: object, what: str = "name") -> str:
     """Return `name` if it may name a registrar, server or child; raise InvalidName, with the rule, if not."""
     if not is_a(name, str):
         raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
-    name = exact_text(cast("str", name))
+    name = exact_text(name)
     if not _NAME.match(name):
         raise InvalidName(
             f"{what} {shown(name)}: expected 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'",
@@ -50,7 +50,7 @@ def parse_server_id(text: object) -> ServerId:
         raise InvalidName(
             f"server id: expected a string 'registrar/server', got {type(text).__name__} ({shown(text)})", name=text
         )
-    text = exact_text(cast("str", text))
+    text = exact_text(text)
     registrar, slash, server = text.partition("/")
     if not slash:
         raise InvalidName(f"server id {shown(text)}: expected 'registrar/server', got no '/'", name=text)

@@ -101,15 +101,15 @@ def target_id(target: object) -> str:
         UsageError: `target` is none of these.
     """
     if is_a(target, (Query, ResourceInfo)):
-        return cast("Query | ResourceInfo", target).id
+        return target.id
     if is_a(target, str):
-        return exact_text(cast("str", target))
+        return exact_text(target)
     raise UsageError(f"expected a Query or an id, got {type(target).__name__} ({shown(target)})")
 
 
 def resource_target(target: object) -> str:
     """Return an id as target_id() does; for a query its resource's, valid also when the holder has left."""
-    return cast("Query", target).resource_id if is_a(target, Query) else target_id(target)
+    return target.resource_id if is_a(target, Query) else target_id(target)
 
 
 # -- a system's --------------------------------------------------------------------------------------------------
@@ -132,7 +132,7 @@ def system_config(config: object) -> SystemConfig:
     if config is None:
         return SystemConfig()
     if is_a(config, SystemConfig):
-        return cast("SystemConfig", config)
+        return config
     raise _wrong("config", "a SystemConfig or None", config)
 
 
@@ -160,5 +160,5 @@ def check_text(value: object, expected: str) -> str:
         UsageError: the value is no text.
     """
     if is_a(value, str):
-        return exact_text(cast("str", value))
+        return exact_text(value)
     raise UsageError(f"{expected}, got {shown(value)} ({type(value).__name__})")

@@ -46,7 +46,7 @@ class server:  # noqa: N801 - used as a decorator
         response_type: Any = None,
     ) -> None:
         if callable(name):  # @rr.server on the method itself
-            meant = cast("FunctionType", name).__name__ if is_a(name, FunctionType) else "name"
+            meant = name.__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
         self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
         self._types = (request_type, response_type)

@@ -13,7 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, overload
 
 import pykka
 
@@ -601,14 +601,14 @@ class Registrar:
             if context is None or serving(context).node is not self._node:
                 return self, ""
         if is_a(context, Current):
-            audience = serving(cast("Current", context)).audience
+            audience = serving(context).audience
             return (self if audience is None else audience.holder), context.resource_id
         if is_a(context, str):
-            return self, exact_text(cast("str", context))
+            return self, exact_text(context)
         if is_a(context, ResourceInfo):
-            return self, cast("ResourceInfo", context).id
+            return self, context.id
         if is_a(context, Query):
-            return self, cast("Query", context).resource_id
+            return self, context.resource_id
         raise UsageError(f"parent: expected rr.current() or a resource id, got {type(context).__name__}")
 
     # -- unload --------------------------------------------------------------------------------------------------
@@ -671,8 +671,8 @@ class Registrar:
         unloads = self._unloads
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
-        if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
-            raise error_of(failures.not_holder(query_id, cast("Query", query_or_id).origin, self.name))
+        if is_a(query_or_id, Query) and query_or_id.origin != self.name:
+            raise error_of(failures.not_holder(query_id, query_or_id.origin, self.name))
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
     async def unload_async(
@@ -768,7 +768,7 @@ class Registrar:
         """
         id = target_id(query)
         if is_a(query, Query):
-            provider = cast("Query", query).registrar
+            provider = query.registrar
         else:
             held = self._actor.catalog.held.get(id)
             provider = None if held is None else held.registrar

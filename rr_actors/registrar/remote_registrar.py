@@ -227,7 +227,8 @@ class RegistrarHandle(Registrar):
 
     def _own(self, got: Any) -> Any:
         """Return the result of a call, and make this handle the holder of the queries in it."""
-        for one in got if is_a(got, (list, tuple)) else ():
+        several: Iterable[Any] = got if issubclass(type(got), (list, tuple)) else ()
+        for one in several:
             if is_a(one, Query):
                 held_by(one, self)
         return got

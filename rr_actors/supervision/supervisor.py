@@ -317,7 +317,7 @@ class SupervisorRef:
             StartFailed: the child did not start, and is not added. `__cause__` has the reason.
             UsageError: a module that the child's process needs is still being imported.
         """
-        if not is_a(spec, (ChildSpec, Supervisor, list, tuple)):
+        if not issubclass(type(spec), (ChildSpec, Supervisor, list, tuple)):
             expected = "a ChildSpec or Supervisor, or a list of arguments for simple_one_for_one"
             raise invalid(f"start_child of {self.path}", "spec", expected, spec)
         if is_a(spec, (list, tuple)):
@@ -387,8 +387,8 @@ class SupervisorRef:
 
     def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
         if is_a(child, str):
-            return exact_text(cast("str", child))
-        path = getattr(child, "path", None) if is_a(child, pykka.ActorRef) else None
+            return exact_text(child)
+        path = getattr(child, "path", None) if issubclass(type(child), pykka.ActorRef) else None
         if path is None or path.rpartition("/")[0] != self.path:
             raise NotFound(f"supervisor {self.path!r}: {shown(child)} is not a child of it", id=shown(child))
         return path.rpartition("/")[2]

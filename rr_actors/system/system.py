@@ -776,8 +776,9 @@ def _free_top(id: str) -> str:
 def _root_of(root: object) -> Supervisor:
     """Return the root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists."""
     if is_a(root, Supervisor):
-        return cast("Supervisor", root)
-    if not is_a(root, (list, tuple, Sequence)) or is_a(root, (str, bytes, range, memoryview)):
+        return root
+    kind = type(root)
+    if not issubclass(kind, (list, tuple, Sequence)) or issubclass(kind, (str, bytes, range, memoryview)):
         raise invalid("System", "root", "a Supervisor or a list of ChildSpecs", root)
     children: list[ChildSpec | Supervisor] = []
     with examined("System: root"):

@@ -60,7 +60,7 @@ def checked(fraction: object, text: object) -> tuple[float, str]:
         raise UsageError(f"progress: fraction: expected a number from 0 to 1, got {what}")
     if not is_a(text, str):
         raise UsageError(f"progress: text: expected a str, got {shown(text)} ({type(text).__name__})")
-    exact = exact_text(cast("str", text))
+    exact = exact_text(text)
     if len(exact) > TEXT_LIMIT:
         raise UsageError(f"progress: text: expected at most {TEXT_LIMIT} characters, got {len(exact)}")
     return float(number), readable(exact)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, cast
+from typing import Any
 
 from rr_actors.base.errors import UsageError, exact_text, is_a, shown, text_of
 from rr_actors.registrar.model.messages import readable
@@ -17,8 +17,8 @@ def state_of(state: object, what: str) -> State:
         UsageError: `state` is no State; `what`, the name of the call, begins the text.
     """
     if is_a(state, State):
-        return cast("State", state)
-    found = State.__members__.get(exact_text(cast("str", state)).upper()) if is_a(state, str) else None
+        return state
+    found = State.__members__.get(exact_text(state).upper()) if is_a(state, str) else None
     if found is None:
         raise UsageError(f"{what}: expected a state of {', '.join(State)}, got {shown(state)} ({type(state).__name__})")
     return found
