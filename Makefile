@@ -32,10 +32,11 @@ SLOW_SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 .PHONY: demo lab test test-slow test-all lint format chaos breakages simulate fuzz fuzz-quick bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
-demo: $(STAMP)
+# Where nothing is set up yet, these two do not wait for what the tests need.
+demo: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-demo)
 	$(BIN)/python examples/mission.py $(ARGS)
 
-lab: $(STAMP)
+lab: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-web)
 	$(BIN)/rr-actors web --lab $(ARGS)
 
 test: $(STAMP)
@@ -85,15 +86,22 @@ bench-quick: $(STAMP)
 bench-peers: $(STAMP)
 	$(BIN)/python -m benchmarks.peers $(ARGS)
 
-$(STAMP): pyproject.toml
+define INSTALL
 	@test -n "$(PYTHON)" || { echo "rr_actors needs Python 3.11 or later: none found. Try: make PYTHON=/path/to/python3" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "rr_actors needs Python 3.11 or later; PYTHON=$(PYTHON) is not. Try another: make PYTHON=..." >&2; exit 1; }
-	@echo "Setting up $(VENV) with what rr_actors[$(EXTRAS)] needs: this takes a minute or so, and is done once."
+	@echo "Setting up $(VENV) with what rr_actors[$(1)] needs: this takes a minute or so, and is done once."
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) \
 		|| { echo "cannot make a virtual environment: install your system's python3-venv package" >&2; rm -rf $(VENV); exit 1; }
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS)]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$(1)]"
 	@touch $@
+endef
+
+$(STAMP): pyproject.toml
+	$(call INSTALL,$(EXTRAS))
+
+$(VENV)/.installed-%: pyproject.toml
+	$(call INSTALL,$*)
 
 clean:
 	rm -rf .venv .venv-* .pytest_cache .ruff_cache .hypothesis .import_linter_cache build dist out bench.json bench-peers.json

@@ -150,7 +150,7 @@ class Extra:
 
     def missing(self, library: str) -> UsageError:
         """Return the error for a library that is not installed."""
-        install = f"pip install 'rr-actors[{self._extra}]'{self._instead}"
+        install = f"pip install 'rr-actors[{self._extra}]' (in a checkout: '.[{self._extra}]'){self._instead}"
         text = f"{self._what} needs the library {library}, which is not installed. Install it with: {install}"
         return UsageError(text, library=library, extra=self._extra)
 

@@ -461,7 +461,7 @@ class System:
                 while not self._ended.wait(_LOOK_S):
                     pass  # a signal that another thread gets does not interrupt this wait
             except Told:
-                logger.info("system %s: stops, as it got a %s", self.name, termination.told)
+                logger.info("system %s: stops, as it got %s", self.name, termination.told.name)
             finally:
                 termination.awaited = False
                 report = self._end
@@ -742,7 +742,8 @@ class System:
         logger.warning(text, self.name, count)
 
     def __repr__(self) -> str:
-        return f"<System {self.name} {'running' if self._node is not None else 'stopped'} in {self.state_dir}>"
+        state = "stopped" if self._node is None else "running" if self._end is None else "ended, not stopped,"
+        return f"<System {self.name} {state} in {self.state_dir}>"
 
 
 def _say_log_lost(error: BaseException, event: Facts | None) -> None:

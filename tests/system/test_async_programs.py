@@ -122,7 +122,7 @@ def test_load_in_a_callback_that_is_a_coroutine_is_refused_without_a_warning(
     provider.register_server("whole", load_whole)
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        with pytest.raises(rr.LoadFailed, match=r"refused in an `async def` callback.*block=False"):
+        with pytest.raises(rr.LoadFailed, match=r"refused in an `async def` callback.*load_async"):
             app.load("provider/whole", "x")
     assert heard == []
 

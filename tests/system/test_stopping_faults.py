@@ -72,7 +72,6 @@ SYNC: list[tuple[type[Any], str]] = [
     (CommitLog, "close"),
     (CatalogLock, "release"),
     (ActorHub, "close"),
-    (Node, "_remove_hub"),
     (Spawner, "close"),
     (SocketDir, "unlink"),
     (SocketDir, "close"),

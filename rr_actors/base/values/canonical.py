@@ -8,6 +8,7 @@ a type, the provider decodes to it and encodes again. Then a dict equals the dat
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
 import re
 import types
@@ -385,6 +386,9 @@ def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> Misfit:
     steps = [name or index for name, index in re.findall(_STEP, path)]
     missing = re.fullmatch(_MISSING, problem)
     if missing is not None:
+        with contextlib.suppress(RecursionError, msgspec.DecodeError):  # deeper than Python goes; bytes after the value
+            if (mistyped := _unknown_field(plain(read_tree(raw)), shape, what)) is not None:
+                return mistyped
         path, steps = f"{path}.{missing['field']}", [*steps, missing["field"]]
         return Misfit(what + path, name_of(shape_at(shape, steps)), "nothing")
     here = shape_at(shape, steps)

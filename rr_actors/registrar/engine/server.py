@@ -327,8 +327,9 @@ class ServerActor:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
         trace = error.details[1] if type(error) is Raised else failure_of(error, self.origin).trace
-        text = readable(f"{self.origin}: {_text_of(error)}")
-        log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
+        kept = f"resource {resource.id} is kept as unload_failed, and may be unloaded again"
+        text = readable(f"{self.origin}: {_text_of(error)}; {kept}")
+        log_raised(logger, error, "%s", text)
         failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, trace)
         self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
 
