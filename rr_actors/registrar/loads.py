@@ -295,11 +295,11 @@ class Loads:
         """
         query = self.views.new(new_id(), target, request, parent)
         loop = asyncio.get_running_loop()
-        future: asyncio.Future[None] = loop.create_future()
+        future: asyncio.Future[RrError | None] = loop.create_future()  # asyncio logs an exception that nobody reads
 
         def settle(error: RrError | None) -> None:
             with contextlib.suppress(asyncio.InvalidStateError):  # cancelled, perhaps by a Ctrl-C just now
-                future.set_result(None) if error is None else future.set_exception(error)
+                future.set_result(error)
 
         def ended(_held: Held | None, error: RrError | None) -> None:
             try:
@@ -312,7 +312,8 @@ class Loads:
             if hearer is not None:
                 self.actor.listeners.add(query.id, on_this_loop(hearer))
             self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
-            await future
+            if (error := await future) is not None:
+                raise error
         except RrError:
             raise
         except BaseException:  # cancelled, or KeyboardInterrupt, which may come anywhere

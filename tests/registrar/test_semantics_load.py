@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import itertools
 import os
 import pickle
@@ -391,6 +392,26 @@ def test_a_load_given_up_when_its_system_has_stopped_raises_nothing_of_its_own(t
     system.stop()
     waiting.close()
     task._log_destroy_pending = False  # type: ignore[attr-defined] - a closed loop never ends it
+
+
+def test_an_awaited_load_that_is_interrupted_leaves_no_error_to_be_logged(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "slow", load=gate)
+    logged: list[Any] = []
+
+    async def interrupt() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: logged.append(context["message"]))
+        load = app.load_async("provider/slow", "x")
+        load.send(None)
+        with pytest.raises(KeyboardInterrupt):
+            load.throw(KeyboardInterrupt)
+        eventually(lambda: app.stats()["loading"] == 0)
+        await asyncio.sleep(0.05)
+
+    asyncio.run(interrupt())
+    gc.collect()
+    assert logged == []
 
 
 def test_a_load_cancelled_at_the_moment_it_succeeds_is_withdrawn(app: rr.Registrar, provider: rr.Registrar) -> None:

@@ -336,6 +336,8 @@ class Catalog:
 
     def _index_held(self, old: Held | None, new: Held | None) -> None:
         if new is not None and new.hold is not HELD:
+            if old is not None and old.hold is not new.hold:  # a load was withdrawn: that is the newest call
+                self.unsettled.pop(new.id, None)
             self.unsettled[new.id] = new.registrar
         elif old is not None and old.hold is not HELD:
             del self.unsettled[old.id]
