@@ -47,7 +47,7 @@ def main(inherited: Inherited) -> int:
     dispatcher = event_loop.acquire()  # to the end of the process: its last messages are sent after its node has ended
     child = ChildProcess(inherited, info, path, spec)
 
-    signal.signal(signal.SIGTERM, lambda _signal, _frame: dispatcher.call(child.terminate))
+    signal.signal(signal.SIGTERM, lambda _signal, _frame: dispatcher.closed or dispatcher.call(child.terminate))
     return dispatcher.run(child.live())
 
 

@@ -212,6 +212,14 @@ def test_a_cancel_that_is_interrupted_wakes_all_that_wait() -> None:
     assert seen.items == [reply]
 
 
+def test_a_signal_handler_may_cancel_a_future_that_its_thread_is_about_to_wait_for() -> None:
+    reply: Reply[int] = Reply()
+    reply.withdraw = Calls()
+    with reply._condition:  # pyright: ignore[reportPrivateUsage]  # as concurrent.futures.wait() holds it
+        assert reply.cancel()
+    assert reply.cancelled()
+
+
 def test_what_map_returns_is_computed_later_if_there_was_no_thread_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_thread(_thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")

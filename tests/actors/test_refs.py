@@ -28,7 +28,7 @@ from rr_actors.actors.remote import peer
 from rr_actors.actors.remote.hub import set_hub
 from rr_actors.base.errors import ActorUnavailable, MailboxFull, NotSerializable, Unavailable, UsageError
 from rr_actors.wire.name_service import StateDir, Status, open_state_dir
-from support import Calls, Gate, eventually
+from support import Calls, Gate, eventually, hang
 from support_refs import Home, OddError, OpenedOn, Remote, RemoteAsync, end_process, open_home, start_process
 
 
@@ -299,7 +299,7 @@ def test_ask_has_a_time_out_by_default(ours: ActorRef[Any], home: Home) -> None:
 def test_a_process_that_does_not_say_what_an_actor_is_is_named(ours: ActorRef[Any], home: Home) -> None:
     pid = ours.ask("pid")
     home.hub.ask_timeout_s = 0.02
-    os.kill(pid, signal.SIGSTOP)
+    hang(pid)
     try:
         with pytest.raises(pykka.Timeout, match=rf"no reply after 0\.02 seconds: the class of {ours.path}"):
             _ = ref_to(str(ours.path)).actor_class

@@ -8,8 +8,9 @@ import os
 import re
 import signal
 import socket
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -28,6 +29,28 @@ class Talkative(rr.Manager):
         for _ in range(100):
             logging.getLogger("talkative").warning("x" * 100_000)
         raise ValueError("no such device")
+
+
+class Lingering(rr.Actor):
+    """Takes half a second to flush its log as its process leaves."""
+
+    handlers: ClassVar[list[logging.Handler]] = []
+
+    def on_receive(self, message: Any) -> int:
+        handler = logging.Handler()
+        handler.flush = lambda: time.sleep(0.5)
+        self.handlers.append(handler)
+        return os.getpid()
+
+
+def test_a_process_that_leaves_and_gets_a_sigterm_leaves_in_order(start: Start) -> None:
+    system = start(rr.ChildSpec(Lingering, id="a", restart="temporary"))
+    pid = system.ref("a").ask("linger")
+    system.ref("a").stop(block=False)
+    time.sleep(0.25)
+    os.kill(pid, signal.SIGTERM)
+    eventually(lambda: system.supervisor().history()[-1].event == "exited")
+    assert system.supervisor().history()[-1].code == 0
 
 
 def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order() -> None:

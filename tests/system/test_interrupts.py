@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors.messaging.futures import Reply
 from rr_actors.runtime.thread_wakeup import EventBell
 from support import Calls, Workshop, eventually, serve
 from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
@@ -159,6 +160,22 @@ def test_a_load_through_a_handle_that_is_interrupted_is_released(
     eventually(lambda: [query.request for query in shop.queries()] == orders[-1:])
     shop.unload_all()
     assert shop.resources() == []
+
+
+def test_a_cancel_that_is_interrupted_takes_the_request_back_or_does_nothing() -> None:
+    point, where = 0, "at first"
+    while where:
+        point += 1
+        reply: Reply[int] = Reply()
+        withdrawn, woken = Calls(), Calls()
+        reply.withdraw = withdrawn
+        reply.add_done_callback(woken)
+        where = interrupted(reply.cancel, point).where
+        did = (reply.done(), reply.cancelled(), len(withdrawn.items), len(woken.items))
+        assert did in ((False, False, 0, 0), (True, True, 1, 1)), where
+        assert reply.cancel()
+        assert (reply.done(), len(withdrawn.items), len(woken.items)) == (True, 1, 1)
+    assert point > 10
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # an interrupt in __del__ goes nowhere

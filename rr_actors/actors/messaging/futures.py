@@ -24,7 +24,7 @@ from rr_actors.actors.messaging import ask_cycles
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.base.errors import ActorUnavailable, UsageError
 from rr_actors.runtime import event_loop
-from rr_actors.runtime.shielding import is_interruptible
+from rr_actors.runtime.shielding import is_interruptible, shielded
 from rr_actors.runtime.time_limits import time_limit
 
 if TYPE_CHECKING:
@@ -91,17 +91,23 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             False if the future is done, if its actor handles the message already, or if the request cannot be taken
             back (a stop, an unload).
         """
+        if self._set:
+            return self._cancelled
+        lock: Any = self._lock
+        if lock._is_owned():  # a signal handler interrupted this thread at the future: no other thread gets the lock
+            return self._cancel()
+        return shielded(self._cancel)  # an interrupt half way would leave threads waiting, or the request not withdrawn
+
+    def _cancel(self) -> bool:
         with self._lock:
             withdraw = self.withdraw
-            if self._cancelled:
-                return True
             if self._set or self._running or withdraw is None:
-                return False
+                return self._cancelled
             self._cancelled = True
             callbacks = self._put(None, concurrent.futures.CancelledError(f"cancelled: {self._whose()}"), None)
         try:
             withdraw()
-        finally:  # an interrupt must not keep the waiting threads waiting
+        finally:  # it raises Unavailable if the loop has ended
             self._call_back(callbacks)
         return True
 
