@@ -129,10 +129,8 @@ class JournaledStore:
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
-        full, meta = (
-            self._full,
-            self._tables.meta,
-        )  # a folding that ends now replaces the list: so the meta row comes next
+        full = self._full  # a folding that ends now replaces the list: so the meta row comes next
+        meta = self._tables.meta
         number = (full[-1].number if full else meta.folded) + 1
         segment = Segment(self._tables.folder, self.path, meta, number, self._end)
         self._tables.note(number)

@@ -249,7 +249,7 @@ def test_a_search_finds_what_a_request_says_and_not_the_bytes_around_it(
 
     assert found("A") == len(letters)
     assert found('"room":"A"') == found('an "A"') == found('an \\"A\\"') == found("xA") == 1
-    assert found("65") == 2
+    assert found("65.0") == found(str(0x4142434445464748)) == 1  # an id may have any two digits
 
 
 def test_a_resource_is_found_by_its_id_or_the_beginning_of_it_with_its_holders_and_parts(

@@ -19,6 +19,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import Unavailable
+from rr_actors.base.values.canonical import encode
 from rr_actors.system.console import console_client, console_server
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import (
@@ -29,6 +30,7 @@ from rr_actors.system.console.console_messages import (
     Children,
     Follow,
     Hello,
+    Hold,
     ListChildren,
     ListResources,
     Load,
@@ -337,3 +339,28 @@ def test_a_client_that_leaves_with_requests_unread_is_noticed_while_its_first_on
     eventually(lambda: not console.connections, timeout=5.0)  # the gate is shut
     gate.open()
     eventually(lambda: not provider.resources())
+
+
+def test_a_load_that_its_client_cannot_hear_of_any_more_is_released_once(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, served: Served, gate: Gate,
+    dialled: Callable[[], socket.socket], caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    slow = serve(provider, "slow", load=gate)
+    console, peer = system._console, dialled()
+    assert console is not None
+    connection = leave_unread(system, app, peer)
+    with rr.connect(system.state_dir) as client:
+        holder = client.open_registrar("worker")
+        peer.sendall(framed(Hold(holder.name, "provider/slow", encode("1")), 1000))
+        gate.wait_arrived()
+        send_no_more(peer)
+        eventually(lambda: connection._ended)
+        gate.open()
+        slow.unloads.wait(1)
+
+        peer.close()
+
+        eventually(lambda: connection not in console.connections)
+        assert holder.queries() == []
+    eventually(lambda: not console.connections)
+    assert "is not released" not in caplog.text

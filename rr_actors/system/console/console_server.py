@@ -274,8 +274,9 @@ class Connection(asyncio.Protocol):
             self._clean_up(self._console.commands.clients.close, self)
 
     def _release_unheard(self) -> None:
-        if self._unheard:
-            self._clean_up(self._console.commands.clients.release_unheard, *self._unheard)
+        unheard, self._unheard = self._unheard, ()
+        if unheard:
+            self._clean_up(self._console.commands.clients.release_unheard, *unheard)
 
     def _clean_up(self, fn: Callable[..., None], *args: Any) -> None:
         """Have a worker release what the client has left, after an opening that may still be in progress."""
