@@ -150,7 +150,7 @@ class Dispatcher:
         if not self.may_block():
             raise UsageError(
                 f"{what}: refused in an `async def` callback, where blocking would hold up all others; "
-                f"await the form for coroutines (such as load_async), or use asyncio.to_thread"
+                f"await the form for coroutines (load_async, or ask with block=False), or use asyncio.to_thread"
             )
 
     def close(self, timeout_s: float = 1.0) -> None:

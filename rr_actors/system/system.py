@@ -461,6 +461,7 @@ class System:
                 while not self._ended.wait(_LOOK_S):
                     pass  # a signal that another thread gets does not interrupt this wait
             except Told:
+                assert termination.told is not None
                 logger.info("system %s: stops, as it got %s", self.name, termination.told.name)
             finally:
                 termination.awaited = False

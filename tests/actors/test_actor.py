@@ -706,7 +706,7 @@ def test_a_blocking_ask_on_the_loop_or_in_an_async_handler_is_refused(dispatcher
     dispatcher.call(ask)
     assert [type(item) for item in outcome.wait(3)] == [UsageError] * 3
     gate.open()
-    with pytest.raises(UsageError, match="load_async"):
+    with pytest.raises(UsageError, match="block=False"):
         AsyncEcho.start().ask(lambda _: ref.ask("x"))
 
 
