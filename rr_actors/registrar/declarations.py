@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal, TypeVar, cast, overload
 
 from rr_actors.base.checks import check_takes, examined
 from rr_actors.base.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
-from rr_actors.registrar.engine.server import ARGUMENTS, ServerSpec, make_spec
+from rr_actors.registrar.engine.server import ARGUMENTS, ServerSpec, checked_spec
 from rr_actors.wire.name_service import Directory, Status, registrar_key
 
 Request = TypeVar("Request")
@@ -50,7 +50,7 @@ class server:  # noqa: N801 - used as a decorator
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
         self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
         self._types = (request_type, response_type)
-        self._name = make_spec(name, _nothing, **self._options).name
+        self._name = checked_spec(ServerSpec(name, _nothing, **self._options)).name
 
     @overload
     def __call__(  # pyright: ignore[reportOverlappingOverload] - the first that fits is meant
@@ -87,8 +87,8 @@ class Declared(Generic[Request, Returned, Response]):
         self._options = options
         self._owner: type | None = None
         self._others: dict[str, Callable[..., Any]] = {}
-        checked = make_spec(name, _without_self(load), **options)
-        self._types = types[0] or checked.request_type, types[1] or checked.response_type
+        spec = checked_spec(ServerSpec(name, _without_self(load), **options))
+        self._types = types[0] or spec.request_type, types[1] or spec.response_type
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._owner = owner
@@ -140,10 +140,8 @@ class Declared(Generic[Request, Returned, Response]):
         """Return the spec of one manager's server. Its callbacks are bound; a subclass may override all but `load`."""
         roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
         load = functools.partial(self._load, manager)
-        request_type, response_type = self._types
-        return make_spec(
-            self.name, load, request_type=request_type, response_type=response_type, **roles, **self._options
-        )
+        types = dict(zip(("request_type", "response_type"), self._types, strict=True))
+        return checked_spec(ServerSpec(self.name, load, **types, **roles, **self._options))
 
     def _id_in(self, directory: Directory) -> str:
         """Return "registrar/server". The registrar is that of the one child of the system that has the declaring class.

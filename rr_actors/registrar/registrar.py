@@ -39,9 +39,9 @@ from rr_actors.registrar.engine.server import (
     ServerActor,
     ServerSpec,
     check_not_own,
+    checked_spec,
     current_or_none,
     log_unread_types,
-    make_spec,
     serving,
     status_callback_of,
 )
@@ -186,18 +186,8 @@ class Registrar:
             InvalidSpec: a callback or an option is wrong.
             NotSerializable: a callback cannot travel to the registrar's process.
         """
-        spec = make_spec(
-            name,
-            load,
-            unload,
-            status=status,
-            recover=recover,
-            request_type=request_type,
-            response_type=response_type,
-            linger_s=linger_s,
-            load_timeout_s=load_timeout_s,
-            recovery=recovery,
-        )
+        callbacks, types = (load, unload, status, recover), (request_type, response_type)
+        spec = checked_spec(ServerSpec(name, *callbacks, *types, linger_s, load_timeout_s, recovery))
         self._register_spec(spec)
 
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:

@@ -327,9 +327,9 @@ class ServerActor:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
         trace = error.details[1] if type(error) is Raised else failure_of(error, self.origin).trace
-        kept = f"resource {resource.id} is kept as unload_failed, and may be unloaded again"
-        text = readable(f"{self.origin}: {_text_of(error)}; {kept}")
-        log_raised(logger, error, "%s", text)
+        text = readable(f"{self.origin}: {_text_of(error)}")
+        log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
+        text += "; the resource is kept as unload_failed, and may be unloaded again"
         failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, trace)
         self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
 
@@ -468,42 +468,35 @@ def _nothing(*_: Any) -> None:
     return None
 
 
-def make_spec(
-    name: str,
-    load: Callback,
-    unload: Callback | None = None,
-    *,
-    status: Callback | None = None,
-    recover: Callback | None = None,
-    request_type: Any = None,
-    response_type: Any = None,
-    linger_s: float = 0.0,
-    load_timeout_s: float | None = None,
-    recovery: str | None = None,
-) -> ServerSpec:
-    """Check the arguments of a server's registration, and read its types from the annotations of `load`.
+def checked_spec(spec: ServerSpec) -> ServerSpec:
+    """Check what a server is registered with; read its types from the annotations of `load` if none are given.
 
     Raises:
-        InvalidName, InvalidSpec: an argument is wrong; the error says which.
+        InvalidName, InvalidSpec: a field is wrong; the error says which.
     """
-    name = check_name(name, "server name")
+    name = check_name(spec.name, "server name")
     with examined(f"server {name!r}"):
-        for field, callback in (("load", load), ("unload", unload), ("status", status), ("recover", recover)):
+        for field in ("load", "unload", "status", "recover"):
+            callback = getattr(spec, field)
             if callable(callback):
                 check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
             elif field == "load" or callback is not None:
                 _invalid(name, field, "a callable", callback)
-        if recovery is not None and recovery not in RECOVERY:
-            _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
-        if not is_number(linger_s) or linger_s < 0:
-            _invalid(name, "linger_s", "seconds, 0 or more", linger_s)
-        if load_timeout_s is not None and not (is_number(load_timeout_s) and load_timeout_s > 0):
-            _invalid(name, "load_timeout_s", "seconds greater than 0, or None", load_timeout_s)
-        found = _annotated(load)
-        request_type = found[0] if request_type is None else request_type
-        response_type = found[1] if response_type is None else response_type
-        limits = (float(linger_s), load_timeout_s, recovery)
-        return ServerSpec(name, load, unload, status, recover, request_type, response_type, *limits)
+        if spec.recovery is not None and spec.recovery not in RECOVERY:
+            _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), spec.recovery)
+        if not is_number(spec.linger_s) or spec.linger_s < 0:
+            _invalid(name, "linger_s", "seconds, 0 or more", spec.linger_s)
+        limit_s = spec.load_timeout_s
+        if limit_s is not None and not (is_number(limit_s) and limit_s > 0):
+            _invalid(name, "load_timeout_s", "seconds greater than 0, or None", limit_s)
+        request, response = _annotated(spec.load)
+        return msgspec.structs.replace(
+            spec,
+            name=name,
+            request_type=request if spec.request_type is None else spec.request_type,
+            response_type=response if spec.response_type is None else spec.response_type,
+            linger_s=float(spec.linger_s),
+        )
 
 
 def _annotated(load: Callback) -> tuple[Any, Any]:
