@@ -154,7 +154,7 @@ class Folder:
             found = os.fstat(file.fileno())
             self._check(name, found)
             if flags & os.O_TRUNC and found.st_size:
-                file.truncate(0)
+                os.ftruncate(file.fileno(), 0)
         except BaseException:
             file.close()
             raise

@@ -150,7 +150,7 @@ class CatalogLock:
         with contextlib.suppress(OSError):  # a full disk: the commits are elsewhere, and safe
             os.pwrite(self._file.fileno(), text.encode(), 0)
             if len(text) < self._size:
-                self._file.truncate(len(text))
+                os.ftruncate(self._file.fileno(), len(text))
             self._size = len(text)
 
 
