@@ -306,9 +306,9 @@ def test_a_group_with_another_users_process_gets_the_grace(
 ) -> None:
     refuse_signal(0, monkeypatch, tmp_path)
     mark = tmp_path / "mark"
-    slow = f"trap '' TERM; sleep 0.3; touch {mark}"
-    code = f"import subprocess; subprocess.Popen(['sh', '-c', {slow!r}]); {SLEEP}"
-    programs.start(KEY, python(code, ready="ready", grace_s=1))
+    slow = f"trap '' TERM; echo ready; sleep 0.3; touch {mark}"
+    code = f"import subprocess, time; subprocess.Popen(['sh', '-c', {slow!r}]); time.sleep(600)"
+    programs.start(KEY, python(code, ready="ready", grace_s=2))
     programs.stop(KEY)
     assert mark.exists()
 
