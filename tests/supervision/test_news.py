@@ -8,8 +8,8 @@ import os
 import re
 import signal
 import socket
-import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
@@ -32,23 +32,29 @@ class Talkative(rr.Manager):
 
 
 class Lingering(rr.Actor):
-    """Takes half a second to flush its log as its process leaves."""
+    """Makes a file when it flushes its log, as its process leaves, and goes on when there is another."""
 
     handlers: ClassVar[list[logging.Handler]] = []
 
-    def on_receive(self, message: Any) -> int:
+    def on_receive(self, message: Path) -> int:
+        def linger() -> None:
+            message.touch()
+            eventually(message.with_suffix(".go").exists)
+
         handler = logging.Handler()
-        handler.flush = lambda: time.sleep(0.5)
+        handler.flush = linger
         self.handlers.append(handler)
         return os.getpid()
 
 
-def test_a_process_that_leaves_and_gets_a_sigterm_leaves_in_order(start: Start) -> None:
+def test_a_process_that_leaves_and_gets_a_sigterm_leaves_in_order(start: Start, tmp_path: Path) -> None:
     system = start(rr.ChildSpec(Lingering, id="a", restart="temporary"))
-    pid = system.ref("a").ask("linger")
+    leaves = tmp_path / "leaves"
+    pid = system.ref("a").ask(leaves)
     system.ref("a").stop(block=False)
-    time.sleep(0.25)
+    eventually(leaves.exists)
     os.kill(pid, signal.SIGTERM)
+    leaves.with_suffix(".go").touch()
     eventually(lambda: system.supervisor().history()[-1].event == "exited")
     assert system.supervisor().history()[-1].code == 0
 
