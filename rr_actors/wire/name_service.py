@@ -340,7 +340,7 @@ class StateDir:
         steps = Steps()
         steps.take("removing what only a running system needs", self._clear)
         with contextlib.suppress(OSError):  # the pid in the file is only for people
-            self._lock.truncate(0)
+            os.ftruncate(self._lock.fileno(), 0)
         steps.take("giving its lock back", self.forget)
         steps.end(f"state directory {self.path}: not closed altogether")
 
@@ -422,7 +422,7 @@ def _take_lock(folder: Folder) -> io.FileIO:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with _named_errors("write", lock_path):
-            lock.truncate(0)
+            os.ftruncate(lock.fileno(), 0)
             lock.write(b"%d\n" % os.getpid())
     except BlockingIOError as error:
         text = os.pread(lock.fileno(), 20, 0).strip()

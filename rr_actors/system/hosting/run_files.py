@@ -48,7 +48,7 @@ class Watched:
     def _open(self) -> mmap.mmap:
         try:
             with Folder.at(self._run_dir) as run, run.open(_NAME, os.O_RDWR | os.O_CREAT) as file:
-                file.truncate(1)
+                os.ftruncate(file.fileno(), 1)
                 self._file = os.fstat(file.fileno())
                 return mmap.mmap(file.fileno(), 1)
         except OSError as error:
