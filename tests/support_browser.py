@@ -108,6 +108,8 @@ class Tab:
         asked: the addresses that the page has asked for.
         outside: those of other machines.
         errors: what the page's scripts have complained of.
+        expected: what a test makes them complain of, a part of the text. The complaint may come late: after the page
+            shows what the test waits for.
     """
 
     def __init__(self, chromium: Chromium, context: BrowserContext, page: Page) -> None:
@@ -116,6 +118,7 @@ class Tab:
         self.asked: list[str] = []
         self.outside: list[str] = []
         self.errors: list[str] = []
+        self.expected = ("net::ERR_", "WebSocket")
         self._chromium = chromium
         page.set_default_timeout(PATIENCE_S * 1000)
         context.on("request", lambda request: self._note(request.url))
@@ -130,7 +133,7 @@ class Tab:
             self.outside.append(url)
 
     def _complaint(self, message: ConsoleMessage) -> None:
-        if message.type == "error" and "net::ERR_" not in message.text and "WebSocket" not in message.text:
+        if message.type == "error" and not any(part in message.text for part in self.expected):
             self.errors.append(message.text)
 
     def do(self, doing: Coroutine[Any, Any, T]) -> T:
