@@ -166,8 +166,8 @@ class UnixTransport:
                 steps.take("closing a link", link.connection_lost, None)
             steps.take("closing the directory of sockets", self._sockets.close)
         steps.end(f"transport {self.address}: not closed altogether")
-        for _ in range(2):
-            await asyncio.sleep(0)  # the loop closes aborted connections in its next turn
+        for _ in range(3):
+            await asyncio.sleep(0)  # the loop closes aborted connections in its next turns
 
     async def _close_links(self) -> None:
         links = [*self.links]
@@ -319,10 +319,10 @@ class _Dialler(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         self._peer = peer_of(self._transport)
-        if self.done.done():
-            self._transport.abort()
-        elif not self._peer.trusted:
+        if not self._peer.trusted:
             self._fail(f"it runs as user {self._peer.uid}, not as ours")
+        elif self.done.done():
+            self._abort()
 
     def data_received(self, data: bytes) -> None:
         if self.done.done():
@@ -370,8 +370,7 @@ class _Dialler(asyncio.Protocol):
         self._forget()
         if not self.done.done():
             self.done.set_exception(error)
-        if self._transport is not None:
-            self._transport.abort()
+        self._abort()
 
     def abandon(self) -> None:
         """Close the link or the connection: connect() does not wait for it any more."""
@@ -379,8 +378,17 @@ class _Dialler(asyncio.Protocol):
         self.done.cancel()
         if self._link is not None:
             self._link.close()
-        elif self._transport is not None:
-            self._transport.abort()
+        else:
+            self._abort()
+
+    def _abort(self) -> None:
+        """Close the connection, in a later call of the loop.
+
+        uvloop takes the socket from its Python object only after connection_made(). If the connection is aborted there,
+        the object closes the same descriptor number once more, when it is collected.
+        """
+        if self._transport is not None:
+            asyncio.get_running_loop().call_soon(self._transport.abort)
 
     def _forget(self) -> None:
         self._timer.cancel()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import os
 import signal
@@ -426,6 +427,24 @@ def test_closing_a_transport_ends_the_connects_it_is_in(run: Run, tmp_path: Path
             for result in await asyncio.gather(*connects, return_exceptions=True):
                 assert isinstance(result, Unavailable)
                 assert "closed" in str(result)
+
+    with deaf(tmp_path / "deaf", 0):
+        run(scenario())
+
+
+@pytest.mark.usefixtures("others_sockets")
+def test_a_connection_that_is_given_up_before_it_is_made_is_closed_once(run: Run, tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with transports(tmp_path) as [transport]:
+            connect = asyncio.ensure_future(transport.connect("deaf", HELLO, Inbox().attach))
+            await asyncio.sleep(0)  # it is connected, and the loop has not called the protocol yet
+            await transport.close()
+            assert isinstance((await asyncio.gather(connect, return_exceptions=True))[0], Unavailable)
+        opened = [os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC) for _ in range(8)]  # one gets the same number
+        del connect
+        gc.collect()
+        for descriptor in opened:
+            os.close(descriptor)  # OSError if somebody has closed it
 
     with deaf(tmp_path / "deaf", 0):
         run(scenario())
