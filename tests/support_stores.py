@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import typing
-import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,9 +32,7 @@ from rr_actors.storage.sqlite_store import segments_among
 
 def folder_of(catalog: Path) -> Folder:
     """The catalog's directory, until nobody uses it any more."""
-    folder = Folder.at(catalog.parent)
-    weakref.finalize(folder, os.close, folder.fd)
-    return folder
+    return Folder.at(catalog.parent)
 
 
 def segments_of(catalog: Path) -> list[Path]:

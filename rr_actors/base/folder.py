@@ -12,6 +12,7 @@ import functools
 import io
 import os
 import stat
+import weakref
 from pathlib import Path
 from typing import Self
 
@@ -59,6 +60,9 @@ class NotAFile(OSError):
 class Folder:
     """A directory that is held open by a descriptor of its own. Usable from any thread.
 
+    The descriptor is closed once, by close() or when the last reference to the folder is gone: a second close could hit
+    a file of another thread that has got the same number. A thread that passes `fd` on must hold the folder meanwhile.
+
     Attributes:
         path: the directory's path when it was opened.
         fd: the descriptor; -1 once it is closed.
@@ -69,6 +73,8 @@ class Folder:
         self.path = path
         self.fd = fd
         self.owner = owner
+        self._close = weakref.finalize(self, os.close, fd)
+        self._close.atexit = False  # other threads may use it until the process ends
 
     @classmethod
     def at(cls, path: str | os.PathLike[str], *, to_read: bool = False) -> Self:
@@ -82,9 +88,8 @@ class Folder:
 
     def close(self) -> None:
         """Close the descriptor. A second call does nothing."""
-        fd, self.fd = self.fd, -1
-        if fd >= 0:
-            os.close(fd)
+        self.fd = -1
+        self._close()
 
     def __enter__(self) -> Self:
         return self

@@ -29,7 +29,6 @@ import os
 import re
 import stat
 import threading
-import weakref
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
@@ -163,8 +162,7 @@ class Directory:
             names = self._names
             if names.fd < 0 or (names.is_there() and (self.run_dir / "names").exists()):
                 return False
-            self._names = self._open()  # the old folder stays open, until it is collected, for threads that use it
-            weakref.finalize(names, os.close, names.fd)
+            self._names = self._open()  # the old folder stays open for threads that use it
             for name, content in list(self._written.items()):
                 if content.startswith(_UP) or self.lookup(name) is None:
                     self._write(name, content)
@@ -178,9 +176,10 @@ class Directory:
         for path in paths:
             with contextlib.suppress(OSError):
                 os.utime(path, follow_symlinks=False)
+        names = self._names
         for name in self.names():
             with contextlib.suppress(OSError):
-                os.utime(name, dir_fd=self._names.fd, follow_symlinks=False)
+                os.utime(name, dir_fd=names.fd, follow_symlinks=False)
 
     def publish(self, name: str, address: str, *, once: bool = False) -> None:
         """Write that `name` is UP at `address`; `once`: when it ends, it will not be started again."""
@@ -221,8 +220,9 @@ class Directory:
 
     def lookup(self, name: str) -> Entry | None:
         """Return the entry, or None if there is none. One system call."""
+        names = self._names
         try:
-            content = os.readlink(name, dir_fd=self._names.fd)
+            content = os.readlink(name, dir_fd=names.fd)
         except OSError:  # no such entry, or no symbolic link
             return None
         if content.startswith(_UP):
@@ -253,10 +253,11 @@ class Directory:
     def manager_classes(self) -> dict[str, list[str]]:
         """Return the classes of each manager that has been in the system, by the name of its registrar."""
         found: dict[str, list[str]] = {}
+        names = self._names
         for name in self.names():
             if name.startswith(_CLASSES):
                 with contextlib.suppress(OSError):
-                    found[name.removeprefix(_CLASSES)] = os.readlink(name, dir_fd=self._names.fd).split(",")
+                    found[name.removeprefix(_CLASSES)] = os.readlink(name, dir_fd=names.fd).split(",")
         return found
 
     def actors_below(self, path: str) -> list[str]:

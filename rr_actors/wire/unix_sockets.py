@@ -78,7 +78,8 @@ def peer_at(connected: socket.socket) -> Peer:
 class SocketDir:
     """The socket files of a directory, reached by its descriptor: its path may be of any length, and change.
 
-    Any thread may use it. The first thread that binds or connects opens the descriptor, which stays open.
+    Any thread may use it. The first thread that binds or connects opens the descriptor, which stays open. A thread that
+    uses it holds the Folder until it is done: another one may find the directory removed and open it anew meanwhile.
     """
 
     def __init__(self, path: Path) -> None:
@@ -94,8 +95,8 @@ class SocketDir:
         unbound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             os.fchmod(unbound.fileno(), 0o600)  # the file gets the socket's own mode
-            address = self._address_of(name)
-            unbound.bind(address)
+            folder = self._opened()
+            unbound.bind(_address(folder, name))
         except OSError as error:
             unbound.close()
             why = wanted_by(error) or error.strerror or error
@@ -119,10 +120,10 @@ class SocketDir:
         connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             connected.setblocking(False)
-            address = self._address_of(name)
+            folder = self._opened()
             if not self.has(name):
                 raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._path / name))
-            connected.connect(address)
+            connected.connect(_address(folder, name))
         except BaseException:
             connected.close()
             raise
@@ -131,7 +132,8 @@ class SocketDir:
     def has(self, name: str) -> bool:
         """Return whether a socket file of this name exists; a symbolic link to one does not count."""
         try:
-            return stat.S_ISSOCK(os.stat(name, dir_fd=self._opened().fd, follow_symlinks=False).st_mode)
+            folder = self._opened()
+            return stat.S_ISSOCK(os.stat(name, dir_fd=folder.fd, follow_symlinks=False).st_mode)
         except OSError:
             return False
 
@@ -149,25 +151,18 @@ class SocketDir:
                 folder.discard(name)
 
     def close(self) -> None:
-        """Close the descriptor; later calls of connect() fail."""
+        """Close the descriptor as soon as no thread uses it; later calls of connect() fail."""
         self._closed = True
-        self._drop()
-
-    def _drop(self) -> None:
-        folder, self._folder = self._folder, None
-        if folder is not None:
-            folder.close()
+        self._folder = None
 
     def _opened(self) -> Folder:
         if self._closed:
             raise FileNotFoundError(errno.ENOENT, "closed: its process is ending", str(self._path))
         folder = self._folder
-        if folder is not None and not folder.is_there():  # the directory was removed, and perhaps made again
-            self._drop()
-            folder = None
-        if folder is None:
+        if folder is None or not folder.is_there():  # not opened yet; or removed, and perhaps made again
             folder = self._folder = Folder.at(self._path)
         return folder
 
-    def _address_of(self, name: str) -> str:
-        return f"/proc/self/fd/{self._opened().fd}/{name}"
+
+def _address(folder: Folder, name: str) -> str:
+    return f"/proc/self/fd/{folder.fd}/{name}"
