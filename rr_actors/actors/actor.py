@@ -19,7 +19,7 @@ from pykka import ActorRegistry
 from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
-from rr_actors.actors.messaging import death_watch, exit_reports
+from rr_actors.actors.messaging import dead_letters, death_watch, exit_reports
 from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity
 from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, Reason, abnormal
 from rr_actors.actors.messaging.futures import Reply, fail
@@ -28,7 +28,7 @@ from rr_actors.actors.monitors import Monitor, begin, take
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.remote.hub import running
 from rr_actors.actors.remote.proxy import as_answer
-from rr_actors.base.errors import Unavailable
+from rr_actors.base.errors import Unavailable, text_of
 from rr_actors.runtime.callback_errors import log_raised, raised_by
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import shielded
@@ -293,7 +293,7 @@ class BaseActor(pykka.Actor):
                 try:
                     message = message.open()
                 except Exception as error:  # an error of the sender, not of this actor
-                    self._not_opened(error, reply)
+                    self._not_opened(message, error, reply)
                     return
             if is_stop(message):
                 await self._stop_now(message, reply)
@@ -319,9 +319,11 @@ class BaseActor(pykka.Actor):
             logger.info("Exception returned from %s to caller:", self, exc_info=failure)
             fail(reply, failure)
 
-    def _not_opened(self, error: Exception, reply: pykka.Future[Any] | None) -> None:
+    def _not_opened(self, packed: Packed, error: Exception, reply: pykka.Future[Any] | None) -> None:
         if reply is None:
             logger.error("a message for %s cannot be opened here, and is dropped", self, exc_info=error)
+            why = f"cannot be opened: {text_of(error)}"
+            dead_letters.office.record(self._target.name, [packed], why, unheard=0)  # the log has it
         else:
             fail(reply, error)
 

@@ -97,7 +97,7 @@ class ActorRef(pykka.ActorRef[A]):
             raise
 
     def tell(self, message: Any) -> None:
-        """Send a message, and return at once.
+        """Send a message, and return at once. It becomes a dead letter if an actor in another process does not take it.
 
         Raises:
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().

@@ -31,9 +31,22 @@ class Worker(rr.Actor):
                     ref.tell(what)
                 except pykka.ActorDeadError as error:
                     return str(error)
+            case ("ask", ref):
+                return ref.ask("wait")
             case "fail":
                 raise ValueError("as it was told")
         return message
+
+
+class Narrow(Worker):
+    mailbox_limit = 1
+
+
+class Unopened:
+    """It can be sent, and not opened where it arrives."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return int, ("no number",)
 
 
 class Odd:
@@ -151,6 +164,74 @@ def test_letters_lost_between_processes_are_noted_where_they_are_lost(start: Sta
     assert to == str(mine.actor_urn)
     assert message.endswith("bytes>")
     assert why == f"sent by root/a (pid {a.ask('pid')}), found nobody"
+
+
+def test_a_told_message_that_a_full_mailbox_refuses_in_another_process_is_one_there(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    gate, events = Gate(), Calls()
+
+    class Keeper(rr.Actor):
+        def on_receive(self, message: Any) -> None:
+            gate()
+
+    system = start(rr.ChildSpec(Narrow, id="a"))
+    system.subscribe(lambda event: events(event) if event["event"] == "dead_letter" else None)
+    a = system.ref("a")
+    pid = a.ask("pid")
+    keeper = Keeper.start()
+    a.tell(("ask", keeper))
+    gate.wait_arrived()
+    for _ in range(3):
+        a.tell("hello")
+
+    heard = events.wait(2)
+    gate.open()
+    ((to, message, why),) = set(letters(system))
+    assert to == "root/a"
+    assert message.endswith("bytes>")
+    assert why.startswith(f"sent by root (pid {os.getpid()}), not taken: MailboxFull: mailbox of root/a: holds 1 mess")
+    assert {event["pid"] for event in heard} == {pid}
+    assert system.dead_letters().count == 2
+    assert "Traceback" not in caplog.text
+    keeper.stop()
+
+
+def test_a_full_mailbox_of_this_process_makes_letters_of_what_others_tell_it(start: Start) -> None:
+    gate = Gate()
+
+    class Small(rr.Actor):
+        mailbox_limit = 1
+
+        def on_receive(self, message: Any) -> None:
+            gate()
+
+    system = start(rr.ChildSpec(Worker, id="a"))
+    a = system.ref("a")
+    small = Small.start()
+    small.tell(1)
+    gate.wait_arrived()
+    small.tell(2)
+    a.ask(("tell", small, 3))
+
+    eventually(lambda: system.dead_letters().count == 1)
+    gate.open()
+    ((to, _, why),) = letters(system)
+    assert to == str(small.actor_urn)
+    assert why.startswith(f"sent by root/a (pid {a.ask('pid')}), not taken: MailboxFull: mailbox of Small")
+    small.stop()
+
+
+def test_a_told_message_that_cannot_be_opened_is_one(start: Start) -> None:
+    system = start(rr.ChildSpec(Worker, id="a"))
+    system.ref("a").tell(Unopened())
+
+    eventually(lambda: system.dead_letters().count == 1)
+    ((to, message, why),) = letters(system)
+    assert to == "root/a"
+    assert message.endswith("bytes>")
+    assert why.startswith("cannot be opened: ValueError: invalid literal")
+    assert system.ref("a").ask("pid") > 0  # it lives on
 
 
 def test_a_message_that_is_too_long_for_its_connection_is_one(start: Start) -> None:

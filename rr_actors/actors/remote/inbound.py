@@ -31,7 +31,7 @@ from rr_actors.actors.remote.protocol import (
 )
 from rr_actors.actors.remote.proxy import attributes_of
 from rr_actors.base import pickling
-from rr_actors.base.errors import NotSerializable, RrError, Unavailable, text_of
+from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable, text_of
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.transport import Link
 from rr_actors.wire.unix_link import UnixLink
@@ -66,13 +66,13 @@ class Visitor:
             case Tell(to, body):
                 self._deliver(to, body, None, ())
             case Inquire(call, to, what):
-                self._in_turn(to, call, self._inquire, call, to, what)
+                self._in_turn(to, call, message, self._inquire, call, to, what)
             case Halt(call, to, reason, final):
                 # Like a message, after the earlier ones. A supervisor's stop overtakes them, as in the mailbox.
                 if reason == "shutdown" or _opens_packed(self._find(to)):
                     self._halt(call, to, reason, final)
                 else:
-                    self._in_turn(to, call, self._halt, call, to, reason, final)
+                    self._in_turn(to, call, message, self._halt, call, to, reason, final)
             case Watch(call, to):
                 self._watch(call, to)
             case Unwatch(call):
@@ -139,19 +139,19 @@ class Visitor:
 
     def _deliver(self, to: str, body: bytes, call: int | None, chain: Chain) -> None:
         ref = self._find(to)
+        packed = Packed(lambda: pickling.loads(body), len(body))
         if ref is None:
-            self._undeliverable(to, call, dead_letters.Lost(f"{len(body)} bytes"))
-            return
-        if _opens_packed(ref):
-            self._put(ref, to, Packed(lambda: pickling.loads(body), len(body)), call, chain)
+            self._undeliverable(to, call, packed)
+        elif _opens_packed(ref):
+            self._put(ref, to, packed, call, chain)
         else:  # this actor would unpickle it on the loop, or does not know Packed
-            self._in_turn(to, call, self._open_and_put, ref, to, body, call, chain)
+            self._in_turn(to, call, packed, self._open_and_put, ref, to, packed, call, chain)
 
-    def _open_and_put(self, ref: pykka.ActorRef[Any], to: str, body: bytes, call: int | None, chain: Chain) -> None:
+    def _open_and_put(self, ref: pykka.ActorRef[Any], to: str, packed: Packed, call: int | None, chain: Chain) -> None:
         try:
-            message = pickling.loads(body)
+            message = packed.open()
         except Exception as error:
-            self._not_taken(to, call, error)
+            self._not_taken(to, call, packed, error)
         else:
             self._put(ref, to, message, call, chain)
 
@@ -166,28 +166,32 @@ class Visitor:
         except ActorDeadError:
             self._undeliverable(to, call, message)
         except Exception as error:
-            self._not_taken(to, call, error)
+            self._not_taken(to, call, message, error)
 
-    def _in_turn(self, to: str, call: int | None, fn: Callable[..., None], *args: Any) -> None:
+    def _in_turn(self, to: str, call: int | None, message: Any, fn: Callable[..., None], *args: Any) -> None:
         """Run fn in a worker, after all earlier calls of the other process for the same actor."""
         try:
             self._dispatcher.workers.serial((self._link.peer, to), fn, *args)  # on all its connections
         except Unavailable as error:
-            self._not_taken(to, call, error)
+            self._not_taken(to, call, message, error)
 
-    def _not_taken(self, to: str, call: int | None, error: Exception) -> None:
+    def _not_taken(self, to: str, call: int | None, message: Any, error: Exception) -> None:
         if call is not None:
             self.raised(call, error)
-        else:
+            return
+        full = isinstance(error, MailboxFull)
+        if not full:  # the traceback helps to find the fault
             logger.error("a message told to %s by %s was not taken", to, self._link.peer, exc_info=error)
+        self._record(to, message, f"not taken: {text_of(error)}", unheard=int(full))
 
     def _undeliverable(self, to: str, call: int | None, message: Any) -> None:
-        name = to.removeprefix("urn:rr-actor:")
-        dead_letters.office.record(
-            name, [message], f"sent by {self._link.peer}, found nobody", unheard=int(call is None)
-        )
+        self._record(to, message, "found nobody", unheard=int(call is None))
         if call is not None:
             self.post(Dead(call))
+
+    def _record(self, to: str, message: Any, why: str, *, unheard: int) -> None:
+        name = to.removeprefix("urn:rr-actor:")
+        dead_letters.office.record(name, [message], f"sent by {self._link.peer}, {why}", unheard=unheard)
 
     def _watch(self, call: int, to: str) -> None:
         def over(report: ExitReport) -> None:
