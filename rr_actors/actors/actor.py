@@ -6,6 +6,7 @@ The life of an actor is one coroutine: it begins, handles messages until the act
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import threading
 import uuid
@@ -377,10 +378,8 @@ class BaseActor(pykka.Actor):
             except BaseException as error:
                 self._note_failure(error)
         death_watch.ended(self.actor_stopped, self._report)
-        try:
+        with contextlib.suppress(Unavailable):  # the loop has ended
             self._dispatcher.call(self._ended, self._on_exit, self._report)
-        except Unavailable:
-            logger.debug("%s ended after its loop", self)
         for reply in self._stop_replies:
             reply.set(None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import threading
@@ -147,11 +148,9 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
         raise UsageError(f"monitor: callback: expected a callable, got {type(callback).__name__}")
     call_back = None if callback is None else described(callback, "monitor: callback")
 
-    def over(monitor: Monitor) -> None:
-        try:
+    def over(_monitor: Monitor) -> None:
+        with contextlib.suppress(Unavailable):  # the loop has ended
             dispatcher.call(release)  # on the loop: a worker would wait for itself
-        except Unavailable:
-            logger.debug("%r is over after its loop", monitor)
 
     def deliver(monitor: Monitor, _down: Down) -> None:
         if call_back is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -45,10 +46,8 @@ class Timer:
         left_s = self.left_s
         if not self._end():
             return None
-        try:
+        with contextlib.suppress(Unavailable):  # the loop has ended
             self._dispatcher.call(self._forget)
-        except Unavailable:
-            logger.debug("%r was cancelled after its loop had ended", self)
         return left_s
 
     def _begin(self) -> None:
@@ -74,10 +73,8 @@ class Timer:
         except (ActorDeadError, RrError) as error:
             logger.warning("the message of a timer was not sent to %s: %s", self._ref, error)
         finally:
-            try:
+            with contextlib.suppress(Unavailable):  # the loop has ended
                 self._dispatcher.call(release)  # on the loop: a worker would wait for itself
-            except Unavailable:
-                logger.debug("%r is over after its loop", self)
 
     def _end(self) -> bool:
         with self._lock:
