@@ -13,7 +13,7 @@ from pykka import ActorDeadError
 from rr_actors.actors.messaging import ask_cycles, dead_letters
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import ExcInfo, Reply, StopReply, error_of
-from rr_actors.actors.messaging.mailbox import Ended, Envelope, Stop, has_ended, is_stop
+from rr_actors.actors.messaging.mailbox import Ended, Envelope, Stop, has_ended, is_stop, put
 from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.remote.peer import Line, Whereabouts
 from rr_actors.actors.remote.proxy import Attributes, DistantInbox, DistantProxy, Mirror, attributes_of, local_proxy
@@ -103,7 +103,7 @@ class ActorRef(pykka.ActorRef[A]):
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
         """
         try:
-            _put(self, Envelope(message), self._target.name)
+            put(self, Envelope(message), self._target.name)
         except ActorDeadError as error:
             _note_dead(self, message, error)
             raise
@@ -200,7 +200,7 @@ class ActorRef(pykka.ActorRef[A]):
     def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
         """Send a message, or set the error on `reply`. Return what to call when nobody waits for the reply any more."""
         try:
-            _put(self, Envelope(message, reply, chain), self._target.name)
+            put(self, Envelope(message, reply, chain), self._target.name)
         except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
             reply.set_exception()
             _note_dead(self, message, error)
@@ -307,7 +307,7 @@ class DistantRef(ActorRef[A]):
             if local is None:
                 self._hub().tell(self._where, message)
                 return
-            _put(local, Envelope(message), self._target.name)
+            put(local, Envelope(message), self._target.name)
         except (ActorDeadError, ActorUnavailable) as error:
             said = _as_directory_says(self._where, error) if isinstance(error, Ended) else error
             _note_dead(self, message, said)
@@ -392,7 +392,7 @@ class DistantRef(ActorRef[A]):
             local = self._local()
             if local is None:
                 return self._hub().ask(self._where, message, reply, chain)
-            _put(local, Envelope(message, reply, chain), self._target.name)
+            put(local, Envelope(message, reply, chain), self._target.name)
         except (ActorDeadError, Unavailable) as error:
             reply.set_exception()
             _note_dead(self, message, error)
@@ -482,13 +482,6 @@ def ref_in(what: Any) -> pykka.ActorRef[Any] | None:
     except Exception:  # raised by the object's own code
         return None
     return cast("pykka.ActorRef[Any]", ref) if is_a(ref, pykka.ActorRef) else None
-
-
-def _put(ref: pykka.ActorRef[Any], envelope: Envelope, name: str) -> None:
-    """Put an envelope into the mailbox of an actor of this process, or raise Ended or MailboxFull."""
-    if ref.actor_stopped.is_set():
-        raise Ended(f"{name} not found", name)
-    ref.actor_inbox.put(envelope)
 
 
 def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> None:

@@ -57,7 +57,7 @@ def test_whoever_has_the_answer_writes_it() -> None:
     asker.answer(1, "value", "root/a")
     asker.raised(2, ValueError("no"), "root/a")
     any_link: Any = link
-    asker.received(any_link, Ask(3, URN, b"", []))
+    asker.received(any_link, Ask(3, URN, b"", ()))
     assert [type(letter).__name__ for letter in link.by_outlet] == ["Answered", "Raised", "Dead"]
     assert link.by_outlet[2] == Dead(3)
 
@@ -97,7 +97,7 @@ def test_an_intruder_that_tells_on_such_a_link_loses_it(tmp_path: Path) -> None:
     async def intrude() -> None:
         hello = Hello(ASKS, "x", "intruder", 0)
         link = await home.transport.connect(home.hub.address, hello, lambda _: Bystander())
-        link.send(Ask(7, URN, b"", []))
+        link.send(Ask(7, URN, b"", ()))
         link.send(Tell(URN, b""))
         link.flush()
 

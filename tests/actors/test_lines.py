@@ -12,8 +12,9 @@ from typing import Any
 import pykka
 import pytest
 
+from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.actors.remote.peer import Call, Line
+from rr_actors.actors.remote.peer import Call, Line, Whereabouts
 from rr_actors.actors.remote.protocol import ASKS, Answered, Ask, Dead, Over, Raised, Tell, Watching
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable
@@ -26,6 +27,11 @@ from support_asks import FakeExchange, answered
 
 HELLO = Hello("actors", "there.sock", "here (pid 1)", 0)
 URN = "urn:rr-actor:root/a"
+WHERE = Whereabouts(Target(URN, "root/a"), "root/a", "")
+
+
+def gone(_where: Whereabouts) -> Exception:
+    return pykka.ActorDeadError("gone")
 
 
 class FakeLink:
@@ -78,7 +84,7 @@ class Bench:
         self.link = self.transport.link
         self.forgotten: list[Line] = []
         transport: Any = self.transport
-        self.line = Line(self.dispatcher, transport, HELLO, self.forgotten.append)
+        self.line = Line(self.dispatcher, transport, HELLO, gone, self.forgotten.append)
         self._numbers = itertools.count(1)
         self.put_ask()
         self.settle()
@@ -88,7 +94,7 @@ class Bench:
         reply: Reply[Any] = Reply()
         number = self.line.next_number()
         self.last = number
-        self.line.put(Ask(number, URN, b"", []), Call(number, reply, "root/a", lambda: pykka.ActorDeadError("gone")))
+        self.line.put(Ask(number, URN, b"", ()), Call(number, reply, WHERE))
         self.turn()
         return reply
 
@@ -101,7 +107,7 @@ class Bench:
         self.hear(Answered(self.last, b""))
 
     def ask(self, timeout_s: float | None = 10.0) -> Any:
-        return self.line.ask(Ask(self.line.next_number(), URN, b"", []), timeout_s)
+        return self.line.ask(Ask(self.line.next_number(), URN, b"", ()), timeout_s)
 
     def tell(self) -> Tell:
         """Put a letter, and let the loop do all it has to do."""
@@ -163,9 +169,9 @@ def test_a_thread_asks_by_a_connection_of_its_own_and_the_next_uses_it_again(ben
 def test_nothing_is_asked_so_before_there_is_a_link() -> None:
     dispatcher = Dispatcher()
     transport: Any = FakeTransport()
-    line = Line(dispatcher, transport, HELLO, lambda _: None)
+    line = Line(dispatcher, transport, HELLO, gone, lambda _: None)
     assert not line.may_ask
-    assert line.ask(Ask(1, URN, b"", []), None) is None
+    assert line.ask(Ask(1, URN, b"", ()), None) is None
     assert not transport.made
     dispatcher.close()
     assert not line.may_ask

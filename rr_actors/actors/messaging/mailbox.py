@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import msgspec
-from pykka import ActorDeadError, Future
+from pykka import ActorDeadError, ActorRef, Future
 from pykka._envelope import Envelope as PykkaEnvelope
 from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPrivateUsage]
 
@@ -230,6 +230,13 @@ class Mailbox:
 
     def __len__(self) -> int:
         return len(self._messages) + len(self._control)
+
+
+def put(ref: ActorRef[Any], envelope: Envelope, name: str) -> None:
+    """Put an envelope into the mailbox of the actor `name` of this process, or raise Ended or MailboxFull."""
+    if ref.actor_stopped.is_set():
+        raise Ended(f"{name} not found", name)
+    ref.actor_inbox.put(envelope)
 
 
 def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:

@@ -17,7 +17,7 @@ from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.actors.messaging.mailbox import Mailbox, refuse_all
 from rr_actors.actors.remote.inbound import Asker, Visitor
-from rr_actors.actors.remote.peer import Call, Line, Whereabouts
+from rr_actors.actors.remote.peer import Call, Cut, Line, Whereabouts
 from rr_actors.actors.remote.protocol import ASKS, KIND, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
 from rr_actors.base import pickling
 from rr_actors.base.errors import ActorUnavailable, Unavailable, UsageError
@@ -128,7 +128,7 @@ class ActorHub:
     def ask(self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain) -> Callable[[], None]:
         """Send the message; `reply` is set later. Return what to call when nobody waits for the reply any more."""
         body = pickling.dumps(message, f"message to {where.target.name}")
-        return self._call(where, reply, lambda call: _letter(call, where, body, chain))
+        return self._call(where, reply, lambda number: Ask(number, where.target.urn, body, chain))
 
     def line_to(self, where: Whereabouts) -> Line | None:
         """Return the line to the actor's process, or None if there is no line yet."""
@@ -151,9 +151,9 @@ class ActorHub:
             NotSerializable: the message cannot be pickled, or is too long.
         """
         body = pickling.dumps(message, f"message to {where.target.name}")
-        call = self._new_call(line, where, reply)
+        call = Call(line.next_number(), reply, where)
         try:
-            answer = line.ask(_letter(call, where, body, chain), timeout_s)
+            answer = line.ask(Ask(call.number, where.target.urn, body, chain), timeout_s)
         except TimeoutError:
             raise
         except OSError as error:
@@ -174,12 +174,12 @@ class ActorHub:
     def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
         """Ask the actor's process about the actor: "alive", "class" or "attributes"."""
         reply: Reply[Any] = Reply()  # without a target: the process replies, so the actor's own handler may wait for it
-        self._call(where, reply, lambda call: Inquire(call.number, where.target.urn, what))
+        self._call(where, reply, lambda number: Inquire(number, where.target.urn, what))
         return reply
 
     def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
         """Send the actor a stop; `reply` is set when the actor has ended."""
-        return self._call(where, reply, lambda call: Halt(call.number, where.target.urn, reason, final))
+        return self._call(where, reply, lambda number: Halt(number, where.target.urn, reason, final))
 
     def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
         """Call fire(reason, detail), as for a Down, once, when the actor has ended. Return what ends the watch.
@@ -204,7 +204,7 @@ class ActorHub:
             placed.set()
             try:
                 over = reply.get()
-            except _Cut:
+            except Cut:
                 if pid is None or self._closed:
                     gone(False)
                     return
@@ -219,9 +219,8 @@ class ActorHub:
 
         line = self._line(address)
         number = line.next_number()
-        call = Call(number, reply, where.target.name, lambda: self.missing(where), _Cut, placed.set)
         reply.add_done_callback(told)
-        line.put(Watch(number, where.target.urn), call)
+        line.put(Watch(number, where.target.urn), Call(number, reply, where, placed.set))
         if self._dispatcher.may_block():
             placed.wait(WATCH_S)
         return lambda: line.call_off(number)
@@ -288,14 +287,11 @@ class ActorHub:
             steps.take("closing a visitor's link", link.close)
         steps.end("the way to actors of other processes: not closed altogether")
 
-    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[Call], Letter]) -> Callable[[], None]:
+    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[int], Letter]) -> Callable[[], None]:
         line = self._line(self._locate(where))
-        call = self._new_call(line, where, reply)
-        line.put(letter(call), call)
-        return lambda: line.give_up(call.number)
-
-    def _new_call(self, line: Line, where: Whereabouts, reply: Reply[Any]) -> Call:
-        return Call(line.next_number(), reply, where.target.name, lambda: self.missing(where))
+        number = line.next_number()
+        line.put(letter(number), Call(number, reply, where))
+        return lambda: line.give_up(number)
 
     def _address(self, where: Whereabouts) -> str:
         """Return the address of the actor's process; "" if the actor is not up."""
@@ -317,7 +313,8 @@ class ActorHub:
                 raise Unavailable("this process's system is stopping")
             line = self._lines.get(address)
             if line is None:
-                line = Line(self._dispatcher, self._transport, Hello(KIND, address, self.name, 0), self._forget)
+                hello = Hello(KIND, address, self.name, 0)
+                line = Line(self._dispatcher, self._transport, hello, self.missing, self._forget)
                 self._lines[address] = line
             return line
 
@@ -337,14 +334,6 @@ class ActorHub:
     def _attach(self, kind: type[Visitor], link: Link) -> Visitor:
         self._visitors.add(link)
         return kind(self.local, self._dispatcher, link, self._visitors.discard)
-
-
-def _letter(call: Call, where: Whereabouts, body: bytes, chain: Chain) -> Ask:
-    return Ask(call.number, where.target.urn, body, [(blocked.urn, blocked.name) for blocked in chain])
-
-
-class _Cut(Exception):
-    """The link to the actor's process was lost, or could not be opened."""
 
 
 _hubs: dict[str, ActorHub] = {}  # by the first part of the paths of their actors: one for each System of the process

@@ -14,7 +14,7 @@ from rr_actors.actors.messaging import dead_letters, death_watch
 from rr_actors.actors.messaging.ask_cycles import Chain, Target, check_chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import ExcInfo, error_of
-from rr_actors.actors.messaging.mailbox import Ended, Envelope, Mailbox, Packed, Stop, has_ended
+from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, Stop, has_ended, put
 from rr_actors.actors.remote.protocol import (
     Answered,
     Ask,
@@ -62,7 +62,7 @@ class Visitor:
         """Take a letter for an actor, or about it."""
         match message:
             case Ask(call, to, body, chain):
-                self._deliver(to, body, call, tuple(Target(*each) for each in chain))
+                self._deliver(to, body, call, chain)
             case Tell(to, body):
                 self._deliver(to, body, None, ())
             case Inquire(call, to, what):
@@ -159,10 +159,8 @@ class Visitor:
         try:
             if call is not None:
                 check_chain(Target(to, str(ref)), chain)
-            if not ref.is_alive():
-                raise Ended(f"{ref} not found", str(ref))
             answer = None if call is None else Answer(self, call, str(ref))
-            ref.actor_inbox.put(Envelope(message, answer, chain))
+            put(ref, Envelope(message, answer, chain), str(ref))
         except ActorDeadError:
             self._undeliverable(to, call, message)
         except Exception as error:

@@ -9,6 +9,7 @@ link may still be in flight: no message overtakes an earlier one, to whichever a
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
 import threading
@@ -70,17 +71,17 @@ class Call(msgspec.Struct, frozen=True):
     """A call that waits for its answer.
 
     Attributes:
-        missing: makes the error for an actor that is not there.
-        cut: makes the error for a link that is lost; if None, `missing` does.
-        begun: called when the other process confirms the watch.
+        begun: of a watch: called when the other process confirms it. The watch fails with Cut if its link is lost.
     """
 
     number: int
     reply: Reply[Any]
-    name: str
-    missing: Callable[[], Exception]
-    cut: Callable[[], Exception] | None = None
+    where: Whereabouts
     begun: Callable[[], None] | None = None
+
+
+class Cut(Exception):
+    """The link to the actor's process was lost, or could not be opened."""
 
 
 class Line:
@@ -88,16 +89,23 @@ class Line:
 
     Args:
         hello: the Hello with which the link is opened; its `to` is the address.
+        missing: makes the error for an actor that is not there.
         forget: called with the line when its link is lost, before its calls fail.
     """
 
     def __init__(
-        self, dispatcher: Dispatcher, transport: UnixTransport, hello: Hello, forget: Callable[[Line], None]
+        self,
+        dispatcher: Dispatcher,
+        transport: UnixTransport,
+        hello: Hello,
+        missing: Callable[[Whereabouts], Exception],
+        forget: Callable[[Line], None],
     ) -> None:
         self.address = hello.to
         self._dispatcher = dispatcher
         self._transport = transport
         self._hello = hello
+        self._missing = missing
         self._forget = forget
         self._waiting: deque[tuple[Letter, Call | None]] = deque()
         self._calls: dict[int, Call] = {}
@@ -185,10 +193,8 @@ class Line:
 
     def call_off(self, number: int) -> None:
         """End the Watch with this number. From any thread."""
-        try:
+        with contextlib.suppress(Unavailable):  # the loop has ended
             self._dispatcher.call(self._call_off, number)
-        except Unavailable:
-            logger.debug("a watch was called off after the loop had ended")
 
     def close(self) -> None:
         """Close the link, and fail the open calls."""
@@ -225,12 +231,12 @@ class Line:
             case Answered():
                 call.reply.set_unopened(lambda: pickling.loads(message.body))
             case Raised():
-                origin = f"{call.name} in {self._peer}"
+                origin = f"{call.where.target.name} in {self._peer}"
                 call.reply.set_unopened(lambda: _reraise(message, origin), raises=True)
             case Over():
                 call.reply.set(message)
             case Dead():
-                fail(call.reply, call.missing())
+                fail(call.reply, self._missing(call.where))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Fail the open calls: the other process has ended, or the link is closed."""
@@ -320,10 +326,10 @@ class Line:
 
     def cut_off(self, call: Call, reason: Exception | None) -> None:
         """Fail a call whose link or connection is lost. From any thread."""
-        if call.cut is not None:
-            error = call.cut()
+        if call.begun is not None:
+            error = Cut()
         elif reason is None or isinstance(reason, Unavailable) or not isinstance(reason, RrError):
-            error = call.missing()
+            error = self._missing(call.where)
             error.__cause__ = reason
         else:  # the other process runs, and refuses
             error = reason

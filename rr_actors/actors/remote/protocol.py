@@ -11,6 +11,8 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.messaging.ask_cycles import Chain
+
 KIND = "actors"
 """The Hello.kind of these links."""
 
@@ -24,7 +26,7 @@ class Ask(msgspec.Struct, frozen=True, array_like=True, tag=1):
     call: int
     to: str
     body: bytes
-    chain: list[tuple[str, str]]
+    chain: Chain
 
 
 class Tell(msgspec.Struct, frozen=True, array_like=True, tag=2):
