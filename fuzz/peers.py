@@ -26,7 +26,7 @@ from rr_actors.wire.transport import Hello, Welcome
 from rr_actors.wire.unix_link import UnixLink, Wire
 
 _LIMIT_BYTES = 100_000
-_WIRE = Wire(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES, 10 * _LIMIT_BYTES)
+_WIRE = Wire(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
 _ROLES = 3
 """A consumer's link, a direct line of one of its threads, and a provider's link."""
 _MISTAKEN = "mistaken"

@@ -18,6 +18,7 @@ import pykka
 
 from rr_actors.actors.actor import Actor, BaseActor, LoopActor
 from rr_actors.actors.refs import ActorRef
+from rr_actors.actors.remote import hub
 from rr_actors.actors.remote.hub import ActorHub, set_hub
 from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.runtime.event_loop import acquire, release
@@ -200,13 +201,19 @@ class Home:
         for ref in reversed(self.hosted):
             ref.stop(timeout=10)
         pykka.ActorRegistry.stop_all(timeout=10)
-        set_hub(None)
+        forget_hubs()
         self.dispatcher.run(self._close())
         release()
 
     async def _close(self) -> None:
         self.hub.close()
         await self.transport.close()
+
+
+def forget_hubs() -> None:
+    """Have no system in this process, as if there had never been one."""
+    hub._hubs.clear()
+    hub._stopped.clear()
 
 
 def open_home(state_dir: Path, **transport_options: Any) -> tuple[Home, StateDir]:

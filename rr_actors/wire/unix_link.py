@@ -20,6 +20,8 @@ from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
 
 _log = logging.getLogger(__name__)
 
+BUFFER_LIMIT_BYTES = 64 * 1024 * 1024
+"""How much may wait on one link for a peer that does not read."""
 CLOSE_LIMIT_S = 1.0
 """How long a closing link waits until its peer has read the last messages."""
 
@@ -29,7 +31,6 @@ class Wire(msgspec.Struct, frozen=True):
 
     decoder: msgspec.msgpack.Decoder[Any]
     frame_limit_bytes: int
-    buffer_limit_bytes: int
 
 
 class UnixLink(asyncio.Protocol):
@@ -58,7 +59,6 @@ class UnixLink(asyncio.Protocol):
         self._reader: FrameReader[Any] = FrameReader(wire.decoder, wire.frame_limit_bytes)
         self._frame_limit = wire.frame_limit_bytes
         self._buffer = bytearray(start)  # the frames of the next flush
-        self._buffer_limit = wire.buffer_limit_bytes
         self._unsent = 0  # bytes that the transport still buffered at the last look
         self._open = True
         self._reason: Exception | None = None
@@ -81,19 +81,19 @@ class UnixLink(asyncio.Protocol):
     def send(self, message: Any) -> None:
         if not self._open:
             return
-        if len(self._buffer) + self._unsent > self._buffer_limit:
+        if len(self._buffer) + self._unsent > BUFFER_LIMIT_BYTES:
             self._check_room()
         self._buffer += framed(message, self._frame_limit)
 
     def _check_room(self) -> None:
         self._unsent = self._transport.get_write_buffer_size()
         waiting = len(self._buffer) + self._unsent
-        if waiting > self._buffer_limit:
+        if waiting > BUFFER_LIMIT_BYTES:
             raise MailboxFull(
-                f"{waiting} bytes wait for {self.peer}, over the limit of {self._buffer_limit} (buffer_limit_bytes): "
+                f"{waiting} bytes wait for {self.peer}, over the limit of {BUFFER_LIMIT_BYTES} (buffer_limit_bytes): "
                 "it does not read; try again when it does",
                 name=self.peer,
-                limit=self._buffer_limit,
+                limit=BUFFER_LIMIT_BYTES,
             )
 
     def flush(self) -> None:

@@ -29,7 +29,8 @@ from rr_actors.wire.unix_sockets import SocketDir, new_name, peer_of
 
 _log = logging.getLogger(__name__)
 
-BUFFER_LIMIT_BYTES = 64 * 1024 * 1024
+HANDSHAKE_TIMEOUT_S = 5.0
+"""How long the handshake of a peer may take."""
 STRANGERS_LIMIT = 128
 """How many connections may be in their handshake at a time; further ones are closed at once."""
 PATIENCE_S = 0.25
@@ -46,30 +47,20 @@ class UnixTransport:
         key: the system's 32 secret bytes.
         codecs: the message type of each kind of link (`Hello.kind`).
         frame_limit_bytes: the length of the longest message, on either side.
-        buffer_limit_bytes: how much may wait on one link for a peer that does not read.
-        handshake_timeout_s: how long the handshake of a peer may take.
 
     Attributes:
         address: the socket file's name in the socket directory.
     """
 
     def __init__(
-        self,
-        socket_dir: Path,
-        key: bytes,
-        codecs: Mapping[str, Any],
-        *,
-        frame_limit_bytes: int = FRAME_LIMIT_BYTES,
-        buffer_limit_bytes: int = BUFFER_LIMIT_BYTES,
-        handshake_timeout_s: float = 5.0,
+        self, socket_dir: Path, key: bytes, codecs: Mapping[str, Any], *, frame_limit_bytes: int = FRAME_LIMIT_BYTES
     ) -> None:
         self._sockets = SocketDir(socket_dir)
         self._key = check_key(key)
         self.wires = {
-            kind: Wire(msgspec.msgpack.Decoder(message_type), frame_limit_bytes, buffer_limit_bytes)
+            kind: Wire(msgspec.msgpack.Decoder(message_type), frame_limit_bytes)
             for kind, message_type in codecs.items()
         }
-        self.handshake_timeout_s = handshake_timeout_s
         self.address = new_name()
         self._server: asyncio.AbstractServer | None = None
         self._closed = False
@@ -106,7 +97,7 @@ class UnixTransport:
         if hello.kind not in self.wires:
             raise UsageError(f"no codec for links of kind {hello.kind!r}: this transport has {sorted(self.wires)}")
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + self.handshake_timeout_s
+        deadline = loop.time() + HANDSHAKE_TIMEOUT_S
         while True:
             handshake = DiallerHandshake(self._key, hello)
             connected = await self._dial(address, hello, deadline)
@@ -225,7 +216,7 @@ class _Acceptor(asyncio.Protocol):
         self._peer = peer_of(self._transport)
         loop = asyncio.get_running_loop()
         self.since = loop.time()
-        self._timer = loop.call_later(self._owner.handshake_timeout_s, self._time_out)
+        self._timer = loop.call_later(HANDSHAKE_TIMEOUT_S, self._time_out)
         if not self._owner.let_in(self):
             self.abort()
         elif not self._peer.trusted:
@@ -278,7 +269,7 @@ class _Acceptor(asyncio.Protocol):
     def _time_out(self) -> None:
         if not self._over:
             what = self._handshake.waits_for
-            self._refuse_stranger(f"it did not send {what} within {self._owner.handshake_timeout_s:g} s")
+            self._refuse_stranger(f"it did not send {what} within {HANDSHAKE_TIMEOUT_S:g} s")
         else:
             self.abort()
 
@@ -359,7 +350,7 @@ class _Dialler(asyncio.Protocol):
             link.data_received(self._handshake.rest)
 
     def _time_out(self) -> None:
-        self._fail(f"it did not send {self._handshake.waits_for} within {self._owner.handshake_timeout_s:g} s")
+        self._fail(f"it did not send {self._handshake.waits_for} within {HANDSHAKE_TIMEOUT_S:g} s")
 
     def _fail(self, why: str) -> None:
         peer = self._peer.named(self.hello.to) if self._transport is not None else self.hello.to

@@ -27,9 +27,20 @@ from rr_actors.actors.refs import ActorRef, DistantRef, ref_to
 from rr_actors.actors.remote import peer
 from rr_actors.actors.remote.hub import set_hub
 from rr_actors.base.errors import ActorUnavailable, MailboxFull, NotSerializable, Unavailable, UsageError
+from rr_actors.wire import unix_link
 from rr_actors.wire.name_service import StateDir, Status, open_state_dir
 from support import Calls, Gate, eventually, hang
-from support_refs import Home, OddError, OpenedOn, Remote, RemoteAsync, end_process, open_home, start_process
+from support_refs import (
+    Home,
+    OddError,
+    OpenedOn,
+    Remote,
+    RemoteAsync,
+    end_process,
+    forget_hubs,
+    open_home,
+    start_process,
+)
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +337,8 @@ def test_a_process_that_does_not_read_fills_the_way_to_it_and_works_again_when_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(peer, "WAITING_LIMIT", 200)
-    home, state = open_home(tmp_path / "state", buffer_limit_bytes=100_000)
+    monkeypatch.setattr(unix_link, "BUFFER_LIMIT_BYTES", 100_000)
+    home, state = open_home(tmp_path / "state")
     try:
         other = home.start_other(a="Remote")
         ref = ref_to("root/a")
@@ -445,7 +457,7 @@ def test_a_supervised_actor_of_this_process_is_asked_directly(home: Home) -> Non
 
 def test_without_a_system_a_local_reference_does_not_pickle_and_says_why(home: Home) -> None:
     here = Remote.start()
-    set_hub(None)
+    forget_hubs()
     try:
         with pytest.raises(NotSerializable, match="no System runs here"):
             pickle.dumps(here)
@@ -461,7 +473,7 @@ def test_without_a_system_no_actor_elsewhere_is_alive_in_an_async_handler_either
             return ref_to("root/a").is_alive()
 
     here = Looks.start()
-    set_hub(None)
+    forget_hubs()
     try:
         assert ref_to("root/a").is_alive() is False
         assert here.ask("look") is False

@@ -173,7 +173,7 @@ def test_a_thread_hears_that_the_connection_is_lost(peer: Peer, line: BlockingLi
 
 
 def test_a_message_over_the_limit_leaves_it_as_it_was(peer: Peer) -> None:
-    wire = Wire(msgspec.msgpack.Decoder(Note), 100, 100)
+    wire = Wire(msgspec.msgpack.Decoder(Note), 100)
     sockets = SocketDir(peer.directory)
     line = BlockingLink(sockets, KEY, peer.transport.address, HELLO, wire, 5.0)
     with pytest.raises(NotSerializable, match="100"):

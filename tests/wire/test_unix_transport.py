@@ -23,6 +23,7 @@ import pytest
 
 from rr_actors.base.errors import ConfigError, MailboxFull, NotSerializable, Unavailable, UsageError
 from rr_actors.registrar.model.messages import PROTOCOL
+from rr_actors.wire import unix_link, unix_transport
 from rr_actors.wire.handshake import DiallerHandshake
 from rr_actors.wire.transport import Hello, Welcome
 from rr_actors.wire.unix_transport import STRANGERS_LIMIT, UnixTransport
@@ -53,13 +54,23 @@ def _log(caplog: pytest.LogCaptureFixture) -> None:
 
 
 @contextlib.asynccontextmanager
-async def transports(directory: Path, count: int = 1, **options: Any) -> AsyncIterator[list[UnixTransport]]:
+async def transports(
+    directory: Path,
+    count: int = 1,
+    *,
+    buffer_limit_bytes: int = unix_link.BUFFER_LIMIT_BYTES,
+    handshake_timeout_s: float = unix_transport.HANDSHAKE_TIMEOUT_S,
+    **options: Any,
+) -> AsyncIterator[list[UnixTransport]]:
     made = [UnixTransport(directory, KEY, {"registrar": Note}, **options) for _ in range(count)]
-    try:
-        yield made
-    finally:
-        for transport in made:
-            await transport.close()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(unix_link, "BUFFER_LIMIT_BYTES", buffer_limit_bytes)
+        patch.setattr(unix_transport, "HANDSHAKE_TIMEOUT_S", handshake_timeout_s)
+        try:
+            yield made
+        finally:
+            for transport in made:
+                await transport.close()
 
 
 async def rest_of(reader: asyncio.StreamReader) -> bytes:

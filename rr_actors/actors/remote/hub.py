@@ -340,15 +340,11 @@ _hubs: dict[str, ActorHub] = {}  # by the first part of the paths of their actor
 _stopped: set[str] = set()  # the first parts of the paths of Systems that ran in this process and have stopped
 
 
-def set_hub(hub: ActorHub | None) -> None:
-    """Set the hub of this process for the tree of its name; references use it from then on. None: remove all hubs."""
-    if hub is None:
-        _hubs.clear()
-        _stopped.clear()
-    else:
-        _stopped.discard(_top(hub.name))
-        _hubs.pop(_top(hub.name), None)  # the newest is last
-        _hubs[_top(hub.name)] = hub
+def set_hub(hub: ActorHub) -> None:
+    """Set the hub of this process for the tree of its name; references use it from then on."""
+    _stopped.discard(_top(hub.name))
+    _hubs.pop(_top(hub.name), None)  # the newest is last
+    _hubs[_top(hub.name)] = hub
 
 
 def remove_hub(hub: ActorHub) -> bool:
