@@ -109,6 +109,29 @@ def test_what_an_actor_had_not_handled_when_it_stopped_are_dead_letters(system: 
     ]
 
 
+def test_what_waits_for_an_actor_that_is_abandoned_is_refused_at_once(start: Start) -> None:
+    gate = Gate()
+
+    class Stuck(rr.Actor):
+        def on_receive(self, message: Any) -> None:
+            gate()
+
+    system = start(rr.ChildSpec(Stuck, id="a", placement="thread", shutdown_s=0.1))
+    ref = system.ref("a")
+    ref.tell("first")
+    gate.wait_arrived()
+    ref.tell("second")
+    reply = ref.ask("third", block=False)
+    system.supervisor().terminate_child("a")
+
+    try:
+        with pytest.raises((pykka.ActorDeadError, rr.ActorUnavailable)):
+            reply.get(timeout=1)
+        assert [(to, message) for to, message, _ in letters(system)] == [("root/a", "'second'"), ("root/a", "'third'")]
+    finally:
+        gate.open()
+
+
 def test_a_stop_is_no_letter(system: rr.System) -> None:
     actor = Worker.start()
     actor.stop()

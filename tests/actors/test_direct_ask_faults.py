@@ -17,6 +17,7 @@ import pykka
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.refs import ref_to
 from rr_actors.actors.remote.hub import hub, set_hub
 from rr_actors.base.errors import ActorUnavailable, RrError, Unavailable
@@ -471,7 +472,7 @@ def _abandon(_actor: Any) -> None:
     own = Home.own
     assert own is not None
     found: Any = own.hub.local("urn:rr-actor:root/a")
-    own.hub.remove("root/a", found)
+    own.hub.remove("root/a", found, ExitReport("killed"))
 
 
 def test_an_actor_that_comes_home_is_asked_here(home: Home, monkeypatch: pytest.MonkeyPatch) -> None:

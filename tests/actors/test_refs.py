@@ -21,7 +21,7 @@ from typing import Any
 import pykka
 import pytest
 
-from rr_actors.actors.actor import Actor
+from rr_actors.actors.actor import Actor, ExitReport
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.actors.refs import ActorRef, DistantRef, ref_to
 from rr_actors.actors.remote import peer
@@ -587,7 +587,7 @@ def test_a_local_actor_that_is_respawned_in_place_keeps_its_reference(home: Home
     assert stopped.get(timeout=10) is True
     with pytest.raises(ActorUnavailable):
         waiting.get(timeout=10)
-    home.hub.remove("root/here", first)
+    home.hub.remove("root/here", first, ExitReport("shutdown"))
     with pytest.raises(ActorUnavailable):
         ref.ask("between")
     home.host("root/here", Remote)
@@ -601,7 +601,7 @@ def test_an_abandoned_actor_is_dead_for_everybody_else(home: Home) -> None:
     stuck.tell(lambda _: gate())
     gate.wait_arrived()
     waiting = stuck.ask("behind", block=False)
-    home.hub.remove("root/stuck", stuck)
+    home.hub.remove("root/stuck", stuck, ExitReport("killed"))
     home.mark("root/stuck", Status.GONE)
     with pytest.raises(pykka.ActorDeadError):
         waiting.get(timeout=10)

@@ -38,8 +38,6 @@ WATCH_S = 1.0
 CUT_S = 1.0
 """How long, after its link is lost, a process may take to die before it counts as alive."""
 
-ABANDONED = ExitReport("killed", "abandoned")
-
 _URN_OF_PATH = "urn:rr-actor:"
 
 running: dict[str, pykka.ActorRef[Any]] = {}
@@ -101,7 +99,7 @@ class ActorHub:
         self._hosted[path] = ref
         self._directory.publish(actor_key(path), self.address, once=once)
 
-    def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport = ABANDONED) -> None:
+    def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport) -> None:
         """Remove the actor at `path`, which has ended or is abandoned. Its supervisor changes the directory.
 
         An abandoned actor is stuck in a handler; for all others it is dead from now on.

@@ -15,10 +15,9 @@ from typing import Any, cast
 import pykka
 
 from rr_actors.actors.actor import IGNORE, BaseActor, ExitReport, Ignore, OnExit
-from rr_actors.actors.messaging import death_watch, exit_reports
+from rr_actors.actors.messaging import exit_reports
 from rr_actors.actors.messaging.exit_reports import abnormal
 from rr_actors.actors.refs import ref_to
-from rr_actors.actors.remote.hub import running
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.checks import invalid
 from rr_actors.base.errors import StartFailed, is_a, text_of
@@ -212,10 +211,7 @@ class Hosted(abc.ABC):
             self._place.abandoned()
         if self.ref is not None:
             self._ask_to_stop(final=False)  # wakes it, if it is not stuck
-            if running.get(self.ref.actor_urn) is self.ref:
-                del running[self.ref.actor_urn]
             self.ref.actor_stopped.set()
-            death_watch.ended(self.ref.actor_stopped, report)
         self._end(report)
 
     def _end(self, report: ExitReport) -> None:
