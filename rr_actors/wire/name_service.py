@@ -311,9 +311,8 @@ class StateDir:
         with _named_errors("use", self.path / "run"), folder.inner("run") as run:
             _lock_shared(folder.fd)
             _remove_incarnations(run)
-            name = os.urandom(_INCARNATION_BYTES).hex()
-            self.run_dir = run.path / name
-            self._run = run.inner(name)
+            self._run = run.inner(os.urandom(_INCARNATION_BYTES).hex())
+            self.run_dir = self._run.path
             _lock_shared(self._run.fd)
 
     def keep(self) -> None:
