@@ -22,12 +22,12 @@ from pykka._envelope import Envelope as PykkaEnvelope
 from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
 from rr_actors.actors.messaging import dead_letters, death_watch, exit_reports
 from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity
-from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, Reason, abnormal
+from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.actors.messaging.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
 from rr_actors.actors.monitors import Monitor, begin, take
-from rr_actors.actors.refs import ActorRef, urn_of_path
-from rr_actors.actors.remote.hub import running
+from rr_actors.actors.refs import ActorRef
+from rr_actors.actors.remote.hub import running, urn_of_path
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.errors import Unavailable, text_of
 from rr_actors.runtime.callback_errors import log_raised, raised_by
@@ -36,7 +36,7 @@ from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.user_loop import is_coroutine
 from rr_actors.supervision.core.child_calls import check_for_actor
 
-__all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit", "Reason"]
+__all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit"]
 
 logger = logging.getLogger("rr_actors")
 

@@ -18,7 +18,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.actors.messaging.mailbox import Mailbox, refuse_all
 from rr_actors.actors.remote.inbound import Asker, Visitor
 from rr_actors.actors.remote.peer import Call, Cut, Line, Whereabouts
-from rr_actors.actors.remote.protocol import ASKS, KIND, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
+from rr_actors.actors.remote.protocol import ASKS, KIND, PATH_URN, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
 from rr_actors.base import pickling
 from rr_actors.base.errors import ActorUnavailable, Unavailable, UsageError
 from rr_actors.base.steps import Steps
@@ -38,15 +38,13 @@ WATCH_S = 1.0
 CUT_S = 1.0
 """How long, after its link is lost, a process may take to die before it counts as alive."""
 
-_URN_OF_PATH = "urn:rr-actor:"
-
 running: dict[str, pykka.ActorRef[Any]] = {}
 """The actors of rr_actors that run in this process, by URN. An entry keeps its actor from being collected."""
 
 
 def urn_of_path(path: str) -> str:
     """Return the URN of the actor at a path of the tree, which is the same after each respawn."""
-    return _URN_OF_PATH + path
+    return PATH_URN + path
 
 
 class ActorHub:
@@ -117,8 +115,8 @@ class ActorHub:
         """Return the reference to the actor with this URN, if it lives in this process."""
         if (ref := running.get(urn)) is not None:
             return ref
-        if urn.startswith(_URN_OF_PATH):
-            return self._hosted.get(urn[len(_URN_OF_PATH) :])
+        if urn.startswith(PATH_URN):
+            return self._hosted.get(urn[len(PATH_URN) :])
         return ActorRegistry.get_by_urn(urn)
 
     # -- the actors of others ------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import ExcInfo, error_of
 from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, Stop, has_ended, put
 from rr_actors.actors.remote.protocol import (
+    PATH_URN,
     Answered,
     Ask,
     Dead,
@@ -188,7 +189,7 @@ class Visitor:
             self.post(Dead(call))
 
     def _record(self, to: str, message: Any, why: str, *, unheard: int) -> None:
-        name = to.removeprefix("urn:rr-actor:")
+        name = to.removeprefix(PATH_URN)
         dead_letters.office.record(name, [message], f"sent by {self._link.peer}, {why}", unheard=unheard)
 
     def _watch(self, call: int, to: str) -> None:

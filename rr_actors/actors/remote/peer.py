@@ -24,6 +24,7 @@ from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.actors.remote.protocol import (
     ASKS,
+    PATH_URN,
     Answered,
     Ask,
     Dead,
@@ -374,7 +375,7 @@ class Line:
 
 def _record_lost(urn: str, letters: list[Tell], why: str) -> None:
     lost = [dead_letters.Lost(f"{len(letter.body)} bytes") for letter in letters]
-    dead_letters.office.record(urn.removeprefix("urn:rr-actor:"), lost, why, unheard=len(lost))
+    dead_letters.office.record(urn.removeprefix(PATH_URN), lost, why, unheard=len(lost))
 
 
 def _reraise(raised: Raised, origin: str) -> Any:

@@ -19,6 +19,9 @@ KIND = "actors"
 ASKS = "asks"
 """The Hello.kind of a thread's connection: one Ask at a time, and its answer."""
 
+PATH_URN = "urn:rr-actor:"
+"""The URN of a supervised actor is this and its path."""
+
 
 class Ask(msgspec.Struct, frozen=True, array_like=True, tag=1):
     """A message for the actor with the URN `to`; the answer has the number `call`. `chain`: the blocked askers."""
