@@ -90,7 +90,7 @@ class UnixLink(asyncio.Protocol):
         waiting = len(self._buffer) + self._unsent
         if waiting > BUFFER_LIMIT_BYTES:
             raise MailboxFull(
-                f"{waiting} bytes wait for {self.peer}, over the limit of {BUFFER_LIMIT_BYTES} (buffer_limit_bytes): "
+                f"{waiting} bytes wait for {self.peer}, over the limit of {BUFFER_LIMIT_BYTES}: "
                 "it does not read; try again when it does",
                 name=self.peer,
                 limit=BUFFER_LIMIT_BYTES,
