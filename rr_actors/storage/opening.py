@@ -62,7 +62,7 @@ def open_store(
         text = f"{shortened(str(path))}: its path has {length} bytes, expected at most {_PATH_BYTES}, as SQLite opens"
         raise CatalogError(f"{text} no longer one; choose a shorter state_dir, or another location", path=str(path))
     with errors_named(path):
-        make_directories(path.parent)
+        make_directories(path.parent, synced=durability == "power")
         with contextlib.ExitStack() as if_not:
             folder = if_not.enter_context(Folder.at(path.parent))
             _make_private(folder)

@@ -376,7 +376,7 @@ def open_state_dir(path: Path | str) -> StateDir:
     with _named_errors("use", path):
         if path.exists() and not path.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a directory")
-        make_directories(path)
+        make_directories(path, synced=True)  # a registrar in it may have the durability "power"
         folder = Folder.at(path)
     with contextlib.ExitStack() as if_not:
         if_not.enter_context(folder)

@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 import sqlite3
+import stat
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -21,6 +22,7 @@ from rr_actors.storage.catalog_lock import Reached
 from rr_actors.storage.opening import Durability, open_store
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Known, Witness
+from rr_actors.wire.name_service import open_state_dir
 from support_slow import few_now
 from support_stores import in_order
 
@@ -284,6 +286,25 @@ def test_a_power_cut_leaves_the_record_of_a_catalog_for_which_commits_survive_it
     shutil.copytree(older, path.parent)
     opened(path, "power").close()
     assert "it was put back from an older copy" in caplog.text
+
+
+def test_a_power_cut_leaves_the_new_directories_of_a_catalog_for_which_commits_survive_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes the name of a directory from a directory above that was not synced."""
+    state, fsync = tmp_path / "new" / "state", os.fsync
+    synced: list[tuple[int, list[str]]] = []  # a directory, and what was in it
+
+    def synced_to_disk(fd: int) -> None:
+        if stat.S_ISDIR(os.fstat(fd).st_mode):
+            synced.append((os.fstat(fd).st_ino, os.listdir(fd)))
+        fsync(fd)
+
+    monkeypatch.setattr(os, "fsync", synced_to_disk)
+    open_state_dir(state).close()
+    open_store(state / "app" / "catalog.sqlite3", durability="power").close()
+    for directory in (state.parent, state, state / "app"):
+        assert any(inode == directory.parent.stat().st_ino and directory.name in names for inode, names in synced)
 
 
 def test_records_that_cannot_be_reached_are_told_of_and_hold_up_nothing(
