@@ -25,7 +25,7 @@ try:
     import matplotlib as _matplotlib  # noqa: F401
     from rich.console import Console
 except ImportError as missing:
-    sys.exit(f"The mission needs {missing.name}: pip install 'rr-actors[demo]', or run it with make demo.")
+    sys.exit(f"The mission needs {missing.name}: pip install '.[demo]' in the checkout, or run it with make demo.")
 
 from mission.action import Plan, run
 from mission.figures import draw

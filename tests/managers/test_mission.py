@@ -98,7 +98,10 @@ def test_without_a_library_it_says_what_to_install(tmp_path: Path, missing: str)
     command = [sys.executable, str(SCRIPT)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 1
-    assert done.stderr == f"The mission needs {missing}: pip install 'rr-actors[demo]', or run it with make demo.\n"
+    assert (
+        done.stderr
+        == f"The mission needs {missing}: pip install '.[demo]' in the checkout, or run it with make demo.\n"
+    )
 
 
 @pytest.mark.parametrize("speed", few_now(["9"], ["0", "fast", "nan"]))

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -221,6 +222,26 @@ def test_a_service_in_a_container_stops_in_order_as_process_1(place: Path) -> No
             assert outer.stop() == 0
     assert "the front camera is closed" in outer.log
     assert still_running(place) == []
+
+
+def test_the_image_of_the_container_has_the_program_and_all_that_installs_the_package(tmp_path: Path) -> None:
+    instructions = (EXAMPLES / "Dockerfile").read_text()
+    for sources, target in re.findall(r"^COPY (.*) (\S+)$", instructions, re.MULTILINE):
+        place = tmp_path / target.lstrip("/")
+        for source in map(REPOSITORY.joinpath, sources.split()):
+            if source.is_dir():
+                shutil.copytree(source, place)
+            else:
+                place.mkdir(parents=True, exist_ok=True)
+                shutil.copy(source, place)
+    (installed,) = re.findall(r"^RUN pip install .*?(\S+)$", instructions, re.MULTILINE)
+    package = tmp_path / installed.lstrip("/")
+    project = tomllib.loads((package / "pyproject.toml").read_text())
+    needed = [project["project"]["readme"], *project["project"]["license-files"]]
+    needed += project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    assert [name for name in needed if not (package / name).exists()] == []
+    (directory,) = re.findall(r"^WORKDIR (\S+)$", instructions, re.MULTILINE)
+    assert (tmp_path / directory.lstrip("/") / "service.py").exists()
 
 
 def test_the_systemd_unit_runs_a_tree_that_stops_in_order_in_time(place: Path) -> None:

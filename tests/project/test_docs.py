@@ -116,6 +116,12 @@ def test_every_test_that_a_page_names_exists(page: Path) -> None:
     assert [test for test in re.findall(r"`(test_\w+)`", page.read_text()) if test not in there] == []
 
 
+def test_nothing_is_installed_from_an_index_that_does_not_have_it() -> None:
+    texts = [*PAGES, *(file for file in (ROOT / "examples").rglob("*") if file.suffix in (".py", ""))]
+    wrong = re.compile(r"pip\s+install\s+(?:-\S+\s+)*['\"]?rr[-_]actors")
+    assert [name(file) for file in texts if file.is_file() and wrong.search(file.read_text())] == []
+
+
 def test_every_page_that_the_code_names_is_there() -> None:
     named = re.compile(r"docs/[\w/\-]+\.md")
     files = [
