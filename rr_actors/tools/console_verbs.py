@@ -205,7 +205,7 @@ def events(
         raise UsageError(f"--event: expected one of {', '.join(known)}, got {shown(unknown[0])}")
     with _client(state) as client:
         if not follow:
-            records = client.ask(c.ListHistory(limit=c.PAGE_LIMIT), c.Happenings).records
+            records = _history(client, "", c.PAGE_LIMIT)
             chosen = [one for one in records if (not kinds or one.event in kinds) and c.mentions(one.facts(), about)]
             for record in chosen[-(count or 20) :]:
                 _say_record(record, as_json)
@@ -221,6 +221,13 @@ def events(
             if left is not None and left <= 0:
                 return
     typer.echo("the system has ended", err=True)
+
+
+def _history(client: ConsoleClient, child: str, limit: int) -> list[Record]:
+    found = client.ask(c.ListHistory(child, limit), c.Happenings)
+    if found.left_out:
+        typer.echo(f"{found.left_out} older records are not shown: they are too long for one answer", err=True)
+    return found.records
 
 
 def _say_event(event: c.Event, as_json: bool) -> None:
@@ -255,7 +262,7 @@ def history(
 ) -> None:
     """Show the starts and exits of a child and all below it, or of all children, with reasons."""
     with _client(state) as client:
-        records = client.ask(c.ListHistory(child, min(limit, c.PAGE_LIMIT)), c.Happenings).records
+        records = _history(client, child, min(limit, c.PAGE_LIMIT))
     for record in records:
         _say_record(record, as_json)
         if record.traceback and not as_json:

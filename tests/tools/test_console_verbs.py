@@ -199,6 +199,33 @@ def test_history_tells_why_a_child_ended(shop: rr.System) -> None:
     assert "exited" in said("events", "--event", "exited")
 
 
+class Loud(rr.Actor):
+    """Ends with a long text."""
+
+    def on_receive(self, message: str) -> None:
+        """Raise it."""
+        raise ValueError(message)
+
+
+def test_of_records_that_are_too_long_for_one_answer_the_newest_are_shown(start: Start) -> None:
+    loud = rr.ChildSpec(Loud, id="loud", placement="thread")
+    system = start(rr.Supervisor([loud], id="root", max_restarts=1000))
+    supervisor, ref, ends = system.supervisor(), system.ref("loud"), 130
+    for number in range(1, ends + 1):
+        eventually(ref.is_alive)
+        ref.tell(f"{number} " + "\N{BELL}" * 10_000)
+        eventually(lambda number=number: len(supervisor.history()) == 2 * number + 1)
+
+    for shown in (rr_actors("history", "--limit", 500, "--json"), rr_actors("events", "--json", "--count", 500)):
+        assert shown.returncode == 0, shown.stderr
+        lines = [json.loads(line) for line in shown.stdout.splitlines()]
+        assert lines[-2]["detail"].startswith(f"ValueError: {ends} ")
+        left_out = 2 * ends + 1 - len(lines)
+        assert 0 < left_out < ends
+        (note,) = shown.stderr.splitlines()
+        assert note.startswith(f"{left_out} older records are not shown: they are too long for one answer")
+
+
 def test_dead_letters_are_shown(shop: rr.System) -> None:
     ref = rr.Actor.start()
     ref.stop()

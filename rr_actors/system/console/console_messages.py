@@ -328,9 +328,10 @@ class Found(_Message, frozen=True):
 
 
 class Happenings(_Message, frozen=True):
-    """Records of the tree, oldest first."""
+    """Records of the tree, oldest first. `left_out`: how many older ones have no room in the answer."""
 
     records: list[Record]
+    left_out: int = 0
 
 
 class Letters(_Message, frozen=True):

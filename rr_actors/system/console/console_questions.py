@@ -22,6 +22,7 @@ from rr_actors.supervision.event_history import Record
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console.console_messages import (
     PAGE_LIMIT,
+    RESPONSE_LIMIT_BYTES,
     Answer,
     Children,
     ChildRow,
@@ -116,7 +117,7 @@ class View:
             case Find(id, registrar):
                 return self.find(id, registrar)
             case ListHistory(path, limit):
-                return Happenings(self._history(path)[-limit:])
+                return _newest([_fitting(record) for record in self._history(path)[-limit:]])
             case ListDeadLetters(limit):
                 letters = self.system.dead_letters()
                 return Letters(letters.count, letters.letters[-limit:])
@@ -166,7 +167,7 @@ class View:
                 if supervisor == place:
                     raise Unavailable(f"supervisor {supervisor}: {text_of(error)}") from error
         chosen = [record for record in records if not place or f"{record.path}/".startswith(f"{place}/")]
-        return [_fitting(record) for record in sorted(chosen, key=lambda record: record.at)]
+        return sorted(chosen, key=lambda record: record.at)
 
     def path_of(self, child: str) -> str:
         """Return the path of a child that is given by its path or its id.
@@ -247,6 +248,16 @@ class View:
             resources = [row for row in resources if id in (row.id, *(holder.query_id for holder in row.holders))]
             queries = [row for row in queries if row.id == id]
         return Found(resources, queries, notes)
+
+
+def _newest(records: list[Record]) -> Happenings:
+    """Return the newest records, as many as have room in an answer."""
+    room = RESPONSE_LIMIT_BYTES
+    for older, record in zip(range(len(records), 0, -1), reversed(records), strict=True):
+        room -= len(msgspec.msgpack.encode(record))
+        if room < 0:
+            return Happenings(records[older:], older)
+    return Happenings(records)
 
 
 def _fitting(record: Record) -> Record:
