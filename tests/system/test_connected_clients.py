@@ -36,6 +36,7 @@ from rr_actors.system.console.console_client import ConsoleClient, NotRunning
 from rr_actors.system.console.console_messages import Find, Hold, Holding
 from rr_actors.wire.unix_sockets import Peer
 from support import LIMIT_S, TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
+from support_interrupts import interrupted
 from support_managers import Made, Order, Shop
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
@@ -323,11 +324,28 @@ def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
     eventually(lambda: worker.queries() == [])
 
 
+def test_a_load_that_is_interrupted_at_any_point_is_released(
+    client: rr.Client, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    worker, requests, where = client.open_registrar("worker"), ["first"], "at first"
+    worker.load("provider/camera", requests[0]).unload()  # which fills caches
+    while where:
+        requests.append(str(len(requests)))
+        worker.queries()  # so that the load finds a connection
+        where = interrupted(lambda: worker.load("provider/camera", requests[-1]), len(requests) - 1).where
+    assert len(requests) > 50
+
+    eventually(lambda: [row.request for row in worker.queries()] == [f'"{requests[-1]}"'])
+    eventually(lambda: len(provider.resources()) == 1)
+    assert "is not released" not in caplog.text
+
+
 def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
     client: rr.Client, provider: rr.Registrar
 ) -> None:
     worker, connection = client.open_registrar("worker"), client._connections.open()
     held = connection.ask(Hold("client.worker", "provider/camera", encode("front")), Holding)
+    connection.keep()
     connection.close()
 
     worker.queries()  # the console reads this after the end of the other connection

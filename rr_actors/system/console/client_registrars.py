@@ -11,7 +11,7 @@ import dataclasses
 import logging
 import threading
 
-from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownRegistrar, shown, text_of
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownQuery, UnknownRegistrar, shown, text_of
 from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.registrar import Registrar, load_bytes
@@ -89,11 +89,11 @@ class ClientRegistrars:
         return Done(f"released {command.query_id}")
 
     def release_unheard(self, registrar: str, query_id: str) -> None:
-        """Release a query of a client that left before it heard the query's id."""
+        """Release a query of a client that left before it kept the query."""
         try:
             self._of(registrar).unload(query_id)
-        except UnknownRegistrar:
-            logger.debug("query %s: released with its registrar, as the client has gone", query_id)
+        except (UnknownQuery, UnknownRegistrar):
+            logger.debug("query %s: released by its client or with its registrar", query_id)
         except RrError:
             logger.exception("query %s: its client has gone, and it is not released", query_id)
 

@@ -136,16 +136,20 @@ class ClientRegistrar:
         """
         limit_s, target = _limit(timeout_s), str(parse_server_id(server))
         command = Hold(self.name, target, _encoded(request, "request"), limit_s)
-        held = self._connections.ask(command, Holding, limit_s + _GRACE_S)
         codec = Codec(response_type, f"{target}: response")
+        query: ClientQuery | None = None
         try:
-            response = (
-                codec.show(held.response) if response_type is None else codec.decode(held.response, target, "response")
-            )
-        except BaseException:
-            self.unload(held.query_id)
+            with self._connections.lent() as client:  # if this ends before keep(), the system releases the query
+                held = client.ask(command, Holding, limit_s + _GRACE_S)
+                data = held.response
+                response = codec.show(data) if response_type is None else codec.decode(data, target, "response")
+                query = ClientQuery(self, held.query_id, held.resource_id, target, request, response)
+                client.keep()
+            return query
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
+            if query is not None:
+                _release_later(query)
             raise
-        return ClientQuery(self, held.query_id, held.resource_id, target, request, response)
 
     async def load_async(
         self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
@@ -288,24 +292,28 @@ async def _awaited(load: Callable[[], ClientQuery]) -> ClientQuery:
         except BaseException as error:
             loaded.set_exception(error)
 
-    asyncio.get_running_loop().run_in_executor(None, make)
     try:
+        asyncio.get_running_loop().run_in_executor(None, make)
         return await asyncio.shield(asyncio.wrap_future(loaded))
-    except asyncio.CancelledError:
-        loaded.add_done_callback(_release_later)
+    except BaseException:  # cancelled, or KeyboardInterrupt: the caller never gets the query
+        loaded.add_done_callback(_undo)
         raise
 
 
-def _release_later(loaded: Future[ClientQuery]) -> None:
-    """Release a query in a thread of its own: the loop and its threads may be ending."""
+def _undo(loaded: Future[ClientQuery]) -> None:
     if loaded.exception() is None:
-        threading.Thread(target=_release, args=(loaded.result(),), name="rr-undo").start()
+        _release_later(loaded.result())
+
+
+def _release_later(query: ClientQuery) -> None:
+    """Release a query in a thread of its own: the caller was interrupted, or its loop and threads may be ending."""
+    threading.Thread(target=_release, args=(query,), name="rr-undo").start()
 
 
 def _release(query: ClientQuery) -> None:
     try:
         query.unload()
-    except NotRunning:
-        logger.debug("%r: its system has ended, or its client is closed, and it is released", query)
+    except (NotRunning, UnknownQuery):
+        logger.debug("%r: the system has released it, or has ended, or its client is closed", query)
     except RrError:
         logger.exception("%r: its load was cancelled, and it is not released", query)

@@ -32,6 +32,8 @@ from rr_actors.system.console.console_messages import (
     Follow,
     Following,
     Hello,
+    Holding,
+    Keep,
     ListChildren,
     ListQueries,
     ListRegistrars,
@@ -67,8 +69,8 @@ class ConsoleClient:
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
-        is_broken: whether an answer did not come, or the console closes the connection after it: then the connection
-            must not be used again.
+        is_broken: whether an answer did not come, the console closes the connection after it, or it is a Holding
+            without its keep() yet: then the connection must not be used again.
 
     Raises:
         NotRunning: no console answers in run_dir.
@@ -102,8 +104,13 @@ class ConsoleClient:
         self.is_broken = True
         self._send(request)
         answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
-        self.is_broken = isinstance(answer, Refused) and not _is_valid(request)
+        self.is_broken = isinstance(answer, Holding) or (isinstance(answer, Refused) and not _is_valid(request))
         return _checked(answer, expected)
+
+    def keep(self) -> None:
+        """Say that the query of the last Holding has arrived; otherwise the end of the connection releases it."""
+        self._send(Keep())
+        self.is_broken = False
 
     def children(self, match: str = "") -> Children:
         """Return all children of the tree that have `match` in their paths, read page by page."""
@@ -177,11 +184,7 @@ class ConsoleClient:
         self._socket.close()
 
     def drop(self) -> None:
-        """Close this process's copy of the connection, on which no thread waits.
-
-        A forked child leaves the connection to its parent so. After the last copy is closed, the kernel tells the
-        system if the last answer was not read. After shutdown() it might not.
-        """
+        """Close this process's copy of the connection, on which no thread waits: a forked child's parent keeps its."""
         self._socket.close()
 
     def __enter__(self) -> Self:

@@ -1,8 +1,8 @@
 """The messages on a console's socket: requests, answers and the feed of events, as types.
 
 Each message is a MessagePack map in a frame (rr_actors/wire/frames.py). A connection begins with Hello. After that each
-request has one answer, in the order of the requests. After Follow only the feed comes. No message is ever a pickle, and
-none has a key of the system.
+request but Keep has one answer, in the order of the requests. After Follow only the feed comes. No message is ever a
+pickle, and none has a key of the system.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.recording.figures import Figure
 
-VERSION = 2
+VERSION = 3
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request. The longest part of any is a resource's request as JSON."""
@@ -209,12 +209,19 @@ class OpenRegistrar(_Message, frozen=True):
 
 
 class Hold(_Message, frozen=True):
-    """Load a resource with a client's registrar, by a request's canonical bytes."""
+    """Load a resource with a client's registrar, by a request's canonical bytes.
+
+    If the connection ends after the answer, and before its Keep, the query is released.
+    """
 
     registrar: _Text
     server: _Text
     request: _Value
     timeout_s: _Seconds = 30.0
+
+
+class Keep(_Message, frozen=True):
+    """Keep the query of the last Holding, because the client has received it. A Keep has no answer."""
 
 
 class Release(_Message, frozen=True):
@@ -237,7 +244,7 @@ OfClient = Hold | Release | AskActor
 Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown | OpenRegistrar | OfClient
 PageRequest = ListChildren | ListRegistrars | ListResources | ListQueries
 Question = PageRequest | Find | ListHistory | ListDeadLetters | ListFigures
-Request = Hello | Follow | BeginRecording | Question | Command
+Request = Hello | Follow | BeginRecording | Keep | Question | Command
 
 
 # -- answers ---------------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ from rr_actors.system.console.console_messages import (
     Hello,
     Hold,
     Holding,
+    Keep,
     Missed,
     OpenRegistrar,
     Refused,
@@ -145,7 +146,7 @@ class Console:
     def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> tuple[bytes, str]:
         """Return the frame that answers a request, and the id of the query that it loaded for a client. In a worker."""
         try:
-            if isinstance(request, Hello | Follow | BeginRecording):
+            if isinstance(request, Hello | Follow | BeginRecording | Keep):
                 raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
             if not isinstance(request, Command):
                 answer = self.view.answer(request)
@@ -186,7 +187,7 @@ class Connection(asyncio.Protocol):
         self._looks = False  # whether the loop will look for the client
         self._reader: Reader | None = None
         self._has_registrars = False
-        self._unheard: tuple[str, ...] = ()  # the registrar and query of the last answer, until the next request
+        self._unheard: tuple[str, ...] = ()  # the registrar and query of the last answer, until Keep
 
     # -- called by asyncio -------------------------------------------------------------------------------------------
 
@@ -268,8 +269,7 @@ class Connection(asyncio.Protocol):
         self._console.connections.discard(self)
         if self._reader is not None:
             self._console.feed.remove(self._reader)
-        if exc is not None or self._blocked:  # the client has closed, and has not read the last answer
-            self._release_unheard()
+        self._release_unheard()
         if self._has_registrars:
             self._clean_up(self._console.commands.clients.close, self)
 
@@ -293,6 +293,9 @@ class Connection(asyncio.Protocol):
         """Begin with the next request, if the last one is answered and the client has read the answer."""
         if self._ended or self._busy or self._blocked:
             return
+        while self._requests and isinstance(self._requests[0], Keep):
+            self._unheard = ()
+            del self._requests[0]
         if not self._requests:
             if self._frames.is_waiting or not self._greeted:
                 if self._timer is None:
