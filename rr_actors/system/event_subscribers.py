@@ -134,8 +134,7 @@ class Subscribers:
         self._system = system
         self._callbacks: dict[int, tuple[str, Callable[..., Any]]] = {}
         self._backlogs: dict[int, Backlog[Facts]] = {}  # filled on the loop; other threads only remove from it
-        self._listeners: dict[int, Callable[[Facts], None]] = {}
-        self._recorders: dict[int, Callable[[Facts], None]] = {}
+        self._listeners: dict[int, tuple[Callable[[Facts], None], bool]] = {}  # and whether it records
         self._numbers = itertools.count(1)
         self._node: Node | None = None
         self._saying = threading.Lock()  # held to say whether anybody listens
@@ -161,13 +160,13 @@ class Subscribers:
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
         return self._add(self._callbacks, (_name_of(callback), described(callback, "subscribe")))
 
-    def listen(self, listener: Callable[[Facts], None]) -> Callable[[], None]:
-        """Have a listener of the package called on the loop (it must be quick); return a function that ends that."""
-        return self._add(self._listeners, listener)
+    def listen(self, listener: Callable[[Facts], None], *, records: bool = False) -> Callable[[], None]:
+        """Have a listener of the package called on the loop (it must be quick); return a function that ends that.
 
-    def record(self, recorder: Callable[[Facts], None]) -> Callable[[], None]:
-        """Call the recorder as listen() does, and have the processes send their entries, as "recorded" events."""
-        return self._add(self._recorders, recorder)
+        Args:
+            records: have the processes send their entries, too, as "recorded" events.
+        """
+        return self._add(self._listeners, (listener, records))
 
     def _add(self, those: dict[int, T], one: T) -> Callable[[], None]:
         number = next(self._numbers)
@@ -186,17 +185,18 @@ class Subscribers:
         return end
 
     def tell(self, event: Facts) -> None:
-        """Pass an event to the recorders, listeners and subscribers, while the system runs."""
+        """Pass an event to the listeners and subscribers, while the system runs."""
         node = self._node
         if node is None:
             return
-        for recorder in list(self._recorders.values()):
-            self._have_heard(recorder, event)
-        if event["event"] == RECORDED:
-            return
-        for listener in list(self._listeners.values()):
-            self._have_heard(listener, event)
-        for number in list(self._callbacks):
+        is_recorded = event["event"] == RECORDED
+        for listener, records in list(self._listeners.values()):
+            if records or not is_recorded:
+                try:
+                    listener(event)
+                except Exception:  # a defect of the listener must end no registrar and no supervisor
+                    logger.exception("system %s: an event was not delivered", self._system)
+        for number in list(self._callbacks) if not is_recorded else ():
             try:
                 self._backlog(node, number).put(event)
             except KeyError:
@@ -216,13 +216,6 @@ class Subscribers:
         logger.warning("system %s: subscriber %s is too slow: it has missed %d events", self._system, who, count)
         return callback(MissedEvent(event="missed", count=count))
 
-    def _have_heard(self, hear: Callable[[Facts], None], event: Facts) -> None:
-        """Call a listener, and log what it raises: its defect must end no registrar and no supervisor."""
-        try:
-            hear(event)
-        except Exception:
-            logger.exception("system %s: an event was not delivered", self._system)
-
     def _raised(self, who: str, error: BaseException, event: Facts | None) -> None:
         kind = "missed" if event is None else event["event"]
         log_raised(logger, error, "system %s: subscriber %s raised at the event %r", self._system, who, kind)
@@ -230,7 +223,8 @@ class Subscribers:
     def _say_whether_watched(self) -> None:
         with self._saying:
             if (node := self._node) is not None:
-                node.watched.set(bool(self._callbacks or self._listeners), bool(self._recorders))
+                records = any(records for _, records in list(self._listeners.values()))
+                node.watched.set(bool(self._callbacks or self._listeners), records)
 
 
 def _name_of(callback: Callable[..., Any]) -> str:

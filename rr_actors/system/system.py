@@ -152,7 +152,7 @@ class System:
         self._subscribers = Subscribers(self.name)
         self._logs: Backlog[Facts] | None = None  # of this run; used on the loop, except at the end of the run
         self._counters = Counters()
-        self._recordings = Recordings(self._subscribers.record, self._counters)
+        self._recordings = Recordings(functools.partial(self._subscribers.listen, records=True), self._counters)
         self._dead_letters = Collection()
         self._ended = Flag()
         self._end: ExitReport | None = None

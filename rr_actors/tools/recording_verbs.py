@@ -14,7 +14,7 @@ import typer
 
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
-from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, add, read_recording
+from rr_actors.system.recording.recordings import Recording, RecordingFile, add, read_recording
 from rr_actors.tools.cli_commands import StateOption
 from rr_actors.tools.console_verbs import JsonOption, app
 
@@ -34,7 +34,7 @@ def record(
     """Record the events, exits and callbacks of the system, and the messages between its registrars."""
     count = missed = 0
     with ConsoleClient(find_console(state)) as client:
-        sink = RecordingFile(file, Header(VERSION, client.welcome.system, time.time()))
+        sink = RecordingFile(file, client.welcome.system, time.time())
         try:
             with _ending(client, seconds), suppress(KeyboardInterrupt):
                 for part in client.record():

@@ -461,7 +461,7 @@ def test_what_records_or_listens_within_the_package_harms_nothing_by_raising(
         raise ValueError("a defect")
 
     heard = Calls()
-    ends = [system._subscribers.record(fail), system._subscribers.listen(fail), system.subscribe(heard)]
+    ends = [system._subscribers.listen(fail, records=True), system._subscribers.listen(fail), system.subscribe(heard)]
     serve(provider, "thing")
     app.load("provider/thing", "x")
 

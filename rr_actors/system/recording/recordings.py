@@ -168,7 +168,7 @@ class Recording:
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=limit)
         self._pid = os.getpid()
-        self._writer = None if path is None else _Writer(RecordingFile(path, Header(VERSION, system, self.since)))
+        self._writer = None if path is None else _Writer(RecordingFile(path, system, self.since))
         self._end: Callable[[], None] | None = None
 
     def _take(self, entries: list[Entry], dropped: int = 0) -> None:
@@ -237,7 +237,7 @@ class Recording:
             ConfigError: the file is there already, or cannot be written.
         """
         entries = self.entries()
-        file = RecordingFile(Path(path), Header(VERSION, self.system, self.since))
+        file = RecordingFile(Path(path), self.system, self.since)
         try:
             file.write(entries, self.missed)
             file.close()
@@ -280,7 +280,7 @@ class RecordingFile:
         ConfigError: the file exists already, or cannot be made.
     """
 
-    def __init__(self, path: Path, header: Header) -> None:
+    def __init__(self, path: Path, system: str, since: float) -> None:
         self.path = path
         self._failure: Exception | None = None
         self._encode = msgspec.json.Encoder(enc_hook=str).encode
@@ -292,7 +292,7 @@ class RecordingFile:
             raise ConfigError(f"{path}: cannot be made: {error.strerror}", file=str(path)) from error
         self._file = os.fdopen(fd, "wb", buffering=2**16)
         try:
-            self._file.write(self._encode(header) + b"\n")
+            self._file.write(self._encode(Header(VERSION, system, since)) + b"\n")
             self._file.flush()
         except OSError as error:
             self.remove()
