@@ -46,8 +46,7 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
 
 
 async def _open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
-    entry = node.find(name)
-    if entry is not None and entry.status in (Status.UP, Status.STARTING, Status.STOPPED):
+    if node.status_of(name) in (Status.UP, Status.STARTING, Status.STOPPED):
         system = node.info.name
         text = f"registrar {name!r}: the name is taken in system {system!r}; close that one, or choose another"
         raise NameTaken(text, name=name)
@@ -72,8 +71,7 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
     actor = node.registrars.get(name)
     if actor is not None and actor.audience is not None:
         return actor.audience.holder
-    entry = node.find(name)
-    if entry is None or entry.status in (Status.GONE, Status.DORMANT):
+    if node.status_of(name) in (None, Status.GONE, Status.DORMANT):
         raise node.directory.no_registrar(name)
     return RegistrarHandle(node, name, patient=patient, owner=owner)
 

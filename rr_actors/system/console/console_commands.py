@@ -121,8 +121,7 @@ class Commands:
         if name:
             return system.registrar(name)
         with self._opening:
-            entry = self._view.node.find(REGISTRAR)
-            if entry is None or entry.status in (Presence.GONE, Presence.DORMANT):
+            if self._view.node.status_of(REGISTRAR) in (None, Presence.GONE, Presence.DORMANT):
                 config = dataclasses.replace(system.config.registrar(REGISTRAR), erase_on_destruct=True)
                 return system.open_registrar(REGISTRAR, config)
         return system.registrar(REGISTRAR)

@@ -205,14 +205,14 @@ class View:
         return registrar_in(self.node, name, patient=False)
 
     def _registrar(self, name: str) -> RegistrarRow:
-        entry = self.node.find(name)
-        if entry is None or entry.status is not Status.UP:
-            return RegistrarRow(name, "gone" if entry is None else entry.status.value)
+        status = self.node.status_of(name)
+        if status is not Status.UP:
+            return RegistrarRow(name, (status or Status.GONE).value)
         try:
             registrar = self.registrar(name)
-            return RegistrarRow(name, entry.status.value, registrar.servers(), registrar.stats())
+            return RegistrarRow(name, status.value, registrar.servers(), registrar.stats())
         except RrError as error:
-            return RegistrarRow(name, entry.status.value, error=readable(text_of(error)))
+            return RegistrarRow(name, status.value, error=readable(text_of(error)))
 
     def _pages(
         self, what: Literal["resources", "queries"], registrar: str, match: str, offset: int, limit: int

@@ -209,10 +209,15 @@ class Node:
             return Entry(Status.UP, self.local.address)
         return self.directory.lookup(registrar_key(registrar))
 
+    def status_of(self, registrar: str) -> Status | None:
+        """Return the status of the entry that find() returns; None if the registrar is unknown."""
+        entry = self.find(registrar)
+        return None if entry is None else entry.status
+
     def statuses(self) -> dict[str, Status]:
         """Return the statuses of the system's registrars that are not gone, by name."""
-        entries = ((name, self.find(name)) for name in sorted({*self.directory.registrars(), *self.registrars}))
-        return {name: entry.status for name, entry in entries if entry is not None and entry.status is not _GONE}
+        found = ((name, self.status_of(name)) for name in sorted({*self.directory.registrars(), *self.registrars}))
+        return {name: status for name, status in found if status is not None and status is not _GONE}
 
     # -- registrars ----------------------------------------------------------------------------------------------
 
@@ -264,14 +269,10 @@ class Node:
             with registrar.lock:
                 catalog = registrar.whole()
                 waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
-            if not any(self._is_up(peer) for peer in waiting):
+            if not any(self.status_of(peer) is Status.UP for peer in waiting):
                 return
             await registrar.monitor.next_change(_LOOK_AGAIN_S)
         logger.info("%s: not all providers have answered within %g s", registrar.name, _RECONCILE_S)
-
-    def _is_up(self, registrar: str) -> bool:
-        entry = self.find(registrar)
-        return entry is not None and entry.status is Status.UP
 
     def serve_registrar(self, registrar: RegistrarActor) -> None:
         """Accept the links of others, and publish the registrar's address. First drop origins that are gone."""
@@ -284,11 +285,9 @@ class Node:
         self.directory.publish(registrar_key(registrar.name), self.transport.address)
 
     def _is_gone(self, registrar: str) -> bool:
-        entry = self.find(registrar)
-        if entry is not None:
-            return entry.status is _GONE
-        if not registrar.startswith(CLIENTS):
-            return False
+        status = self.status_of(registrar)
+        if status is not None or not registrar.startswith(CLIENTS):
+            return status is _GONE
         # If an application is killed, its next start alone gives up its clients. Later ones find no catalog of them.
         return not os.path.exists(self.config.registrar(registrar).catalog_path(self.info.state_dir))
 
@@ -348,21 +347,19 @@ class Node:
     async def _release_everything(self, registrar: RegistrarActor) -> None:
         registrar.settle()
         self._withdraw_loads(registrar)
+        releases: Releases | None = None
         try:
             await self._unload_everything(registrar)
-        except asyncio.CancelledError:  # a callback does not end: only its own resource's parts wait for it
-            with registrar.lock:
-                held = registrar.whole().held
-                queries = [query_id for query_id in registrar.newest_first() if not held[query_id].parent]
-            Releases(registrar, queries, _unheard).hurry()
-            registrar.settle()  # all of them are owed then, on disk
-            raise
-        queries = registrar.newest_first()
-        released = _AllDone(self.dispatcher.loop, len(queries), registrar.name)
-        releases = Releases(registrar, queries, lambda _query_id, error: released(error))
-        try:
+            queries = registrar.newest_first()
+            released = _AllDone(self.dispatcher.loop, len(queries), registrar.name)
+            releases = Releases(registrar, queries, lambda _query_id, error: released(error))
             await released.future
         except asyncio.CancelledError:
+            if releases is None:  # a callback does not end: only its own resource's parts wait for it
+                with registrar.lock:
+                    held = registrar.whole().held
+                    queries = [query_id for query_id in registrar.newest_first() if not held[query_id].parent]
+                releases = Releases(registrar, queries, lambda _query_id, _error: None)
             releases.hurry()
             registrar.settle()  # all of them are owed then, on disk
             raise
@@ -394,8 +391,7 @@ class Node:
 
         Other providers read it in the directory when they are back.
         """
-        entry = self.find(name)
-        if entry is None or entry.status is not _GONE:  # an existing entry may also have the reason
+        if self.status_of(name) is not _GONE:  # an existing entry may also have the reason
             self.directory.mark(registrar_key(name), _GONE)
         for registrar in list(self.registrars.values()):
             registrar.monitor.receive(Gone(name), name)
@@ -427,10 +423,6 @@ class Node:
             self.dispatcher.call(lambda: self.emit("dead_letter", **facts))
         except Unavailable:
             logger.debug("a dead letter was not told: the loop has ended")
-
-
-def _unheard(_query_id: str, _error: RrError | None) -> None:
-    """Ignore the outcome of a release, for which nothing waits any more."""
 
 
 def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
