@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import sys
 import threading
 import time
 import weakref
@@ -112,33 +113,33 @@ class ConsoleClient:
         self._send(Keep())
         self.is_broken = False
 
-    def children(self, match: str = "") -> Children:
-        """Return all children of the tree that have `match` in their paths, read page by page."""
-        return self._all(ListChildren(match), Children)
+    def children(self) -> Children:
+        """Return all children of the tree, read page by page."""
+        return self._all(ListChildren(), Children)
 
     def registrars(self) -> Registrars:
         """Return all registrars, read page by page."""
         return self._all(ListRegistrars(), Registrars)
 
-    def resources(self, registrar: str = "", match: str = "", limit: int | None = None) -> Resources:
+    def resources(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> Resources:
         """Return the resources of a registrar, or of all, that ListResources(match) finds; at most `limit`."""
         return self._all(ListResources(match, registrar=registrar), Resources, limit)
 
-    def queries(self, registrar: str = "", match: str = "", limit: int | None = None) -> Queries:
+    def queries(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> Queries:
         """Return the queries that a registrar holds, or all, that ListQueries(match) finds; at most `limit`."""
         return self._all(ListQueries(match, registrar=registrar), Queries, limit)
 
-    def _all(self, request: PageRequest, expected: type[_Page], limit: int | None = None) -> _Page:
+    def _all(self, request: PageRequest, expected: type[_Page], limit: int = sys.maxsize) -> _Page:
         """Return the rows of all pages, at most `limit`, with the notes of all pages."""
         rows: list[Any] = []
         notes: dict[str, None] = {}
         while True:
-            left = PAGE_LIMIT if limit is None else max(1, min(limit - len(rows), PAGE_LIMIT))
+            left = max(1, min(limit - len(rows), PAGE_LIMIT))
             page = self.ask(msgspec.structs.replace(request, offset=len(rows), limit=left), expected)
             rows += page.rows
             if isinstance(page, Resources | Queries):
                 notes.update(dict.fromkeys(page.notes))
-            if not page.rows or len(rows) >= page.total or (limit is not None and len(rows) >= limit):
+            if not page.rows or len(rows) >= min(page.total, limit):
                 more = {"notes": list(notes)} if notes else {}
                 return msgspec.structs.replace(page, rows=rows[:limit], **more)
 

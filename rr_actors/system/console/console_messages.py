@@ -240,8 +240,8 @@ class AskActor(_Message, frozen=True):
     timeout_s: _Seconds = 30.0
 
 
-OfClient = Hold | Release | AskActor
-Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown | OpenRegistrar | OfClient
+OfClient = OpenRegistrar | Hold | Release | AskActor
+Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown | OfClient
 PageRequest = ListChildren | ListRegistrars | ListResources | ListQueries
 Question = PageRequest | Find | ListHistory | ListDeadLetters | ListFigures
 Request = Hello | Follow | BeginRecording | Keep | Question | Command

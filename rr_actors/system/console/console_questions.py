@@ -109,11 +109,11 @@ class View:
                 names = [name for name in self.node.statuses() if match in name]
                 return Registrars(len(names), [self._registrar(name) for name in names[offset : offset + limit]])
             case ListResources(match, offset, limit, registrar):
-                total, pages, notes = self._pages("resources", registrar, match, offset, limit)
-                return Resources(total, [row for one in pages for row in one.resources], notes)
+                found, notes = self._page("resources", registrar, match, offset, limit)
+                return Resources(found.total, found.resources, notes)
             case ListQueries(match, offset, limit, registrar):
-                total, pages, notes = self._pages("queries", registrar, match, offset, limit)
-                return Queries(total, [row for one in pages for row in one.queries], notes)
+                found, notes = self._page("queries", registrar, match, offset, limit)
+                return Queries(found.total, found.queries, notes)
             case Find(id, registrar):
                 return self.find(id, registrar)
             case ListHistory(path, limit):
@@ -185,7 +185,7 @@ class View:
 
     # -- registrars --------------------------------------------------------------------------------------------------
 
-    def up(self, registrar: str = "") -> list[str]:
+    def up(self, registrar: str) -> list[str]:
         """Return the names of the registrars that can be asked: this one, or all that are up.
 
         Raises:
@@ -214,36 +214,29 @@ class View:
         except RrError as error:
             return RegistrarRow(name, status.value, error=readable(text_of(error)))
 
-    def _pages(
-        self, what: Literal["resources", "queries"], registrar: str, match: str, offset: int, limit: int
-    ) -> tuple[int, list[Page], list[str]]:
-        """Return a page over several registrars: the total, its parts, and notes on registrars that do not answer."""
-        total, pages, notes = 0, list[Page](), list[str]()
+    def _page(
+        self, what: Literal["resources", "queries", "id"], registrar: str, match: str, offset: int = 0, limit: int = 0
+    ) -> tuple[Page, list[str]]:
+        """Return a page over several registrars, and notes on registrars that do not answer."""
+        total, resources, queries, notes = 0, list[ResourceRow](), list[QueryRow](), list[str]()
         for name in self.up(registrar):
-            have = sum(len(one.resources) + len(one.queries) for one in pages)
-            wanted = Wanted(what, match, max(0, offset - total), limit - have)
+            wanted = Wanted(what, match, max(0, offset - total), limit - len(resources) - len(queries))
             try:
                 found = page(self.registrar(name), wanted)
             except RrError as error:
                 notes.append(readable(text_of(error)))
             else:
                 total += found.total
-                pages.append(found)
-        return total, pages, notes
+                resources += found.resources
+                queries += found.queries
+        return Page(total, resources, queries), notes
 
     def find(self, id: str, registrar: str = "") -> Found:
         """Return the resources and queries with this id, or if there are none, those whose ids begin with it."""
         if not id:
             raise UsageError("expected the id of a query or resource, or four characters of its beginning, got nothing")
-        resources, queries, notes = list[ResourceRow](), list[QueryRow](), list[str]()
-        for name in self.up(registrar):
-            try:
-                found = page(self.registrar(name), Wanted("id", id))
-            except RrError as error:
-                notes.append(readable(text_of(error)))
-            else:
-                resources += found.resources
-                queries += found.queries
+        found, notes = self._page("id", registrar, id)
+        resources, queries = found.resources, found.queries
         if any(row.id == id for row in (*resources, *queries)):
             resources = [row for row in resources if id in (row.id, *(holder.query_id for holder in row.holders))]
             queries = [row for row in queries if row.id == id]
