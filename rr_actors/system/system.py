@@ -68,7 +68,7 @@ from rr_actors.system.hosting.hosted import Hosted, check_hostable, prepare
 from rr_actors.system.hosting.node import Node, SystemInfo
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
-from rr_actors.system.recording.recordings import Recording, Recordings, begin
+from rr_actors.system.recording.recordings import Recording, Recordings
 from rr_actors.system.registrar_lookup import give_up, give_up_clients, left_behind, open_registrar, registrar_in
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.web_process import WebPage
@@ -696,8 +696,8 @@ class System:
             ConfigError: the file exists already, or cannot be created.
         """
         self._running()
-        recording = Recording(self.name, limit=limit, path=None if file is None else Path(file))
-        begin(recording, self._recordings)
+        path = None if file is None else Path(file)
+        recording = Recording(self.name, limit=limit, path=path, recordings=self._recordings)
         if self._node is None:  # the system was stopped meanwhile
             recording.stop()
             self._running()

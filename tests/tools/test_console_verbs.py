@@ -614,7 +614,7 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
     asked = command("sequence", query.id, "--seconds", 4)
     with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drawing:
         eventually(lambda: watched.recording)
-        (reader,) = feed._recording
+        (reader,) = feed._readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
         eventually(lambda: not reader._waiting)
@@ -637,7 +637,7 @@ def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so
     watched, feed = shop._node.watched, shop._console.feed
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
         eventually(lambda: watched.recording)
-        (reader,) = feed._recording
+        (reader,) = feed._readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
         eventually(lambda: not reader._waiting)

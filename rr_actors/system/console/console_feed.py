@@ -126,28 +126,23 @@ class Feed:
         self.seq = 0
         self._subscribers = subscribers
         self._recordings = recordings
-        self._recording: dict[Reader, Callable[[], None]] = {}
+        self._readers: dict[Reader, Callable[[], None] | None] = {}  # with the function that ends its recording
         self._unlisten: Callable[[], None] | None = None
-        self._readers: list[Reader] = []
         self._timer: asyncio.TimerHandle | None = None
 
     def add(self, reader: Reader) -> None:
         """Send a reader what happens from now on."""
+        self._readers[reader] = None
         if reader.records:
-            self._recording[reader] = self._recordings.begin(functools.partial(self._recorded, reader))
-            return
-        self._readers.append(reader)
-        if self._unlisten is None:
+            self._readers[reader] = self._recordings.begin(functools.partial(self._recorded, reader))
+        elif self._unlisten is None:
             self._unlisten = self._subscribers.listen(self.heard)
 
     def remove(self, reader: Reader) -> None:
         """Send a reader nothing more; with the last reader of events, end the feed's own subscription."""
-        if (end := self._recording.pop(reader, None)) is not None:
+        if (end := self._readers.pop(reader, None)) is not None:
             end()
-            return
-        if reader in self._readers:
-            self._readers.remove(reader)
-        if not self._readers and self._unlisten is not None:
+        if self._unlisten is not None and all(other.records for other in self._readers):
             unlisten, self._unlisten = self._unlisten, None
             unlisten()
 
@@ -158,7 +153,8 @@ class Feed:
         rest = {key: value for key, value in facts.items() if key not in ("event", "at")}
         event = Event(self.seq, at if isinstance(at, float) else time.time(), facts["event"], rest)
         for reader in self._readers:
-            reader.hear(event)
+            if not reader.records:
+                reader.hear(event)
         self._flush_soon()
 
     def _recorded(self, reader: Reader, entries: list[Entry], dropped: int) -> None:
@@ -171,7 +167,7 @@ class Feed:
 
     def _flush(self) -> None:
         self._timer = None
-        for reader in [*self._readers, *self._recording]:
+        for reader in list(self._readers):
             reader.flush()
 
     def close(self) -> None:
@@ -179,7 +175,7 @@ class Feed:
         if self._timer is not None:
             self._timer.cancel()
             self._flush()
-        for reader in [*self._readers, *self._recording]:
+        for reader in list(self._readers):
             self.remove(reader)
 
 

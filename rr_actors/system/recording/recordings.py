@@ -158,7 +158,9 @@ class Recording:
         path: the file that the entries are written to; None for a recording in memory.
     """
 
-    def __init__(self, system: str, *, limit: int = LIMIT, path: Path | None = None) -> None:
+    def __init__(
+        self, system: str, *, limit: int = LIMIT, path: Path | None = None, recordings: Recordings | None = None
+    ) -> None:
         if type(limit) is not int or limit < 1:
             raise UsageError(f"record: limit: expected a whole number above 0, got {shown(limit)}")
         self.system = system
@@ -169,7 +171,7 @@ class Recording:
         self._entries: deque[Entry] = deque(maxlen=limit)
         self._pid = os.getpid()
         self._writer = None if path is None else _Writer(RecordingFile(path, system, self.since))
-        self._end: Callable[[], None] | None = None
+        self._end = None if recordings is None else recordings.begin(self._take, self._closed)
 
     def _take(self, entries: list[Entry], dropped: int = 0) -> None:
         with self._lock:
@@ -257,13 +259,6 @@ class Recording:
     def __repr__(self) -> str:
         where = f"in {self.path}" if self.path is not None else f"{len(self._entries)} entries"
         return f"<Recording of {self.system}: {where}, {self.missed} missed>"
-
-
-def begin(recording: Recording, recordings: Recordings) -> Recording:
-    """Have the recording take all new entries, and return the recording."""
-    take, closed = recording._take, recording._closed  # pyright: ignore[reportPrivateUsage]  # same file
-    recording._end = recordings.begin(take, closed)  # pyright: ignore[reportPrivateUsage]  # same file
-    return recording
 
 
 def add(recording: Recording, entries: list[Entry], dropped: int = 0) -> None:
