@@ -145,17 +145,14 @@ class Index:
         chosen: set[int] = set()
         seen: set[str] = set()
         ahead: list[tuple[str, float]] = []
-        is_query = id in self.of_query and (of_query or id not in self.of_resource)
-        queries = (
-            [id] if is_query else [*dict.fromkeys([*self.queries_on.get(id, ()), *([id] * (id in self.of_query))])]
-        )
-        if not is_query:
-            first = min((self.entries[number].at for number in self.of_resource.get(id, ())), default=0.0)
+        if id in self.of_resource and not (of_query and id in self.of_query):
+            first = min(self.entries[number].at for number in self.of_resource[id])
             self._resource(id, first, chosen, ahead, seen)
-        ahead += [(query, 0.0) for query in queries]
+            ahead += [(query, 0.0) for query in self.queries_on.get(id, ())]
+        ahead.append((id, 0.0))
         while ahead:
             query, since = ahead.pop()
-            numbers = [number for number in self.of_query[query] if self.entries[number].at >= since]
+            numbers = [number for number in self.of_query.get(query, ()) if self.entries[number].at >= since]
             if query in seen or not numbers:
                 continue
             seen.add(query)
