@@ -121,13 +121,13 @@ class Manager(Actor):
     async def _after_stop(self, final: bool) -> None:
         if final and self._is_mine():
             await self._node.wind_down(self.registrar.name, self._node.config.stop_timeout_s)
-            self._close_registrar(Status.GONE, erase=self.registrar.config.erase_on_destruct)
+            self._close_registrar(Status.GONE)
         else:
             self._close_registrar(None)
 
-    def _close_registrar(self, status: Status | None, *, erase: bool = False) -> None:
+    def _close_registrar(self, status: Status | None) -> None:
         if self._is_mine():
-            self._node.close_registrar(self.registrar.name, status, erase=erase)
+            self._node.close_registrar(self.registrar.name, status)
 
     def _is_mine(self) -> bool:
         """Return whether this manager still owns the registrar of its name: an abandoned one may have a successor."""

@@ -7,7 +7,6 @@ gives up those that a killed application left.
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import threading
 
@@ -25,7 +24,6 @@ from rr_actors.system.console.console_messages import (
     Replied,
 )
 from rr_actors.system.console.console_questions import View, Viewed
-from rr_actors.system.registrar_lookup import open_registrar
 
 logger = logging.getLogger("rr_actors")
 
@@ -44,9 +42,7 @@ class ClientRegistrars:
             InvalidName, NameTaken: the name is not valid, or another client has it.
         """
         full = check_name(CLIENTS + check_name(name, "registrar name"), "registrar name")
-        system = view.system
-        config = dataclasses.replace(system.config.registrar(full), erase_on_destruct=True)
-        registrar = open_registrar(view.node, full, config, system)
+        registrar = view.open_registrar(full)
         with self._lock:
             self._open[full] = owner, registrar
         return Done(f"opened registrar {full}", {"registrar": full})

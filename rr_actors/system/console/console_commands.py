@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import signal
 import threading
@@ -117,14 +116,11 @@ class Commands:
         return Done(f"loaded {server} and released it again", facts | {"kept": False})
 
     def _holder(self, name: str) -> Registrar:
-        system = self._view.system
-        if name:
-            return system.registrar(name)
-        with self._opening:
-            if self._view.node.status_of(REGISTRAR) in (None, Presence.GONE, Presence.DORMANT):
-                config = dataclasses.replace(system.config.registrar(REGISTRAR), erase_on_destruct=True)
-                return system.open_registrar(REGISTRAR, config)
-        return system.registrar(REGISTRAR)
+        if not name:
+            with self._opening:
+                if self._view.node.status_of(REGISTRAR) in (None, Presence.GONE, Presence.DORMANT):
+                    return self._view.open_registrar(REGISTRAR)
+        return self._view.system.registrar(name or REGISTRAR)
 
     def _unload(self, command: Unload) -> Done:
         found = self._view.find(command.id)

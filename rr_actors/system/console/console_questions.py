@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 import weakref
@@ -13,7 +14,7 @@ import msgspec
 from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.refs import ActorRef
-from rr_actors.base.config import RegistrarConfig, SystemConfig
+from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, text_of
 from rr_actors.registrar.model.messages import readable
 from rr_actors.registrar.pages import Page, QueryRow, ResourceRow, Wanted
@@ -46,7 +47,7 @@ from rr_actors.system.console.console_messages import (
 )
 from rr_actors.system.hosting.node import Node
 from rr_actors.system.recording.figures import Figure
-from rr_actors.system.registrar_lookup import registrar_in
+from rr_actors.system.registrar_lookup import open_registrar, registrar_in
 from rr_actors.wire.name_service import Status
 
 _LOOK_S = 5.0
@@ -68,8 +69,6 @@ class Viewed(Protocol):
     def ref(self, id: str) -> ActorRef[Any]: ...
 
     def registrar(self, name: str) -> Registrar: ...
-
-    def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar: ...
 
     def dead_letters(self) -> DeadLetters: ...
 
@@ -203,6 +202,11 @@ class View:
             UnknownRegistrar, InvalidName: the system has no registrar of this name.
         """
         return registrar_in(self.node, name, patient=False)
+
+    def open_registrar(self, name: str) -> Registrar:
+        """Open a registrar as registrar_lookup.open_registrar() does; its catalog is removed when it is closed."""
+        config = dataclasses.replace(self.system.config.registrar(name), erase_on_destruct=True)
+        return open_registrar(self.node, name, config, self.system)
 
     def _registrar(self, name: str) -> RegistrarRow:
         status = self.node.status_of(name)

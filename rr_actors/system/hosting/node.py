@@ -291,14 +291,15 @@ class Node:
         # If an application is killed, its next start alone gives up its clients. Later ones find no catalog of them.
         return not os.path.exists(self.config.registrar(registrar).catalog_path(self.info.state_dir))
 
-    def close_registrar(self, name: str, status: Status | None, *, erase: bool = False) -> None:
-        """Close a registrar, and write its status into the directory; None: write nothing."""
+    def close_registrar(self, name: str, status: Status | None) -> None:
+        """Close a registrar if it is open, and write its status into the directory; None: write nothing."""
         registrar = self.registrars.pop(name, None)
         if registrar is not None:
             steps = Steps()
             if status is _GONE:
                 for client in registrar.clients.values():
                     steps.take(f"taking leave of {client.provider}", client.take_leave)
+            erase = status is _GONE and registrar.config.erase_on_destruct
             steps.take("closing it", lambda: registrar.close(erase=erase))
             if status is not None and self._ours(name):
                 steps.take("leaving word of it", self.directory.mark, registrar_key(name), status)
@@ -320,10 +321,7 @@ class Node:
         """
         steps = Steps()
         await steps.take_async("releasing what it holds, and unloading what it serves", self.wind_down(name, timeout_s))
-        registrar = self.registrars.get(name)
-        if registrar is not None:  # else it was closed meanwhile
-            erase = registrar.config.erase_on_destruct
-            steps.take("closing it", lambda: self.close_registrar(name, _GONE, erase=erase))
+        steps.take("closing it", self.close_registrar, name, _GONE)
         if all(actor.on_failure is not None for actor in self.registrars.values()):  # only those of managers are left
             self.owner = None
         steps.end(f"registrar {name!r}: not closed as it should be")
