@@ -36,6 +36,7 @@ from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice, Put
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.storage.store import Store
+from rr_actors.wire.name_service import Status
 from rr_actors.wire.transport import Attach, Hello, Welcome
 
 _RETRY_S = 0.25
@@ -161,8 +162,8 @@ class RegistrarActor(RegistrarState):
         self.close()
         if self.on_failure is not None:
             self.on_failure(error)
-        else:
-            self.node.registrar_failed(self.name)
+        else:  # no supervisor starts it; it may be opened again
+            self.node.close_registrar(self.name, Status.DORMANT)
 
     # -- messages and commands -----------------------------------------------------------------------------------
 

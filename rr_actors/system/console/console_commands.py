@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +15,7 @@ from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.runtime.processes.lifeline import signal_if
+from rr_actors.runtime.processes.process import signal_name
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console.client_registrars import ClientRegistrars, ask
@@ -176,7 +176,7 @@ class Commands:
         above, _, id = supervisor.path.rpartition("/")
         if child.pid == (SupervisorRef(above).which_child(id).pid if above else os.getpid()):
             raise UsageError(f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead")
-        name = _signal_name(command.signal)
+        name = signal_name(command.signal)
         facts = {"path": path, "pid": child.pid, "signal": name}
         if command.dry_run:
             return Done(f"would send {name} to {path} (pid {child.pid})", facts)
@@ -266,10 +266,3 @@ def _plain(value: Any) -> Any:
     except Exception:  # a user's value: keys that are no text, numbers that are too long
         return shown(value)
     return plain if fits else shown(value)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"

@@ -305,10 +305,6 @@ class Node:
                 steps.take("leaving word of it", self.directory.mark, registrar_key(name), status)
             steps.end(f"registrar {name!r}: not closed altogether")
 
-    def registrar_failed(self, name: str) -> None:
-        """Mark a registrar that has closed by itself as dormant. No supervisor starts it; it may be opened again."""
-        self.close_registrar(name, Status.DORMANT)
-
     def _ours(self, name: str) -> bool:
         entry = self.directory.lookup(registrar_key(name))
         return entry is None or entry.status is not Status.UP or entry.address == self.transport.address
