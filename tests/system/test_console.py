@@ -270,6 +270,19 @@ def test_a_resource_is_found_by_its_id_or_the_beginning_of_it_with_its_holders_a
     assert json.loads(part.request)["name"] == "part"
 
 
+def test_resources_are_listed_also_if_their_statuses_are_together_too_long_for_an_answer(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+) -> None:
+    serve(provider, "thing")
+    long = "\N{BELL}" * 9_000
+    for query in app.load_all([("provider/thing", number) for number in range(130)]):
+        provider.send_status(query, rr.Status("WARNING", long))
+
+    rows = console.resources("provider").rows
+    assert len({row.id for row in rows}) == 130
+    assert {row.message for row in rows} == {long}
+
+
 def test_the_history_of_a_child_tells_of_its_exits(shop: rr.System, console: ConsoleClient) -> None:
     os.kill(shop.ref("shop").pid or 0, signal.SIGKILL)
 

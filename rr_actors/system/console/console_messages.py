@@ -54,7 +54,7 @@ class Hello(_Message, frozen=True):
 
 
 class _Page(_Message, frozen=True):
-    """A page of the rows that have the text `match` in them."""
+    """A page of the rows that have the text `match` in them: at most `limit`, and as many as have room in an answer."""
 
     match: _Text = ""
     offset: _Offset = 0

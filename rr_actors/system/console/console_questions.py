@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, Protocol
 
 import msgspec
@@ -109,14 +110,16 @@ class View:
                 return Registrars(len(names), [self._registrar(name) for name in names[offset : offset + limit]])
             case ListResources(match, offset, limit, registrar):
                 found, notes = self._page("resources", registrar, match, offset, limit)
-                return Resources(found.total, found.resources, notes)
+                return Resources(found.total, found.resources[: _room_for(found.resources)], notes)
             case ListQueries(match, offset, limit, registrar):
                 found, notes = self._page("queries", registrar, match, offset, limit)
                 return Queries(found.total, found.queries, notes)
             case Find(id, registrar):
                 return self.find(id, registrar)
             case ListHistory(path, limit):
-                return _newest([_fitting(record) for record in self._history(path)[-limit:]])
+                records = [_fitting(record) for record in self._history(path)[-limit:]]
+                older = len(records) - _room_for(records[::-1])
+                return Happenings(records[older:], older)
             case ListDeadLetters(limit):
                 letters = self.system.dead_letters()
                 return Letters(letters.count, letters.letters[-limit:])
@@ -247,14 +250,10 @@ class View:
         return Found(resources, queries, notes)
 
 
-def _newest(records: list[Record]) -> Happenings:
-    """Return the newest records, as many as have room in an answer."""
-    room = RESPONSE_LIMIT_BYTES
-    for older, record in zip(range(len(records), 0, -1), reversed(records), strict=True):
-        room -= len(msgspec.msgpack.encode(record))
-        if room < 0:
-            return Happenings(records[older:], older)
-    return Happenings(records)
+def _room_for(rows: Sequence[ResourceRow | Record]) -> int:
+    """Return how many of these rows, from the first on, have room in an answer: they may have long texts."""
+    sizes = itertools.accumulate(len(msgspec.msgpack.encode(row)) for row in rows)
+    return sum(size <= RESPONSE_LIMIT_BYTES for size in sizes)
 
 
 def _fitting(record: Record) -> Record:
