@@ -390,10 +390,8 @@ class Node:
         for registrar in list(self.registrars.values()):
             registrar.monitor.receive(Gone(name), name)
         for provider in self.directory.registrars():
-            if provider in self.registrars or provider == name:
-                continue
             entry = self.find(provider)
-            if entry is not None and entry.status is Status.UP:
+            if provider not in self.registrars and entry is not None and entry.status is Status.UP:
                 await self._tell_gone(provider, entry.address, name)
 
     async def _tell_gone(self, provider: str, address: str, name: str) -> None:
