@@ -70,8 +70,8 @@ class ConsoleClient:
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
-        is_broken: whether an answer did not come, the console closes the connection after it, or it is a Holding
-            without its keep() yet: then the connection must not be used again.
+        is_broken: whether the connection must not be kept for another call: the last answer did not come, or is a
+            Holding without its keep() yet, or a Refused, after which the console may close the connection.
 
     Raises:
         NotRunning: no console answers in run_dir.
@@ -105,7 +105,7 @@ class ConsoleClient:
         self.is_broken = True
         self._send(request)
         answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
-        self.is_broken = isinstance(answer, Holding) or (isinstance(answer, Refused) and not _is_valid(request))
+        self.is_broken = isinstance(answer, Holding | Refused)
         return _checked(answer, expected)
 
     def keep(self) -> None:
@@ -151,7 +151,7 @@ class ConsoleClient:
         Raises:
             RrError: the system refused the request.
         """
-        return self._parts(follow, Events | Missed)
+        return self._parts(follow)
 
     def record(self) -> Iterator[Entries]:
         """Yield the recorded entries from now on, as follow() does. `dropped` has those that this reader missed, too.
@@ -159,15 +159,15 @@ class ConsoleClient:
         Raises:
             RrError: the system refused the request.
         """
-        parts = self._parts(BeginRecording(), Entries | Missed)
+        parts = self._parts(BeginRecording())
         return (Entries([], part.count) if isinstance(part, Missed) else part for part in parts)
 
-    def _parts(self, request: Follow | BeginRecording, kinds: Any) -> Iterator[Any]:
+    def _parts(self, request: Follow | BeginRecording) -> Iterator[Any]:
         self._send(request)
         _checked(self._receive(self.timeout_s), Following)
-        return self._fed(kinds)
+        return self._fed()
 
-    def _fed(self, kinds: Any) -> Iterator[Any]:
+    def _fed(self) -> Iterator[Any]:
         while True:
             try:
                 answer = self._receive(None)
@@ -175,8 +175,7 @@ class ConsoleClient:
                 return
             if isinstance(answer, Refused):
                 raise error_of(answer.failure)
-            if isinstance(answer, kinds):
-                yield answer
+            yield answer
 
     def close(self) -> None:
         """Close the connection; a call that waits in another thread raises NotRunning. A second close does nothing."""
@@ -235,15 +234,6 @@ def _checked(answer: Answer, expected: type[_A]) -> _A:
     if not isinstance(answer, expected):
         raise Unavailable(f"console: expected {expected.__name__}, got {type(answer).__name__}")
     return answer
-
-
-def _is_valid(request: Request) -> bool:
-    """Return whether the console can read a request; it closes the connection after another one."""
-    try:
-        msgspec.msgpack.decode(msgspec.msgpack.encode(request), type=Request)
-    except msgspec.ValidationError:
-        return False
-    return True
 
 
 def _connected(run_dir: Path) -> socket.socket:
