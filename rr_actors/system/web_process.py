@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.machinery
-import select
 import subprocess
 import sys
 import time
@@ -11,7 +10,7 @@ from typing import Self
 
 from rr_actors.base.checks import Extra
 from rr_actors.base.errors import Unavailable, shown
-from rr_actors.runtime.processes.lifeline import kill_group
+from rr_actors.runtime.processes.lifeline import is_readable, kill_group
 
 _LIBRARIES = ("nicegui", "typer", "rich")
 """The libraries of the program. They are looked for and not imported here: only the page's process needs them."""
@@ -77,11 +76,9 @@ class WebPage:
         """Return the address that the program prints when the page can be opened."""
         output = self._program.stdout
         assert output is not None
-        poll = select.poll()
-        poll.register(output, select.POLLIN)
         until = time.monotonic() + _START_S
         printed = b""
-        while b"\n" not in printed and poll.poll(max(0.0, until - time.monotonic()) * 1000):
+        while b"\n" not in printed and is_readable(output.fileno(), until - time.monotonic()):
             if not (got := output.read(4096)):  # it has closed its output
                 break
             printed += got
