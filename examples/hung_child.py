@@ -19,18 +19,18 @@ import rr_actors as rr
 class Worker(rr.Actor):
     def on_receive(self, message: object) -> object:
         if message == "be slow":
-            time.sleep(1.5)
+            time.sleep(2.5)
         if message == "hang":
             ctypes.PyDLL(None).sleep(3600)  # keeps the interpreter to itself: no other thread of the process runs
         return os.getpid()
 
 
 def main() -> None:
-    children = [rr.ChildSpec(Worker, id="worker", heartbeat_s=0.5)]
+    children = [rr.ChildSpec(Worker, id="worker", heartbeat_s=1.0)]
     with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
         worker = system.ref("worker")
         first = worker.ask("who?")
-        print("slow for three heartbeats, and still the same:", worker.ask("be slow") == first, flush=True)
+        print("slow for two heartbeats, and still the same:", worker.ask("be slow") == first, flush=True)
 
         replaced = threading.Event()
         system.subscribe(lambda event: replaced.set() if event["event"] == "restarted" else None)

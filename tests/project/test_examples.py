@@ -72,7 +72,7 @@ EXPECTED = {
         "   └─ wheel     supervisor",
     ],
     "hung_child": [
-        "slow for three heartbeats, and still the same: True",
+        "slow for two heartbeats, and still the same: True",
         "replaced by another process: True",
         "why: hung: its loop had not answered",
     ],
