@@ -43,7 +43,8 @@ class RegistrarConfig:
             home. Default: the name.
         save_interval_s: the seconds between two saves, with save_on_modify off.
         save_on_modify: write each change before it is acknowledged. Off: a crash loses the changes since the last save.
-        erase_on_destruct: remove the catalog when the registrar is closed for good.
+        erase_on_destruct: remove the catalog when the registrar is closed for good, and owes no release to a provider
+            that is down.
         durability: what a change survives. "process": SIGKILL. "power": a power cut (fsync before the answer).
             "none": nothing, for benchmarks.
         on_damage: "refuse" a damaged or foreign catalog, or rename it and start empty ("aside").

@@ -8,13 +8,15 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
 from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
 from rr_actors.base.names import CLIENTS, check_name
-from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
+from rr_actors.registrar.model.rows import OWED, Change, Content, Drop, Held, Peer, Put, Resource
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.registrar.remote_registrar import RegistrarHandle
 from rr_actors.storage.opening import open_store, read_rows
@@ -115,7 +117,10 @@ async def give_up_clients(node: Node, names: Iterable[str]) -> None:
 
 
 async def give_up(node: Node, name: str, *, erase: bool = False) -> None:
-    """Delete what a dormant registrar holds from its catalog, and have the providers release it. On the loop.
+    """Have the providers of a dormant registrar release what it holds, and delete that from its catalog. On the loop.
+
+    What providers hold that are down stays in the catalog, as owed. They read in the directory that the registrar is
+    gone, if the application lives until they are back; else its next start finds the registrar dormant again.
 
     Args:
         erase: remove the catalog from disk.
@@ -124,27 +129,49 @@ async def give_up(node: Node, name: str, *, erase: bool = False) -> None:
         CatalogError: its catalog cannot be opened.
     """
     config, state_dir = node.config.registrar(name), Path(node.info.state_dir)
-    await node.dispatcher.workers.run(forget, config, state_dir, "held")
+    await node.dispatcher.workers.run(owe, config, state_dir)
     await node.retire(name)
-    # The peers stay until now: if the application was killed before, its next start finds the registrar dormant again.
-    await node.dispatcher.workers.run(functools.partial(forget, config, state_dir, "peers", erase=erase))
+    down = {other for other, status in node.statuses().items() if status is not Status.UP}
+    await node.dispatcher.workers.run(functools.partial(forget, config, state_dir, down=down, erase=erase))
 
 
-def forget(config: RegistrarConfig, state_dir: Path, *tables: Table, erase: bool = False) -> None:
-    """Delete all rows of some tables from the catalog of a registrar that nobody has open. Blocks.
+def owe(config: RegistrarConfig, state_dir: Path) -> None:
+    """Mark all that a registrar holds which nobody has open as owed: if it is opened again, it releases that. Blocks.
+
+    Raises:
+        CatalogError: its catalog cannot be opened or written.
+    """
+    _change(config, state_dir, lambda content: [Put(replace(row, hold=OWED)) for row in content["held"].values()])
+
+
+def forget(config: RegistrarConfig, state_dir: Path, *, down: Collection[str] = (), erase: bool = False) -> None:
+    """Delete what a registrar holds that nobody has open, and its providers, from its catalog. Blocks.
 
     Args:
+        down: the providers whose rows stay. So do the rows of the registrar itself, if it is one of its consumers.
         erase: remove the catalog from disk, too.
 
     Raises:
         CatalogError: its catalog cannot be opened or written.
     """
+
+    def changes(content: Content) -> list[Change]:
+        own = {query.origin for query in content["queries"].values()} & {config.name}
+        held = [row.id for row in content["held"].values() if row.registrar not in {*down, *own}]
+        peers = [name for name in content["peers"] if name not in {*down, *own}]
+        return [*(Drop("held", id) for id in held), *(Drop("peers", name) for name in peers)]
+
+    _change(config, state_dir, changes, erase=erase)
+
+
+def _change(
+    config: RegistrarConfig, state_dir: Path, changes: Callable[[Content], Sequence[Change]], *, erase: bool = False
+) -> None:
     durability = "power" if config.durability == "power" else "process"
     path, witness = config.catalog_path(state_dir), Witness(state_dir, config.name)
     store = open_store(path, durability=durability, on_damage=config.on_damage, witness=witness)
     try:
-        content = store.load()
-        store.commit([Drop(table, id) for table in tables for id in content[table]])
+        store.commit(changes(store.load()))
     except BaseException:
         store.close()
         raise

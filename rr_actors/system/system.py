@@ -544,7 +544,9 @@ class System:
         return [name for name, status in self._running().statuses().items() if status is Status.DORMANT]
 
     def release(self, name: str) -> None:
-        """Release everything that a dormant registrar holds.
+        """Release everything that a dormant registrar holds; a provider that is down does so when it is back.
+
+        If the application ends before that, its next start finds the registrar dormant again.
 
         Raises:
             UsageError: the registrar is not dormant.

@@ -165,6 +165,25 @@ def test_erase_on_destruct_removes_the_catalog_at_close(system: rr.System, state
     assert catalog_path(state_dir, "kept").exists()
 
 
+def test_erase_on_destruct_leaves_a_catalog_whose_releases_a_provider_that_is_down_has_to_hear_of(
+    start: Start, workshop: Workshop, state_dir: Path
+) -> None:
+    shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    system = start(shop)
+    passing = system.open_registrar("passing", rr.RegistrarConfig(erase_on_destruct=True))
+    passing.load("shop/thing", Order("wheel"))
+    system.supervisor().terminate_child("shop")
+    passing.close(timeout_s=0.1)
+    system.stop()
+    system = start(shop)
+    assert system.dormant() == ["passing"]
+    passing = system.open_registrar("passing", rr.RegistrarConfig(erase_on_destruct=True))
+    workshop.wait("unload wheel")
+    eventually(lambda: not system.registrar("shop").resources())
+    passing.close()
+    assert not catalog_path(state_dir, "passing").exists()
+
+
 @pytest.mark.parametrize("broken", ["commit", "close"])
 @pytest.mark.parametrize("ends", ["registrar", "system"])
 def test_a_disk_that_is_full_or_broken_keeps_nothing_from_closing(

@@ -22,7 +22,19 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.model.rows import Held, Peer
 from rr_actors.storage.opening import read_rows
 from rr_actors.wire.name_service import Directory, Status, registrar_key
-from support import LIMIT_S, TEST_PATHS, Calls, Workshop, child, eventually, kill, messages, pid_of, wait_respawned
+from support import (
+    LIMIT_S,
+    TEST_PATHS,
+    Calls,
+    Workshop,
+    child,
+    eventually,
+    kill,
+    messages,
+    pid_of,
+    serve,
+    wait_respawned,
+)
 from support_managers import Made, Order, Shop
 
 Start = Callable[..., rr.System]
@@ -762,6 +774,102 @@ def test_a_release_that_a_kill_interrupts_can_be_made_again(start: Start, worksh
     assert system.dormant() == []
     left = read_rows(state_dir / "other" / "catalog.sqlite3")
     assert not any(isinstance(row, Held | Peer) for row in left)
+
+
+HOLDS = """
+other = system.open_registrar('other')
+other.load('shop/thing', Order('wheel'))
+other.save_catalog()
+"""
+
+
+@pytest.mark.parametrize(
+    ("down", "end", "again"),
+    [("stopped", "stop", "opened"), ("starting", "kill", "opened"), ("starting", "stop", "released")],
+)
+def test_a_release_while_its_provider_is_down_is_owed_when_the_application_is_started_again(
+    start: Start, workshop: Workshop, state_dir: Path, down: str, end: str, again: str
+) -> None:
+    run_and_be_killed(workshop, state_dir, HOLDS)
+    body = f"""
+    if {down == "stopped"}:
+        system.supervisor().terminate_child('shop')
+    else:
+        workshop.shut('start shop')
+        os.kill(system.supervisor().which_children()[0].pid, signal.SIGKILL)
+        workshop.wait('start shop', 3)
+    system.release('other')
+    assert system.dormant() == []
+    if {end == "stop"}:
+        system.stop(0.5)
+    """
+    run_and_be_killed(workshop, state_dir, body)
+    workshop.open("start shop")
+    system = start(shop(workshop))
+    assert system.dormant() == ["other"]
+
+    if again == "opened":
+        assert list(system.open_registrar("other").queries()) == []
+    else:
+        system.release("other")
+
+    workshop.wait("unload wheel")
+    eventually(lambda: holders(system) == {})
+    assert system.dormant() == []
+
+
+def test_what_was_released_while_its_provider_was_down_is_not_held_again_by_who_opens_it_meanwhile(
+    start: Start, workshop: Workshop, state_dir: Path
+) -> None:
+    run_and_be_killed(workshop, state_dir, HOLDS)
+    system = start(shop(workshop))
+    system.supervisor().terminate_child("shop")
+    system.release("other")
+    other = system.open_registrar("other")
+    system.supervisor().restart_child("shop")
+    workshop.wait("unload wheel")
+    eventually(lambda: holders(system) == {})
+    assert list(other.queries()) == []
+
+
+def test_what_a_dormant_registrar_holds_at_itself_is_released_when_it_is_opened(
+    start: Start, workshop: Workshop, state_dir: Path
+) -> None:
+    body = """
+    other = system.open_registrar('other')
+    other.register_server('own', lambda request: request, lambda *_: None)
+    other.load('other/own', 'x')
+    other.save_catalog()
+    """
+    run_and_be_killed(workshop, state_dir, body)
+    system = start()
+    system.release("other")
+    other = system.open_registrar("other")
+    served = serve(other, "own")
+    assert served.unloads.wait() == [("x", "x")]
+    eventually(lambda: not other.resources())
+
+
+def test_a_provider_hears_of_a_registrar_that_is_released_while_it_is_about_to_serve(
+    start: Start, workshop: Workshop, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = """
+    provider = system.open_registrar('provider')
+    provider.register_server('thing', lambda request: request, lambda *_: None)
+    app.load('provider/thing', 'x')
+    """
+    run_and_be_killed(workshop, state_dir, body)
+    system = start()
+    publish = Directory.publish
+
+    def publish_late(directory: Directory, name: str, address: str, **options: Any) -> None:
+        if name == registrar_key("provider"):
+            directory.mark(registrar_key("app"), Status.GONE)  # System.release() does so, then looks for addresses
+        publish(directory, name, address, **options)
+
+    monkeypatch.setattr(Directory, "publish", publish_late)
+    served = serve(system.open_registrar("provider"), "thing")
+    assert served.unloads.wait() == [("x", "x")]
 
 
 def test_a_whole_system_that_was_killed_comes_back_with_everything(

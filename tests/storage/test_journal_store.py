@@ -648,7 +648,7 @@ def test_what_a_dormant_registrar_holds_is_found_in_its_journal_and_forgotten_wi
     in_parts(store, [Put(Peer("hub")), Put(query("a"))], [Put(Peer("maker")), Put(query("b"))], [Drop("queries", "a")])
     copy = left_by(path, "app")
     store.close()
-    forget(RegistrarConfig("app"), copy.parent.parent, "held", "peers")
+    forget(RegistrarConfig("app"), copy.parent.parent)
     assert read_rows(copy) == [query("b")]
     assert names(copy) == ["catalog.lock", "catalog.sqlite3"]
 

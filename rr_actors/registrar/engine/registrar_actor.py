@@ -135,6 +135,9 @@ class RegistrarActor(RegistrarState):
 
         Each step is tried, also after one that failed.
 
+        Args:
+            erase: remove the catalog, unless a provider that is down has to be told that queries are released.
+
         Raises:
             Exception, ExceptionGroup: the errors of the steps that failed.
         """
@@ -151,7 +154,9 @@ class RegistrarActor(RegistrarState):
         unloads, self.unloads = self.unloads, {}
         for unload_waiter in unloads.values():
             steps.take("telling who unloads", unload_waiter, down)
-        steps.take("closing its catalog", lambda: self._commits.close(erase=erase))
+        with self.lock:
+            told = self.catalog.outbound.keys() <= self.catalog.up.keys()
+        steps.take("closing its catalog", lambda: self._commits.close(erase=erase and told))
         self.lock_in_use(in_use=False)
         steps.end(f"registrar {self.name!r}: not closed altogether")
 

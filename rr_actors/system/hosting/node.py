@@ -275,14 +275,17 @@ class Node:
         logger.info("%s: not all providers have answered within %g s", registrar.name, _RECONCILE_S)
 
     def serve_registrar(self, registrar: RegistrarActor) -> None:
-        """Accept the links of others, and publish the registrar's address. First drop origins that are gone."""
+        """Accept the links of others, publish the registrar's address, and drop the origins that are gone.
+
+        In this order: retire() marks an origin as gone, and then tells the registrars whose address it finds.
+        """
+        registrar.serve()
+        self.directory.publish(registrar_key(registrar.name), self.transport.address)
         with registrar.lock:
             catalog = registrar.whole()
             origins = {**catalog.by_origin, **catalog.notices_to}
         for origin in filter(self._is_gone, origins):
             registrar.monitor.receive(Gone(origin), origin)
-        registrar.serve()
-        self.directory.publish(registrar_key(registrar.name), self.transport.address)
 
     def _is_gone(self, registrar: str) -> bool:
         status = self.status_of(registrar)
