@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import signal
@@ -36,7 +37,19 @@ from rr_actors.storage.opening import read_rows
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Hello
-from support import Calls, Gate, Workshop, break_exchanges, catalog_path, eventually, hang, kill, serve, wait_respawned
+from support import (
+    Calls,
+    Gate,
+    Workshop,
+    break_exchanges,
+    catalog_path,
+    eventually,
+    hang,
+    kill,
+    pid_of,
+    serve,
+    wait_respawned,
+)
 from support_managers import Order, Shop
 
 # -- brief holds of real registrars ----------------------------------------------------------------------------------
@@ -107,6 +120,42 @@ def test_what_is_held_briefly_is_loaded_and_unloaded_and_never_on_disk(
     assert buyer.stats()["unloading"] == 0
     buyer.save_catalog()
     assert held_on_disk(state_dir) == before
+
+
+class Brief(rr.Manager):
+    """Holds something, and releases something else while the provider hangs, whose pid it is told."""
+
+    def on_receive(self, message: Any) -> Any:
+        if message == "queries":
+            return [query.request.name for query in self.registrar.queries()]
+        threading.Thread(target=self.hold_briefly, args=(message,), daemon=True).start()
+        return None
+
+    def hold_briefly(self, provider: int) -> None:
+        self.registrar.load("shop/thing", Order("first"))
+        query = self.registrar.load("shop/thing", Order("wheel"))
+        hang(provider)
+        with contextlib.suppress(rr.RegistrarDown):
+            query.unload()
+
+
+@pytest.mark.parametrize("end", ["kill", "stop"])
+def test_a_release_of_a_brief_hold_that_its_provider_has_not_read_is_owed_on_disk_a_moment_later(
+    start: Callable[..., rr.System], workshop: Workshop, state_dir: Path, end: str
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)), rr.ChildSpec(Brief, id="brief"))
+    system.ref("brief").tell(pid_of(system, "shop"))
+    rows = functools.partial(read_rows, catalog_path(state_dir, "brief"))
+    eventually(lambda: any(isinstance(row, Held) and row.hold is Hold.OWED for row in rows()))
+    if end == "kill":
+        wait_respawned(system, "brief", kill(system, "brief"))
+    else:
+        system.supervisor().terminate_child("brief")
+        system.supervisor().restart_child("brief")
+    kill(system, "shop")
+    workshop.wait("unload wheel")
+    eventually(lambda: [resource.request.name for resource in system.registrar("shop").resources()] == ["first"])
+    assert system.ref("brief").ask("queries") == ["first"]
 
 
 def test_while_others_hold_it_a_brief_hold_ends_without_a_callback(buyer: rr.Registrar, workshop: Workshop) -> None:

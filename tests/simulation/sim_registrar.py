@@ -108,9 +108,7 @@ class SimRegistrar(SimShell):
             if fault == "error":
                 raise CatalogError("disk full")
             self.write([*self.unsaved.changes(), *decision.changes, *decision.later.values()])
-            self.unsaved.all_written()
-            self.unsaved.written(decision.later.values())
-            self.unsaved.written(decision.changes)
+            self.unsaved.clear()
             self.world.todo.discard(("save", self.name))
         elif decision.later:
             self.unsaved.add(decision.later.values())
@@ -174,7 +172,7 @@ class SimRegistrar(SimShell):
             if self.disk_is_full or fault == "error":
                 raise CatalogError("disk full")
             self.write([Put(row)])
-            self.unsaved.written([Put(row)])
+            self.unsaved.row_written(row)
             if fault == "after":
                 raise Killed
             return True
@@ -267,7 +265,7 @@ class SimRegistrar(SimShell):
     def save(self) -> None:
         """What was to follow later follows now."""
         self.write(self.unsaved.changes())
-        self.unsaved.all_written()
+        self.unsaved.clear()
         self.world.todo.discard(("save", self.name))
 
     def not_committed(self, inbox: list[tuple[Any, str | None]]) -> None:

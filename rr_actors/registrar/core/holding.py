@@ -209,8 +209,9 @@ def owed(catalog: Catalog, query_id: str) -> Held | None:
 def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
     """Mark a query as owed, with the row that owed() has returned; return False if write() has not written it.
 
-    If the disk has anything of the query, write(row) writes it first. If it has nothing, nothing is written: after a
-    crash the provider says whether the query is held. After False nothing has changed.
+    If the disk has anything of the query, write(row) writes it first. If it has nothing, the row is written a moment
+    later, unless the query is gone by then: after an earlier crash the provider says whether it is held. After False
+    nothing has changed.
 
     Raises:
         CatalogError: write() has raised it; nothing has changed.
@@ -219,7 +220,7 @@ def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], b
     catalog.unfinished = [("held", id, catalog.held[id])]
     try:
         if id in unsaved.new:
-            unsaved.new[id] = None
+            unsaved.new[id] = row
         elif not write(row):
             catalog.unfinished = None
             return False

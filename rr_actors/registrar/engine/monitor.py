@@ -243,9 +243,9 @@ class RegistrarState:
     def owe(self, query_id: str) -> bool:
         """Mark as owed a query that a thread releases by its own line; return False if Release has to be decided.
 
-        The row is written, unless the disk has nothing of the query: then, after a crash, the provider says whether it
-        is still held. After True the thread must tell the provider. It then passes the answer to forget_released(), or
-        leaves the release to the registrar's actor.
+        The row is written, a moment later if the disk has nothing of the query: after an earlier crash the provider
+        says whether it is still held. After True the thread must tell the provider. It then passes the answer to
+        forget_released(), or leaves the release to the registrar's actor.
         """
         if self.closed or interpreter.possible():
             return False
@@ -598,7 +598,7 @@ class CommitLog:
         """
         if self._at_once:
             self._save()
-        self.unsaved.forget()
+        self.unsaved.clear()
         return self._store.load()
 
     def commit(self, decision: Decision) -> None:
@@ -611,12 +611,9 @@ class CommitLog:
             unsaved, later = self.unsaved, decision.later.values()
             if unsaved.some or unsaved.new or later:
                 self._write([*unsaved.changes(), *decision.changes, *later])
-                unsaved.all_written()
-                unsaved.written(later)
+                unsaved.clear()
             else:
                 self._write(decision.changes)
-            if unsaved.new:  # some were released before they were written; the rows of these changes are on disk now
-                unsaved.written(decision.changes)
         elif decision.changes or decision.later:
             self.unsaved.add(decision.changes)
             self.unsaved.add(decision.later.values())
@@ -657,7 +654,7 @@ class CommitLog:
         with self.lock:
             if changes := self.unsaved.changes():
                 self._write(changes)
-                self.unsaved.all_written()
+                self.unsaved.clear()
 
     def _write(self, changes: Sequence[Change]) -> None:
         if self.watched is not None and self.watched.level[0] > 1:

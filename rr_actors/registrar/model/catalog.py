@@ -529,26 +529,25 @@ Key = tuple[Table, str]
 class Unsaved:
     """The last change of each row that waits to be written.
 
-    A held row that was never written need not be written as owed: after a crash this registrar does not know of the
-    query, and its provider says whether it is held. So a query that is released within that time leaves nothing on
-    disk. "Never written" says more than "waits to be written": a row that waits may replace an older one on disk.
+    A held row that was never written may also be written as owed a moment later: after a crash before that, this
+    registrar does not know of the query, and its provider says whether it is held. So a query that is loaded and
+    released within that time leaves nothing on disk. "Never written" says more than "waits to be written": a row that
+    waits may replace an older one on disk.
 
     Attributes:
         some: the changes that wait, by table and id, except those of `new`.
-        new: by id, the held queries that no commit has written; None: the query is released, and does not wait.
+        new: by id, the held or owed queries that no commit has written.
     """
 
     __slots__ = ("new", "some")
 
     def __init__(self) -> None:
         self.some: dict[Key, Change] = {}
-        self.new: dict[str, Held | None] = {}
+        self.new: dict[str, Held] = {}
 
     def changes(self) -> list[Change]:
         """Return the changes that wait to be written."""
-        if not self.new:
-            return list(self.some.values())
-        return [*self.some.values(), *(Put(row) for row in self.new.values() if row is not None)]
+        return [*self.some.values(), *map(Put, self.new.values())]
 
     def add(self, changes: Iterable[Change]) -> None:
         """Have these changes wait, in place of older ones of the same rows."""
@@ -561,31 +560,17 @@ class Unsaved:
             else:
                 del self.new[id]
 
-    def written(self, changes: Iterable[Change]) -> None:
-        """Note that these changes are on disk, and forget older ones of the same rows."""
-        for change in changes:
-            table, id = key_of(change)
-            self.some.pop((table, id), None)
-            if table == "held":
-                self.new.pop(id, None)
-
     def row_written(self, row: Row) -> None:
-        """Forget the changes of one row that has been written, as written() does for many."""
+        """Forget the changes of one row, which is on disk now."""
         if self.some:
             self.some.pop((TABLE_OF[type(row)], row.id), None)
         if self.new:
             self.new.pop(row.id, None)
 
-    def all_written(self) -> None:
-        """Note that all waiting changes are on disk."""
-        if self.new:  # first: if an interrupt comes in between, `some` is only written once more
-            self.new = {id: None for id, row in self.new.items() if row is None}
+    def clear(self) -> None:
+        """Forget all waiting changes: they are on disk, or are never to be written."""
+        self.new.clear()  # first: if an interrupt comes in between, `some` is only written once more
         self.some.clear()
-
-    def forget(self) -> None:
-        """Forget all waiting changes; they are never written."""
-        self.some.clear()
-        self.new.clear()
 
     def drop(self, query_id: str) -> None:
         """Note that a held query is gone, so that its row is removed from the disk, if it is there."""
