@@ -70,6 +70,7 @@ class Script:
         self.waiting: deque[tuple[str, Item]] = deque()
         self.events = 0
         self.numbers = 0
+        self.asked = 0
 
     def side(self, name: str) -> Side:
         """The registrar of that name; the first time it is named it begins."""
@@ -281,7 +282,9 @@ def _begins(script: Script, name: str, server: str, options: str) -> None:
 
 def _loads(script: Script, name: str, query: str, provider: str, server: str, request: str, parent: str | None) -> None:
     script.side(provider)
-    script.post(name, c.Ask(query, provider, server, request.encode(), parent or ""))
+    script.asked += 1
+    number = script.side(name).catalog.since + script.asked
+    script.post(name, c.Ask(query, provider, server, request.encode(), parent or "", number))
 
 
 def _load_ends(script: Script, name: str, id: str, how: str, text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import msgspec
@@ -42,6 +43,7 @@ class Registrar:
         self.catalog = Catalog(name, content_of(rows), epoch)
         self.effects: list[Any] = []
         self.changes: list[Any] = []
+        self.numbers = itertools.count(self.catalog.since + 1)
         for server in servers:
             self.obey(c.Register(server, "event"))
 
@@ -50,6 +52,9 @@ class Registrar:
 
     def obey(self, command: Any) -> list[Any]:
         return self.together((command, None))
+
+    def ask(self, id: str, provider: str, server: str, request: bytes, parent: str) -> list[Any]:
+        return self.obey(c.Ask(id, provider, server, request, parent, next(self.numbers)))
 
     def begin_again(self) -> list[Any]:
         return self.together((c.BeginAgain(), None))
@@ -300,7 +305,7 @@ def test_what_an_interrupted_reload_had_loaded_goes_with_a_resource_that_is_fata
     server = Server("cam", recovery="reload")
     registrar = provider("loaded", recovery="reload").again(server)
     registrar.obey(c.Reconcile("lens", [], "r"))
-    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.ask("part", "lens", "zoom", b"", "q")
     registrar.decide(Loaded("part", "res", b"x"), "lens")
     registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
 
@@ -396,7 +401,7 @@ def consumer(hold: str) -> Registrar:
     """Query "q" at registrar p, pending, held or owed, over a link that is reconciled."""
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", [], "r0"))
-    registrar.obey(c.Ask("q", "p", "cam", b"front", ""))
+    registrar.ask("q", "p", "cam", b"front", "")
     if hold != "pending":
         registrar.decide(Loaded("q", "res", b"feed"), "p")
     if hold == "owed":
@@ -509,12 +514,12 @@ def in_flight() -> Registrar:
     """A load of the query "q" by its caller's own line, which nobody else has heard of."""
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", [], "r0"))
-    registrar.obey(c.Ask("first", "p", "cam", b"front", ""))
+    registrar.ask("first", "p", "cam", b"front", "")
     registrar.catalog.in_flight["q"] = ASKED
     return registrar
 
 
-ASKED = holding.pending(c.Ask("q", "p", "cam", b"front", ""), 0, (1 << 32) + 7)
+ASKED = holding.pending(c.Ask("q", "p", "cam", b"front", "", (1 << 32) + 7))
 GOT = c.Got("q", "res", b"feed")
 
 
@@ -891,7 +896,7 @@ def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
     for _ in range(recovery.ATTEMPTS - 1):
         registrar = registrar.again(Server("cam"))
     registrar.obey(c.Reconcile("lens", [], "r"))
-    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.ask("part", "lens", "zoom", b"", "q")
     (asked,) = requests(registrar)
     rows = [*registrar.catalog.resources.values(), *registrar.catalog.queries.values()]
     rows += [*registrar.catalog.peers.values()]  # the part's own row had not been written
@@ -935,7 +940,7 @@ def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not
     registrar.obey(c.Reconcile("lens", [], "r"))
     registrar.decide(Fetch("app", True))
     registrar.decide(load())
-    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.ask("part", "lens", "zoom", b"", "q")
     registrar.decide(Loaded("part", "res", b"x"), "lens")
     registrar.obey(c.LoadDone("q", 1, b"feed"))
     if listened:
@@ -1094,7 +1099,7 @@ def whole(*, has_status: bool = True, phase: str = "loading") -> Registrar:
     """Resource "q", which has loaded "part" of lens/zoom, and is loading still, or is asked after."""
     registrar = provider(phase, has_status=has_status)
     registrar.obey(c.Reconcile("lens", [], "r"))
-    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.ask("part", "lens", "zoom", b"", "q")
     registrar.decide(Loaded("part", "res", b"x"), "lens")
     return registrar
 
@@ -1228,7 +1233,7 @@ def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds(
     registrar.obey(c.Reconcile("p", [], "r0"))
     for number in range(5000):
         id = f"q{number}"
-        registrar.obey(c.Ask(id, "p", "cam", b"front", ""))
+        registrar.ask(id, "p", "cam", b"front", "")
         registrar.decide(Loaded(id, "res", b"feed"), "p")
         notice = Notice(f"s:{id}", id, "app", "res", f"s{number}", State.WARNING, "hot", "p/cam")
         registrar.decide(Noticed(notice), "p")
@@ -1322,7 +1327,7 @@ def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:
     registrar = Registrar("p", Server("cam"))
     registrar.obey(c.Reconcile("p", [], "r"))
     registrar.decide(load("q"))
-    registrar.obey(c.Ask("part", "p", "cam", b"front", "q"))
+    registrar.ask("part", "p", "cam", b"front", "q")
     (asked,) = requests(registrar)
 
     registrar.decide(asked, "p")
@@ -1352,7 +1357,7 @@ def with_spares() -> Registrar:
     registrar = provider("loaded", has_status=True)
     registrar.obey(c.Reconcile("lens", [], "r"))
     for id in ("part", "older", "spare"):
-        registrar.obey(c.Ask(id, "lens", "zoom", b"", "q"))
+        registrar.ask(id, "lens", "zoom", b"", "q")
         registrar.decide(Loaded(id, "res " + id, b"x"), "lens")
     return registrar
 
@@ -1417,7 +1422,7 @@ def test_a_part_that_is_asked_for_again_is_the_same_query(now: str, fails: bool)
         registrar.obey(c.Release("spare"))
     before = registrar.catalog.held["spare"]
 
-    registrar.obey(c.Ask("spare", "lens", "zoom", b"", "q"))
+    registrar.ask("spare", "lens", "zoom", b"", "q")
 
     (resolved,) = [effect for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
     assert (resolved.failure is not None) == fails
@@ -1442,7 +1447,7 @@ def building() -> Registrar:
     registrar = Registrar("app", Server("robot"), rows=[Peer("p")])
     registrar.obey(c.Reconcile("p", [], "r0"))
     registrar.decide(Load("r", "robot", b"", "other", "", 0, 1))
-    registrar.catalog.in_flight["q"] = holding.pending(c.Ask("q", "p", "cam", b"front", "r"), 1, (1 << 32) + 7)
+    registrar.catalog.in_flight["q"] = holding.pending(c.Ask("q", "p", "cam", b"front", "r", (1 << 32) + 7), 1)
     return registrar
 
 

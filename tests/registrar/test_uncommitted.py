@@ -58,7 +58,7 @@ def load(id: str) -> Load:
 
 
 def ask() -> c.Ask:
-    return c.Ask("new", "p", "cam", b"front", "")
+    return c.Ask("new", "p", "cam", b"front", "", 1)
 
 
 def refused(*items: Any) -> tuple[list[Any], list[Any], Decision]:

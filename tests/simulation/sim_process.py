@@ -110,7 +110,7 @@ class SimShell:
         """Nothing of the process's memory."""
         self.inbox: deque[tuple[Any, str | None]] = deque()
         self.unsaved = Unsaved()
-        self.sequence = 0  # the last number given to a direct load
+        self.sequence = 0  # the last number given to a load
         self.registered: set[str] = set()
         self.links: dict[str, SimLink] = {}  # from consumers
         self.clients: dict[str, Peering] = {}  # to providers
@@ -156,7 +156,7 @@ class SimShell:
 
     def next_seq(self) -> int:
         """As RegistrarActor.sequence."""
-        self.sequence = max(self.sequence, self.catalog.seq) + 1
+        self.sequence = max(self.sequence, self.catalog.since) + 1
         return self.sequence
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
@@ -297,7 +297,7 @@ class SimShell:
             return None
         attempt = 0 if resource is None else resource.attempt
         self._asked(ask.query_id, ask.registrar, run)
-        held = self.catalog.in_flight[ask.query_id] = holding.pending(ask, attempt, ask.seq or self.next_seq())
+        held = self.catalog.in_flight[ask.query_id] = holding.pending(ask, attempt)
         return Load(held.id, held.server, held.request, self.name, held.parent, attempt, held.seq)
 
     def _asked(self, query_id: str, provider: str, run: Run | None) -> None:

@@ -26,7 +26,7 @@ class People(Trouble):
         if registrar.state not in ("up", "starting") or query_id in self.ledger.fate:
             return False
         self.asker[query_id] = name
-        ask = c.Ask(query_id, provider, server, request, "")
+        ask = c.Ask(query_id, provider, server, request, "", registrar.next_seq())
         if not (direct and self.ask_directly(registrar, ask, None)):
             registrar.ask(ask, None)
         return True

@@ -120,7 +120,7 @@ class World(People):
             run.subs += 1
             run.waits = f"{id}/{number}.{run.subs}"
             provider, server, request, *directly = place
-            ask = c.Ask(run.waits, provider, server, request, run.id)
+            ask = c.Ask(run.waits, provider, server, request, run.id, registrar.next_seq())
             if not (directly and self.ask_directly(registrar, ask, run)):
                 registrar.ask(ask, run)
             return True

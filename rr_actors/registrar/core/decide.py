@@ -137,7 +137,7 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: m.Failu
             case m.Load() if item.query_id not in decision.catalog.queries:
                 decision.cause(refuse(decision, item.origin, item.query_id, failure))
             case c.Ask():
-                decision.cause(LoadResolved(holding.pending(item, 0, 0), failure))
+                decision.cause(LoadResolved(holding.pending(item), failure))
             case c.Release():
                 decision.cause(UnloadResolved(item.query_id, failure))
             case c.ReleaseOverdue():

@@ -31,7 +31,7 @@ def ask(decision: Decision, command: Ask) -> None:
     if parent:
         resource = catalog.resources.get(parent)
         if resource is None:
-            held = pending(command, 0, 0)
+            held = pending(command)
             why = f"the resource {shortened(parent)} that asks for it is gone"
             decision.cause(LoadResolved(held, failures.withdrawn(held, why)))
             return
@@ -42,7 +42,7 @@ def ask(decision: Decision, command: Ask) -> None:
             elif known.hold is OWED:
                 decision.cause(LoadResolved(known, failures.withdrawn(known, "it is being released")))
             return
-    held = pending(command, attempt, catalog.next_seq(command.seq))
+    held = pending(command, attempt)
     look_there(decision, command.registrar)
     decision.put_here(held)
     request(decision, held.registrar, load_of(decision, held))
@@ -63,8 +63,6 @@ def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
     add(catalog.outbound, asked.registrar, id)
     if asked.parent:
         add(catalog.parts, asked.parent, id)
-    if asked.seq > catalog.seq:
-        catalog.seq = asked.seq
     unsaved.new[id] = row
     del catalog.in_flight[id]
     catalog.unfinished = None
@@ -113,9 +111,10 @@ def _unknown(query_id: str) -> Held:
     return Held(query_id, "", "", b"", None, "", "", 0, 0, PENDING, State.FATAL)
 
 
-def pending(ask: Ask, attempt: int, seq: int) -> Held:
+def pending(ask: Ask, attempt: int = 0) -> Held:
     """Return the row of a query that is asked for."""
-    return Held(ask.query_id, ask.registrar, ask.server, ask.request, None, "", ask.parent, attempt, seq, PENDING, OK)
+    place = (ask.query_id, ask.registrar, ask.server, ask.request)
+    return Held(*place, None, "", ask.parent, attempt, ask.seq, PENDING, OK)
 
 
 def load_of(decision: Decision, held: Held) -> Load:

@@ -41,7 +41,6 @@ def add_in_flight(decision: Decision, query_id: str) -> None:
     held = decision.forget(decision.catalog.in_flight, query_id)
     if held is not None:
         look_there(decision, held.registrar)
-        decision.catalog.next_seq(held.seq)
         decision.put_here(held)
         decision.note(decision.catalog.direct, query_id, True)
 

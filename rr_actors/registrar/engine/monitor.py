@@ -104,7 +104,7 @@ class RegistrarState:
         self.catalog = Catalog(name, self._commits.content(), store.epoch)
         self.epoch = store.epoch
         self.waiting: deque[tuple[Any, str | None]] = deque()
-        self.sequence = itertools.count(self.catalog.seq + 1)
+        self.sequence = itertools.count(self.catalog.since + 1)
         self.loads: dict[str, LoadWaiter] = {}
         self.unloads: dict[str, UnloadWaiter] = {}
         self.closed = False

@@ -327,7 +327,7 @@ class RegistrarActor(RegistrarState):
             catalog = Catalog(self.name, self._commits.content(), self.epoch)
             catalog.servers.update(old.servers)
             catalog.listened, catalog.in_flight = old.listened, old.in_flight
-            catalog.seq = catalog.since = max(catalog.seq, old.seq)
+            catalog.since = max(catalog.since, old.since, *(row.seq for row in old.held.values()))
             self.catalog = catalog
             self.consumers.close()  # they connect again, and reconcile
             for client in list(self.clients.values()):

@@ -170,8 +170,8 @@ class Catalog:
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
         self.unfinished: Undo | None = None  # how to undo the decision that is being applied; None between decisions
-        self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
-        self.since = self.seq  # this Catalog asked for all queries with a greater number, and knows all about them
+        # this Catalog asked for all queries with a greater number, and knows all about them
+        self.since = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
 
     def _fill_indexes(self) -> None:
         """Build the indexes that set() keeps for each row; one index at a time, as there may be a million rows."""
@@ -215,12 +215,6 @@ class Catalog:
                 entries[key] = old
         self._fill_indexes()
         return rows
-
-    def next_seq(self, given: int = 0) -> int:
-        """Return the running number of the next query that this registrar asks for: `given`, if it has one already."""
-        number = given or self.seq + 1
-        self.seq = max(self.seq, number)
-        return number
 
     def new_resource_id(self, query_id: str) -> str:
         """Return a new id for the resource that a query makes: the query's own, or one made from that.
@@ -438,7 +432,7 @@ class Decision:
     be rebuilt from another registrar: they are written behind `changes`, or a moment later.
     """
 
-    __slots__ = ("_counters", "_undo", "catalog", "changes", "effects", "later")
+    __slots__ = ("_closings_made", "_undo", "catalog", "changes", "effects", "later")
 
     def __init__(self, catalog: Catalog) -> None:
         self.catalog = catalog
@@ -446,7 +440,7 @@ class Decision:
         self.later: dict[tuple[Table, str], Change] = {}
         self.effects: list[Effect] = []
         self._undo: Undo = []
-        self._counters = (catalog.seq, catalog.closings_made)
+        self._closings_made = catalog.closings_made
         catalog.unfinished = self._undo
 
     def put(self, row: Row) -> None:
@@ -513,7 +507,7 @@ class Decision:
                 where.pop(key, None)
             else:
                 where[key] = old
-        self.catalog.seq, self.catalog.closings_made = self._counters
+        self.catalog.closings_made = self._closings_made
         self.catalog.unfinished = None
         self._undo = []
         self.changes.clear()

@@ -175,7 +175,7 @@ class ForceUnload(Command, frozen=True):
 class Ask(Command, frozen=True, gc=False):
     """Load from a provider's server, for a resource of this registrar (`parent`, "" for none).
 
-    `seq`: its running number in the order of loads; 0: the next number.
+    `seq`: its running number in the order of loads.
     """
 
     query_id: str
@@ -183,7 +183,7 @@ class Ask(Command, frozen=True, gc=False):
     server: str
     request: bytes
     parent: str
-    seq: int = 0
+    seq: int
 
 
 class Got(Command, frozen=True, gc=False):
