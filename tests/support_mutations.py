@@ -126,10 +126,9 @@ class OwesWithoutWriting(SimRegistrar):
     """A thread that releases what is on disk does not write that it is owed."""
 
     def owe(self, query_id: str, fault: str) -> bool:
-        row = holding.owed(self.catalog, query_id)
-        if fault or row is None or self.inbox:
+        if fault or self.inbox:
             return False
-        return holding.owe(self.catalog, self.unsaved, row, lambda row: True)
+        return holding.owe(self.catalog, self.unsaved, query_id, lambda row: True)
 
 
 class WritesOlderRowsOver(SimRegistrar):
@@ -394,15 +393,15 @@ def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
 def owes_what_it_had(patch: Patch) -> type[SimRegistrar]:
     """Also what was held before a crash is let go by line."""
 
-    def owed(catalog: Catalog, query_id: str) -> Any:
+    def owe(catalog: Catalog, unsaved: Unsaved, query_id: str, write: Callable[[Held], bool]) -> bool:
         since, catalog.since = catalog.since, 0
         try:
-            return original(catalog, query_id)
+            return original(catalog, unsaved, query_id, write)
         finally:
             catalog.since = since
 
-    original = holding.owed
-    patch(holding, "owed", owed)
+    original = holding.owe
+    patch(holding, "owe", owe)
     return SimRegistrar
 
 
@@ -439,11 +438,11 @@ def takes_unsaved_for_new(patch: Patch) -> type[SimRegistrar]:
 def writes_what_is_let_go(patch: Patch) -> type[SimRegistrar]:
     """That a query is held is written although it has been let go since."""
 
-    def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
-        waiting = unsaved.new.get(row.id)
-        done = original(catalog, unsaved, row, write)
+    def owe(catalog: Catalog, unsaved: Unsaved, query_id: str, write: Callable[[Held], bool]) -> bool:
+        waiting = unsaved.new.get(query_id)
+        done = original(catalog, unsaved, query_id, write)
         if waiting is not None:
-            unsaved.new[row.id] = waiting
+            unsaved.new[query_id] = waiting
         return done
 
     original = holding.owe

@@ -8,7 +8,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.core import holding, recovery
 from rr_actors.registrar.core.decide import Item, decide
 from rr_actors.registrar.model import commands as c
@@ -567,6 +566,11 @@ def test_a_load_of_which_something_was_heard_meanwhile_is_decided(meanwhile: Any
     assert registrar.catalog.in_flight == {}
 
 
+def owes(registrar: Registrar, id: str = "q") -> bool:
+    """Whether a query may be let go by the fast path."""
+    return holding.owe(registrar.catalog, Unsaved(), id, lambda row: True)
+
+
 @pytest.mark.parametrize("saved", [True, False])
 def test_what_a_thread_lets_go_by_its_line_is_gone_as_what_is_decided_of_it(saved: bool) -> None:
     fast, general = in_flight(), in_flight()
@@ -574,16 +578,15 @@ def test_what_a_thread_lets_go_by_its_line_is_gone_as_what_is_decided_of_it(save
     assert holding.hold(fast.catalog, unsaved, GOT)
     if saved:
         unsaved.clear()
-    owed = holding.owed(fast.catalog, "q")
-    assert owed is not None
+    owed = msgspec.structs.replace(fast.catalog.held["q"], hold=Hold.OWED)
     written: list[Any] = []
-    assert holding.owe(fast.catalog, unsaved, owed, lambda row: not written.append(row))
+    assert holding.owe(fast.catalog, unsaved, "q", lambda row: not written.append(row))
     general.obey(GOT)
     general.obey(c.Release("q"))
     assert everything(fast) == everything(general)
     assert written == ([owed] if saved else [])  # what was never written is written as owed a moment later
     assert unsaved.changes() == ([] if saved else [Put(owed)])
-    assert holding.owed(fast.catalog, "q") is None
+    assert not owes(fast)
 
     assert holding.forget_released(fast.catalog, unsaved, "q")
     general.decide(Unloaded("q"), "p")
@@ -597,15 +600,7 @@ def test_what_cannot_be_written_as_owed_is_held() -> None:
     unsaved = Unsaved()
     assert holding.hold(registrar.catalog, unsaved, GOT)
     unsaved.clear()
-    owed = holding.owed(registrar.catalog, "q")
-    assert owed is not None
-
-    def full(row: Any) -> bool:
-        raise CatalogError("disk full", path="")
-
-    assert not holding.owe(registrar.catalog, unsaved, owed, lambda row: False)
-    with pytest.raises(CatalogError):
-        holding.owe(registrar.catalog, unsaved, owed, full)
+    assert not holding.owe(registrar.catalog, unsaved, "q", lambda row: False)
     assert hold_of(registrar) is Hold.HELD
     assert registrar.catalog.unfinished is None
 
@@ -615,35 +610,33 @@ def test_a_release_that_is_late_or_goes_on_by_the_link_is_owed_on_disk() -> None
         registrar = in_flight()
         unsaved = Unsaved()
         assert holding.hold(registrar.catalog, unsaved, GOT)
-        owed = holding.owed(registrar.catalog, "q")
-        assert owed is not None
-        assert holding.owe(registrar.catalog, unsaved, owed, lambda row: False)
+        assert holding.owe(registrar.catalog, unsaved, "q", lambda row: False)
         registrar.obey(command)
-        assert registrar.changes == [Put(owed)]
+        assert registrar.changes == [Put(registrar.catalog.held["q"])]
 
 
 @pytest.mark.parametrize("hold", ["pending", "owed"])
 def test_what_is_not_held_is_not_let_go_by_a_line(hold: str) -> None:
     registrar = consumer(hold)
-    assert holding.owed(registrar.catalog, "q") is None
+    assert not owes(registrar)
 
 
 def test_what_is_about_to_change_is_not_let_go_by_a_line() -> None:
     held = consumer("held")
-    assert holding.owed(held.catalog, "other") is None
+    assert not owes(held, "other")
 
     before_a_crash = held.again()
-    assert holding.owed(before_a_crash.catalog, "q") is None
+    assert not owes(before_a_crash)
 
     refused = consumer("owed")
     refused.decide(UnloadRefused("q", FAILURE), "p")
     assert hold_of(refused) is Hold.HELD
-    assert holding.owed(refused.catalog, "q") is None
+    assert not owes(refused)
 
     taken = consumer("held")
     taken.decide(Noticed(Notice("e:q", "q", "app", "res", "e", State.FATAL, "", "p/cam", True), False), "p")
     assert hold_of(taken) is Hold.HELD
-    assert holding.owed(taken.catalog, "q") is None
+    assert not owes(taken)
 
 
 def test_who_lets_go_of_what_was_taken_from_him_is_not_told_that_any_more() -> None:

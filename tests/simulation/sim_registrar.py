@@ -162,25 +162,21 @@ class SimRegistrar(SimShell):
 
     def owe(self, query_id: str, fault: str) -> bool:
         """As RegistrarState.owe."""
-        row = holding.owed(self.catalog, query_id)
-        if row is None or self.inbox:
+        if self.inbox:
             return False
 
         def write(row: Held) -> bool:
             if fault == "before":
                 raise Killed
             if self.disk_is_full or fault == "error":
-                raise CatalogError("disk full")
+                return False
             self.write([Put(row)])
             self.unsaved.row_written(row)
             if fault == "after":
                 raise Killed
             return True
 
-        try:
-            return holding.owe(self.catalog, self.unsaved, row, write)
-        except CatalogError:
-            return False
+        return holding.owe(self.catalog, self.unsaved, query_id, write)
 
     def hold(self, got: c.Got) -> bool:
         """As RegistrarState.hold: what a thread has loaded by a line of its own."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from rr_actors.base.errors import CatalogError, shortened
+from rr_actors.base.errors import shortened
 from rr_actors.registrar.core import releasing
 from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, request, withdraw
 from rr_actors.registrar.model import failures
@@ -191,45 +191,32 @@ def release(decision: Decision, command: Release) -> None:
     request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
-def owed(catalog: Catalog, query_id: str) -> Held | None:
-    """Return the owed row of a query that a thread releases by its own line; None if release() has to decide it.
+def owe(catalog: Catalog, unsaved: Unsaved, query_id: str, write: Callable[[Held], bool]) -> bool:
+    """Decide Release by the fast path, with the same result as release(); return False if release() has to decide it.
+
+    If the disk has anything of the query, write(row) writes the owed row first, or returns False. If the disk has
+    nothing, the row is written a moment later, unless the query is gone by then: after an earlier crash the provider
+    says whether the query is held.
 
     release() decides queries from before a crash: a list that their provider made earlier may arrive after the answer,
     and would bring them back.
     """
     held = catalog.held.get(query_id)
     if held is None or held.hold is not HELD or held.seq <= catalog.since:
-        return None
+        return False
     if query_id in catalog.kept or query_id in catalog.ending:
-        return None
-    return replace(held, hold=OWED)
-
-
-def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
-    """Mark a query as owed, with the row that owed() has returned; return False if write() has not written it.
-
-    If the disk has anything of the query, write(row) writes it first. If it has nothing, the row is written a moment
-    later, unless the query is gone by then: after an earlier crash the provider says whether it is held. After False
-    nothing has changed.
-
-    Raises:
-        CatalogError: write() has raised it; nothing has changed.
-    """
-    id = row.id
-    catalog.unfinished = [("held", id, catalog.held[id])]
-    try:
-        if id in unsaved.new:
-            unsaved.new[id] = row
-        elif not write(row):
-            catalog.unfinished = None
-            return False
-    except CatalogError:
+        return False
+    row = replace(held, hold=OWED)
+    catalog.unfinished = [("held", query_id, held)]
+    if query_id in unsaved.new:
+        unsaved.new[query_id] = row
+    elif not write(row):
         catalog.unfinished = None
-        raise
-    catalog.held[id] = row
-    catalog.unsettled[id] = row.registrar
+        return False
+    catalog.held[query_id] = row
+    catalog.unsettled[query_id] = row.registrar
     if row.parent:
-        discard(catalog.parts, row.parent, id)
+        discard(catalog.parts, row.parent, query_id)
     catalog.unfinished = None
     return True
 

@@ -173,7 +173,7 @@ class RegistrarState:
                     return None
                 catalog.set("queries", query.id, query)
                 catalog.unfinished = None
-            except Exception:  # a full disk, or a defect: decide() will meet it again, and report it
+            except Exception:  # a defect: decide() will meet it again, and report it
                 catalog.unfinished = None
                 return None
             except BaseException:
@@ -255,14 +255,9 @@ class RegistrarState:
             catalog = self.catalog
             if catalog.unfinished is not None:
                 self.whole()
-            row = holding.owed(catalog, query_id)
-            if row is None:
-                return False
             try:
-                if not holding.owe(catalog, self._commits.unsaved, row, self._commits.commit_row):
+                if not holding.owe(catalog, self._commits.unsaved, query_id, self._commits.commit_row):
                     return False
-            except CatalogError:  # decide() will meet it again, and report it
-                return False
             except BaseException:
                 self.whole()
                 raise
@@ -620,11 +615,15 @@ class CommitLog:
             self.save_soon()
 
     def commit_row(self, row: Row) -> bool:
-        """Write one row now, or raise CatalogError; return False if rows are not written singly. With the lock."""
-        if self.row_by_row:
+        """Write one row now, or return False: decide() has to write it, or reports why that fails. With the lock."""
+        if not self.row_by_row:
+            return False
+        try:
             self._write([Put(row)])
-            self.unsaved.row_written(row)
-        return self.row_by_row
+        except CatalogError:
+            return False
+        self.unsaved.row_written(row)
+        return True
 
     def restore(self, catalog: Catalog) -> None:
         """Roll back a decision that was interrupted. From any thread, with the lock.
