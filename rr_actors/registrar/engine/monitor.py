@@ -15,8 +15,9 @@ never takes the lock of another registrar.
         catalog = state.whole()
         ...
 
-An interrupt (Ctrl-C) may stop a thread between any two instructions. The next thread that takes the lock rolls the
-unfinished decision back before it reads anything. Therefore every use of the catalog begins with whole().
+An interrupt (Ctrl-C) may stop a thread between any two instructions, and so may a defect. The next thread that takes
+the lock rolls the unfinished decision back before it reads anything. Therefore every use of the catalog begins with
+whole().
 """
 
 from __future__ import annotations
@@ -141,17 +142,13 @@ class RegistrarState:
             CatalogError: the changes were not written. Nothing has happened, and no other thread has seen any of it.
         """
         with self.lock:
+            decision = decide(self.whole(), items)
             try:
-                decision = decide(self.whole(), items)
-                try:
-                    self._commits.commit(decision)
-                except CatalogError:
-                    decision.undo()
-                    raise
-                decision.close()
-            except BaseException:  # an interrupt at any instruction, or a defect: a decision that was undone is whole
-                self.whole()
+                self._commits.commit(decision)
+            except CatalogError:
+                decision.undo()
                 raise
+            decision.close()
             return decision
 
     def join(self, load: Load) -> Loaded | None:
@@ -168,17 +165,14 @@ class RegistrarState:
                 return None
             try:
                 catalog.unfinished = [("queries", query.id, ABSENT)]
-                if not self._commits.commit_row(query):
-                    catalog.unfinished = None
-                    return None
-                catalog.set("queries", query.id, query)
+                written = self._commits.commit_row(query)
+                if written:
+                    catalog.set("queries", query.id, query)
                 catalog.unfinished = None
             except Exception:  # a defect: decide() will meet it again, and report it
-                catalog.unfinished = None
                 return None
-            except BaseException:
-                self.whole()
-                raise
+            if not written:
+                return None
             resource = catalog.resources[query.resource_id]
             return Loaded(query.id, resource.id, resource.response or b"")
 
@@ -217,15 +211,11 @@ class RegistrarState:
                 self.whole()
             if self.waiting:
                 return False
-            try:
-                held = holding.hold(catalog, self._commits.unsaved, answer)
-                if held:
-                    self.loads.pop(answer.query_id, None)
-                    if not self._commits.saving:
-                        self._commits.save_soon()
-            except BaseException:
-                self.whole()
-                raise
+            held = holding.hold(catalog, self._commits.unsaved, answer)
+            if held:
+                self.loads.pop(answer.query_id, None)
+                if not self._commits.saving:
+                    self._commits.save_soon()
             return held
 
     def forget_refused(self, query_id: str) -> bool:
@@ -255,14 +245,10 @@ class RegistrarState:
             catalog = self.catalog
             if catalog.unfinished is not None:
                 self.whole()
-            try:
-                if not holding.owe(catalog, self._commits.unsaved, query_id, self._commits.commit_row):
-                    return False
-            except BaseException:
-                self.whole()
-                raise
-            self.unloads[query_id] = answered_by_line
-            return True
+            is_owed = holding.owe(catalog, self._commits.unsaved, query_id, self._commits.commit_row)
+            if is_owed:
+                self.unloads[query_id] = answered_by_line
+            return is_owed
 
     def forget_released(self, query_id: str) -> bool:
         """Forget a query that its provider has released after owe(); return False if Unloaded has to be decided."""
@@ -274,15 +260,11 @@ class RegistrarState:
             catalog = self.catalog
             if catalog.unfinished is not None:
                 self.whole()
-            try:
-                gone = holding.forget_released(catalog, self._commits.unsaved, query_id)
-                if gone:
-                    self.unloads.pop(query_id, None)
-                    if not self._commits.saving:
-                        self._commits.save_soon()
-            except BaseException:
-                self.whole()
-                raise
+            gone = holding.forget_released(catalog, self._commits.unsaved, query_id)
+            if gone:
+                self.unloads.pop(query_id, None)
+                if not self._commits.saving:
+                    self._commits.save_soon()
             return gone
 
     def down(self) -> RegistrarDown:

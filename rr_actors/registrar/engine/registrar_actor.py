@@ -155,7 +155,8 @@ class RegistrarActor(RegistrarState):
         for unload_waiter in unloads.values():
             steps.take("telling who unloads", unload_waiter, down)
         with self.lock:
-            told = self.catalog.outbound.keys() <= self.catalog.up.keys()
+            catalog = self.whole()
+            told = catalog.outbound.keys() <= catalog.up.keys()
         steps.take("closing its catalog", lambda: self._commits.close(erase=erase and told))
         self.lock_in_use(in_use=False)
         steps.end(f"registrar {self.name!r}: not closed altogether")
