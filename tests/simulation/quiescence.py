@@ -129,7 +129,6 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         "waiting",
         "recovering",
         "closings",
-        "closing_of",
         "owners",
         "leaving",
         "hearing",

@@ -226,7 +226,7 @@ def forget_released(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
     row = catalog.held.get(query_id)
     if row is None:
         return True
-    if row.hold is not OWED or query_id in catalog.direct or query_id in catalog.closing_of or query_id in catalog.kept:
+    if row.hold is not OWED or query_id in catalog.direct or query_id in catalog.closings or query_id in catalog.kept:
         return False
     catalog.unfinished = [("held", query_id, row)]
     del catalog.held[query_id], catalog.unsettled[query_id]

@@ -82,43 +82,33 @@ def release_parts(
     ids = [id for id in parts_of(decision, resource_id) if catalog.held[id].attempt != keep_attempt]
     for id in ids:
         owe(decision, catalog.held[id], "withdrawn, what asked for it is gone")
-    if not ids:
-        decision.effects += after
-        return
-    catalog.closings_made += 1
-    number = catalog.closings_made
-    decision.note(catalog.closings, number, Closing(tuple(ids), tuple(after)))
-    _step(decision, number, tuple(ids))
+    _release_next(decision, ids, tuple(after))
 
 
 def released(decision: Decision, held_id: str) -> None:
     """Go on with the next part, because the release of this one was answered, or cannot be."""
-    catalog = decision.catalog
-    number = decision.forget(catalog.closing_of, held_id)
-    if number is not None:
-        _step(decision, number, catalog.closings[number].remaining[1:])
+    closing = decision.forget(decision.catalog.closings, held_id)
+    if closing is not None:
+        _release_next(decision, closing.remaining, closing.after)
 
 
 def provider_lost(decision: Decision, registrar: str) -> None:
     """Go on with all releases that wait for this provider, because it does not answer now."""
     catalog = decision.catalog
-    waiting = [id for id in catalog.closing_of if id in catalog.held and catalog.held[id].registrar == registrar]
+    waiting = [id for id in catalog.closings if id in catalog.held and catalog.held[id].registrar == registrar]
     for id in waiting:
         released(decision, id)
 
 
-def _step(decision: Decision, number: int, remaining: tuple[str, ...]) -> None:
+def _release_next(decision: Decision, ids: Sequence[str], after: tuple[Effect, ...]) -> None:
+    """Send the release of the first of these parts whose provider is up; if there is none, cause `after`."""
     catalog = decision.catalog
-    closing = catalog.closings[number]
-    while remaining:
-        held = catalog.held.get(remaining[0])
+    for place, id in enumerate(ids, 1):
+        held = catalog.held.get(id)
         if held is not None and held.registrar in catalog.up:
-            decision.note(catalog.closings, number, replace(closing, remaining=remaining))
-            decision.note(catalog.closing_of, held.id, number)
-            decision.cause(Request(held.registrar, Unload(held.id, catalog.name)))
+            decision.note(catalog.closings, id, Closing(tuple(ids[place:]), after))
+            decision.cause(Request(held.registrar, Unload(id, catalog.name)))
             return
         if held is not None:
             decision.cause(Connect(held.registrar))
-        remaining = remaining[1:]
-    decision.forget(catalog.closings, number)
-    decision.effects += closing.after
+    decision.effects += after

@@ -560,7 +560,6 @@ class CommitLog:
         self.saving = False  # from when a save is asked for until it begins
         self._save_timer: TimerHandle | None = None
         self._tidying = False  # from when tidying is asked for until it has ended
-        self._tidy_timer: TimerHandle | None = None
         self.count = 0
         self.timed = 0
         self.timed_s = 0.0
@@ -673,7 +672,7 @@ class CommitLog:
             with contextlib.suppress(Unavailable):  # the process is stopping, and soon closes this registrar
                 self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
         else:
-            self._tidy_timer = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self.count)
+            self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self.count)
 
     def _tidied(self, _result: None, error: BaseException | None) -> None:
         self._tidying = False
@@ -684,14 +683,13 @@ class CommitLog:
             if error is None:
                 self._tidy_when_quiet()
             else:
-                self._tidy_timer = self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
+                self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
 
     def close(self, *, erase: bool) -> None:
         """Write unsaved changes and close the store; with `erase`, remove it. Log every failure."""
         self._closed = True
-        for timer in (self._save_timer, self._tidy_timer):
-            if timer is not None:
-                timer.cancel()
+        if self._save_timer is not None:
+            self._save_timer.cancel()
         try:
             self._save()
         except Exception:  # a CatalogError, or a defect that has ended the registrar: close the store all the same

@@ -70,7 +70,7 @@ class Server(msgspec.Struct, frozen=True):
 
 
 class Closing(msgspec.Struct, frozen=True):
-    """Releases that are sent one after another, newest first; the effects `after` follow the last of them."""
+    """Releases to be sent after the one in progress, newest first; the effects `after` follow the last of them."""
 
     remaining: tuple[str, ...]
     after: tuple[Effect, ...]
@@ -103,7 +103,7 @@ class Catalog:
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: queries whose Load was refused
       lately. `unanswered`: queries whose Unload has come over the present link and has not been answered.
     - `recovering`: resources whose recover callback runs, with the messages parked until it has returned.
-    - `closings`, `closing_of`: releases in progress.
+    - `closings`: releases of parts in progress, by the query whose release has been sent.
     - `direct`: queries whose Load a thread has sent by its own connection, which has not answered yet; False: the query
       has ended by another way. `fresh`: queries that such a connection answered while the provider's link was down: the
       list sent over the next link may be older. `in_flight`: the rows of loads sent by such connections, until a
@@ -151,8 +151,7 @@ class Catalog:
         self.refused: dict[str, Failure] = {}
         self.unanswered: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
-        self.closings: dict[int, Closing] = {}
-        self.closing_of: dict[str, int] = {}
+        self.closings: dict[str, Closing] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}
         self.told: dict[str, bool] = dict.fromkeys(self.notices, True)
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
@@ -168,7 +167,6 @@ class Catalog:
         self.in_flight: dict[str, Held] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
-        self.closings_made = 0
         self.unfinished: Undo | None = None  # how to undo the decision that is being applied; None between decisions
         # this Catalog asked for all queries with a greater number, and knows all about them
         self.since = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
@@ -432,7 +430,7 @@ class Decision:
     be rebuilt from another registrar: they are written behind `changes`, or a moment later.
     """
 
-    __slots__ = ("_closings_made", "_undo", "catalog", "changes", "effects", "later")
+    __slots__ = ("_undo", "catalog", "changes", "effects", "later")
 
     def __init__(self, catalog: Catalog) -> None:
         self.catalog = catalog
@@ -440,7 +438,6 @@ class Decision:
         self.later: dict[tuple[Table, str], Change] = {}
         self.effects: list[Effect] = []
         self._undo: Undo = []
-        self._closings_made = catalog.closings_made
         catalog.unfinished = self._undo
 
     def put(self, row: Row) -> None:
@@ -507,7 +504,6 @@ class Decision:
                 where.pop(key, None)
             else:
                 where[key] = old
-        self.catalog.closings_made = self._closings_made
         self.catalog.unfinished = None
         self._undo = []
         self.changes.clear()
