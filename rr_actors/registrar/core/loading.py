@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from rr_actors.registrar.core.callback_runs import end_limit, limit_load, running, start_load
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
 from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, request, withdraw
+from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
 from rr_actors.registrar.model import failures
@@ -29,7 +30,6 @@ from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.registrar.model.rows import LOADED, LOADING, OK, PENDING, QUEUED, Query, Resource
 
 _NONE: dict[bytes, str] = {}
-_WAITS = (LOADING, QUEUED)
 
 
 def load(decision: Decision, message: Load) -> None:
@@ -109,7 +109,7 @@ def _load_again(decision: Decision, message: Load, query: Query) -> None:
     resource = catalog.resources[query.resource_id]
     if resource.id in catalog.recovering:
         park(decision, resource.id, message)
-    elif resource.phase in _WAITS:
+    elif is_busy(catalog, resource):
         decision.note(catalog.waiting, query.id, resource.id)
         _look_for_ring(decision, message, resource)
     else:
@@ -143,16 +143,15 @@ def load_done(decision: Decision, done: LoadDone) -> None:
     decision.cause(Happened("loaded", resource.id, resource.server, ""))
     end_limit(decision, resource)
     holders = catalog.holders.get(resource.id)
-    if not holders:
+    if holders:
+        for query_id in holders:
+            if decision.forget(catalog.waiting, query_id) is not None:
+                origin = catalog.queries[query_id].origin
+                decision.cause(Reply(origin, Loaded(query_id, resource.id, done.response)))
+        # The owner may have unloaded it while it was loading; its present holders came after that.
+        decision.effects += answers_to_owners(decision, resource, None)
+    else:
         retire(decision, resource)
-        start_deferred(decision, resource.id)
-        return
-    for query_id in holders:
-        if decision.forget(catalog.waiting, query_id) is not None:
-            origin = catalog.queries[query_id].origin
-            decision.cause(Reply(origin, Loaded(query_id, resource.id, done.response)))
-    # The owner may have unloaded it while it was loading; its present holders came after that.
-    decision.effects += answers_to_owners(decision, resource, None)
     start_deferred(decision, resource.id)
 
 
@@ -199,8 +198,7 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     """Pass a probe on from this resource to all that it waits for."""
     catalog = decision.catalog
     ring = [*message.ring, catalog.origin_of(resource)]
-    waits = resource.phase in _WAITS or resource.id in catalog.recovering
-    if not waits or len(ring) > _RING_LIMIT:
+    if not is_busy(catalog, resource) or len(ring) > _RING_LIMIT:
         return
     if resource.id == message.waiter:
         add_in_flight(decision, message.blocked)

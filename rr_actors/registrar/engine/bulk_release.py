@@ -32,16 +32,11 @@ class Releases:
         self._registrar = registrar
         self._ended = ended
         self._waiting: dict[str, deque[str]] = {}
-        gone: list[str] = []
         with registrar.lock:
             held = registrar.whole().held
             for query_id in query_ids:
-                if query_id in held:
-                    self._waiting.setdefault(held[query_id].registrar, deque()).append(query_id)
-                else:
-                    gone.append(query_id)
-        for query_id in gone:
-            ended(query_id, None)
+                provider = held[query_id].registrar if query_id in held else ""  # it is gone: nothing is to be done
+                self._waiting.setdefault(provider, deque()).append(query_id)
         for queue in self._waiting.values():
             self._begin(queue, AT_A_TIME)
 

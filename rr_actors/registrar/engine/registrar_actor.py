@@ -379,7 +379,7 @@ class Servers:
             text = f"server {server.origin}: registered already; unregister it first, or take another name"
             raise NameTaken(text, name=name)
         self._by_name[name] = server
-        registrar.consumers.tell_all(Described(name, server.types))
+        registrar.consumers.tell_all(Described(name, server.facts.types))
         if old is None:
             registrar.post(c.Register(server.facts, new_id()))
         else:

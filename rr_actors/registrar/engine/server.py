@@ -211,7 +211,6 @@ class ServerActor:
     def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
         self.spec = spec
         self.restored = False  # whether it came from the catalog; then a second registration replaces it
-        self.types = types
         has = spec.status is not None, spec.recover is not None
         limits = spec.linger_s, spec.load_timeout_s, spec.recovery or "keep"
         self.facts = Server(spec.name, *limits, *has, types)  # what decisions need to know
