@@ -20,7 +20,7 @@ from typing import Any
 from rr_actors.base.errors import Unavailable, UsageError, name_of_class, text_of
 from rr_actors.registrar.model.messages import readable
 from rr_actors.runtime import event_loop
-from rr_actors.runtime.user_loop import is_coroutine
+from rr_actors.runtime.user_loop import closing, is_coroutine
 from rr_actors.runtime.workers import is_async
 
 _PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
@@ -90,7 +90,9 @@ def described(
             answer = fn(*args)
         except BaseException as error:
             raise Raised(error, describe) from None
-        return after(answer) if is_coroutine(answer) else answer  # a wrapper of an async function gives a coroutine
+        if is_coroutine(answer):  # `fn` is a wrapper of an async function
+            return closing(answer, after(answer))
+        return answer
 
     return run_async if awaits else run
 

@@ -6,6 +6,7 @@ import asyncio
 import functools
 import logging
 import threading
+import weakref
 from collections.abc import Callable, Coroutine
 from contextvars import Context
 from types import CoroutineType
@@ -37,6 +38,15 @@ def log_exception(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> 
 def is_coroutine(value: object) -> TypeGuard[Coroutine[Any, Any, Any]]:
     """Return whether `value` is the result of calling an `async def` function."""
     return type(value) is CoroutineType
+
+
+def closing(inner: Coroutine[Any, Any, Any], outer: Coroutine[Any, Any, Any]) -> Coroutine[Any, Any, Any]:
+    """Return `outer`, which awaits `inner`. If it is closed before it begins, close `inner` too.
+
+    Otherwise Python would warn that the user's coroutine was never awaited.
+    """
+    weakref.finalize(outer, inner.close).atexit = False
+    return outer
 
 
 def start_loop_thread(run: Callable[[Callable[[], object]], None], name: str) -> threading.Thread:

@@ -20,7 +20,7 @@ import msgspec
 import pytest
 
 import rr_actors as rr
-from support import Calls, Gate, Workshop, eventually, hang, messages, pid_of, serve
+from support import LIMIT_S, Calls, Gate, Workshop, eventually, hang, messages, pid_of, serve
 from support_managers import Order, Shop
 from support_slow import few_now
 
@@ -256,6 +256,31 @@ def test_load_callbacks_may_be_coroutine_functions(app: rr.Registrar, provider: 
     assert query.response == "made x"
     query.unload()
     assert unloaded.items == [("x", "made x")]
+
+
+def test_a_load_callback_that_gives_a_coroutine_after_the_systems_end_leaves_no_warning(
+    start: Callable[..., rr.System], recwarn: pytest.WarningsRecorder
+) -> None:
+    threads, gate = Calls(), Gate()
+
+    async def too_late() -> None: ...
+
+    def load(_request: Any) -> Any:
+        threads(threading.current_thread())
+        gate()
+        return too_late()
+
+    system = start(config=rr.SystemConfig(stop_timeout_s=0.1))
+    provider = system.open_registrar("provider")
+    provider.register_server("thing", load)
+    provider.load("provider/thing", "x", block=False)
+    gate.wait_arrived()
+    system.stop()
+    gate.open()
+    (thread,) = threads
+    thread.join(LIMIT_S)
+    gc.collect()
+    assert [str(warning.message) for warning in recwarn] == []
 
 
 def test_a_query_is_the_same_wherever_it_is_seen(app: rr.Registrar, provider: rr.Registrar) -> None:

@@ -6,16 +6,19 @@ import asyncio
 import contextvars
 import errno
 import functools
+import gc
 import inspect
 import logging
 import os
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from rr_actors.base.errors import MailboxFull, Unavailable
+from rr_actors.runtime.callback_errors import described
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.thread_wakeup import EventBell
 from rr_actors.runtime.user_loop import is_coroutine, start_task
@@ -354,9 +357,6 @@ def test_idle_threads_end_after_a_while() -> None:
 
 
 def test_an_idle_thread_keeps_nothing_of_what_it_ran(workers: Workers) -> None:
-    import gc
-    import weakref
-
     class Big:
         def __call__(self) -> None: ...
 
@@ -749,7 +749,10 @@ def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: p
     eventually(lambda: workers.threads == 0)
 
 
-def test_a_coroutine_that_comes_after_the_end_ends_its_thread_in_order(dispatcher: Dispatcher) -> None:
+@pytest.mark.parametrize("wrap", [lambda fn: fn, lambda fn: described(fn, "the callback")], ids=["plain", "described"])
+def test_a_coroutine_that_comes_after_the_end_is_closed_and_ends_its_thread_in_order(
+    dispatcher: Dispatcher, wrap: Callable[[Any], Any], recwarn: pytest.WarningsRecorder
+) -> None:
     gate, workers = Gate(), dispatcher.workers
 
     async def too_late() -> None: ...
@@ -758,12 +761,14 @@ def test_a_coroutine_that_comes_after_the_end_ends_its_thread_in_order(dispatche
         gate()
         return too_late()
 
-    workers.submit(wrapper)
+    workers.submit(wrap(wrapper))
     gate.wait_arrived()
     workers.close(timeout_s=0.0)
     gate.open()
 
     eventually(lambda: workers.threads == 0)
+    gc.collect()
+    assert [str(warning.message) for warning in recwarn] == []
 
 
 def test_a_coroutine_whose_task_is_cancelled_before_it_begins_is_closed() -> None:

@@ -41,7 +41,7 @@ from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.messages import Failure, Load, failure_of, readable
 from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, Notice, Phase, Resource
 from rr_actors.runtime.callback_errors import Raised, described, log_raised, traceback_of
-from rr_actors.runtime.user_loop import Done, is_coroutine
+from rr_actors.runtime.user_loop import Done, closing, is_coroutine
 from rr_actors.runtime.workers import is_async
 
 
@@ -437,7 +437,7 @@ def _wrap(
         begin(current)
         answer = callback(*arguments(resource), *more)
         if is_coroutine(answer):  # the callback is a wrapper or a lambda around an async function
-            return _then(answer, result)
+            return closing(answer, _then(answer, result))
         return result(answer)
 
     return run
