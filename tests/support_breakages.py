@@ -235,7 +235,7 @@ def _not_swept() -> None:
 
 def _no_lifeline() -> None:
     replace(lifeline.hold, lambda lifeline, parent_pid: None)
-    override(ChildProcess, "_lost", lambda lost: lambda self: None)
+    override(ChildProcess, "terminate", lambda terminate: lambda self: None)
     override(Monkey, "_kill_crew", lambda kill: Monkey._kill_supervisor)  # so that there are such parents
 
 
@@ -305,7 +305,7 @@ BREAKAGES = {
     ),
     "children outlive their parent": Breakage(
         "fencing",
-        "lifeline.hold and ChildProcess._lost do nothing",
+        "lifeline.hold and ChildProcess.terminate do nothing",
         _no_lifeline,
         ("is left", "standstill", "does not come back", *_LOST),
     ),

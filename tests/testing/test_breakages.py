@@ -63,6 +63,12 @@ def _run(name: str, seed: int, directory: Path, limit_s: float) -> dict[str, Any
     return json.loads(report.read_text())
 
 
+def test_what_each_of_them_breaks_is_there() -> None:
+    program = "from support_breakages import BREAKAGES\nfor breakage in BREAKAGES.values():\n    breakage.apply()"
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY / "tests", env=environment, check=True)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(180)
 @pytest.mark.parametrize("name", _of_today())
