@@ -17,7 +17,8 @@ from multiprocessing import util
 from typing import Any
 
 from rr_actors.runtime.processes import lifeline
-from rr_actors.runtime.processes.process import Inherited, Spawner
+from rr_actors.runtime.processes.fork_server import Inherited
+from rr_actors.runtime.processes.process import Spawner
 
 
 def _say(control: socket.socket, **facts: Any) -> None:

@@ -8,10 +8,11 @@ the user loop they would hold up all other coroutines.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import traceback
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
@@ -71,17 +72,10 @@ def described(
         text = f"{what}: expected a callable, got one of {name_of_class(type(fn))} whose attributes cannot be read"
         raise UsageError(f"{text}: {text_of(error)}") from None
 
-    async def after(coroutine: Coroutine[Any, Any, Any]) -> Any:
+    async def run_async(*args: Any, begin: Callable[..., Any] = fn) -> Any:
         try:
-            return await coroutine
+            return await begin(*args)
         except BaseException as error:  # of any class: it is the callback's error
-            raised = await _raised(error, describe)
-        raise raised from None
-
-    async def run_async(*args: Any) -> Any:
-        try:
-            return await fn(*args)
-        except BaseException as error:
             raised = await _raised(error, describe)
         raise raised from None
 
@@ -91,7 +85,7 @@ def described(
         except BaseException as error:
             raise Raised(error, describe) from None
         if is_coroutine(answer):  # `fn` is a wrapper of an async function
-            return closing(answer, after(answer))
+            return closing(answer, run_async(begin=lambda: answer))
         return answer
 
     return run_async if awaits else run
@@ -99,8 +93,7 @@ def described(
 
 async def _raised(error: BaseException, describe: Callable[[BaseException], Any]) -> Raised:
     """Describe a coroutine's exception in a worker; by its class alone if its text hangs."""
-    if (coming := _described_elsewhere(error, describe)) is None:
-        return Raised(error, describe)
+    coming = _described_elsewhere(error, describe)
     await asyncio.wait((asyncio.wrap_future(coming),), timeout=TEXT_LIMIT_S)
     return coming.result() if coming.done() else Raised(_unspoken(error), describe)
 
@@ -113,24 +106,24 @@ def raised_by(error: BaseException) -> Raised:
     process = event_loop.current()
     if process is None or not process.may_block():
         return Raised(error)
-    if (coming := _described_elsewhere(error, _nothing_more)) is None:
-        return Raised(error)
     try:
-        return coming.result(TEXT_LIMIT_S)
+        return _described_elsewhere(error, _nothing_more).result(TEXT_LIMIT_S)
     except TimeoutError:
         return Raised(_unspoken(error))
 
 
-def _described_elsewhere(error: BaseException, describe: Callable[[BaseException], Any]) -> Future[Raised] | None:
-    """Let a worker describe the error, and return a future for the result; None if no worker is left."""
-    process = event_loop.current()
-    if process is None:
-        return None
+def _described_elsewhere(error: BaseException, describe: Callable[[BaseException], Any]) -> Future[Raised]:
+    """Let a worker describe the error, and return a future for the result; describe it here if no worker is left."""
     coming: Future[Raised] = Future()
-    try:
-        process.workers.in_thread(lambda: coming.set_result(Raised(error, describe)), beyond_limit=True)
-    except Unavailable:
-        return None
+
+    def work() -> None:
+        coming.set_result(Raised(error, describe))
+
+    with contextlib.suppress(Unavailable):
+        if (process := event_loop.current()) is not None:
+            process.workers.in_thread(work, beyond_limit=True)
+            return coming
+    work()
     return coming
 
 

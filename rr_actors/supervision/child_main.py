@@ -19,7 +19,7 @@ from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable, text_of
 from rr_actors.runtime import event_loop, interpreter
-from rr_actors.runtime.processes.process import Inherited
+from rr_actors.runtime.processes.fork_server import Inherited
 from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.heartbeat import Health
@@ -76,12 +76,12 @@ class ChildProcess:
         self._shutdown_s: Shutdown  # from the specification
         self._channel: control.Channel | None = None
         self._hosted: Hosted | None = None
-        self._told_to_start = asyncio.Event()
+        loop = self.node.dispatcher.loop
+        self._told_to_start: asyncio.Future[None] = loop.create_future()
+        self._told_to_stop: asyncio.Future[None] = loop.create_future()
         self._stop: control.Stop | None = None
         self._is_limited = False  # the parent limits the stops that it asks for
-        self._told_to_stop = asyncio.Event()
-        self._ended = asyncio.Event()
-        self._report: ExitReport | None = None
+        self._report: asyncio.Future[ExitReport] = loop.create_future()  # of an actor that has ended by itself
 
     async def live(self) -> int:
         """Run the child until its end, and return the exit code."""
@@ -102,11 +102,16 @@ class ChildProcess:
     def terminate(self) -> None:
         """Stop the child gracefully, after SIGTERM or the loss of the supervisor."""
         if self._stop is None:
-            self._stop, self._is_limited = control.Stop(), True
-        self._told_to_stop.set()
+            self._is_limited = True
+            self._stop_as(control.Stop())
+
+    def _stop_as(self, stop: control.Stop) -> None:
+        self._stop = stop
+        if not self._told_to_stop.done():
+            self._told_to_stop.set_result(None)
 
     async def _live(self) -> int:
-        await _first(self._told_to_start, self._told_to_stop)
+        await asyncio.wait((self._told_to_start, self._told_to_stop), return_when=asyncio.FIRST_COMPLETED)
         if self._stop is not None:
             return self._leave(ExitReport("shutdown", "stopped before it was started"))
         try:
@@ -119,18 +124,16 @@ class ChildProcess:
             self._say(await self.node.dispatcher.workers.run(_failed, error))
             return 1
         self._say(control.Ready())
-        await _first(self._told_to_stop, self._ended)
-        return self._leave(self._report if self._report is not None else await self._stop_actor())
+        await asyncio.wait((self._told_to_stop, self._report), return_when=asyncio.FIRST_COMPLETED)
+        return self._leave(self._report.result() if self._report.done() else await self._stop_actor())
 
     async def _start(self) -> bool:
         spec: ChildSpec = await self.node.dispatcher.workers.run(pickling.loads, self._spec)
         self._shutdown_s = spec.shutdown_s
         cls, args, kwargs = target_of(spec)
-        self._hosted = prepare(self.node, cls, self._path, self._exited, once=spec.restart == "temporary")
+        self._hosted = prepare(self.node, cls, self._path, self._report.set_result, once=spec.restart == "temporary")
         starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent has the time limit
-        stopping = asyncio.ensure_future(self._told_to_stop.wait())
-        await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
-        stopping.cancel()
+        await asyncio.wait((starting, self._told_to_stop), return_when=asyncio.FIRST_COMPLETED)
         if not starting.done():
             self._hosted.cut_short()
         return await starting
@@ -162,11 +165,10 @@ class ChildProcess:
     def _received(self, message: control.Message) -> None:
         match message:
             case control.Start():
-                self._told_to_start.set()
+                self._told_to_start.set_result(None)
             case control.Stop():
                 self.node.stopping = f"{self._path} is being stopped"
-                self._stop = message
-                self._told_to_stop.set()
+                self._stop_as(message)
             case control.Ping():
                 self._say(control.Pong(self._health.trouble()))
             case _:
@@ -179,10 +181,6 @@ class ChildProcess:
         configs = [registrar.config for registrar in node.registrars.values()]
         catalogs = [config.catalog_path(state_dir).parent for config in configs if config.durability != "none"]
         return [Path(state_dir), *catalogs]
-
-    def _exited(self, report: ExitReport) -> None:
-        self._report = report
-        self._ended.set()
 
     def _send_log(self, event: dict[str, Any]) -> bool:
         """Send a log record as news, from any thread. Return False if that is not possible any more."""
@@ -203,13 +201,6 @@ class ChildProcess:
     def _say(self, message: control.Message) -> None:
         if self._channel is not None:
             self._channel.send(message)
-
-
-async def _first(*events: asyncio.Event) -> None:
-    waiting = [asyncio.ensure_future(event.wait()) for event in events]
-    await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-    for future in waiting:
-        future.cancel()
 
 
 def _failed(error: Exception) -> control.Failed:

@@ -41,12 +41,10 @@ from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spe
 from rr_actors.supervision.core.state import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
-from rr_actors.supervision.event_history import Record, Records
+from rr_actors.supervision.event_history import Records
 from rr_actors.supervision.import_guard import check_children_can_import
 from rr_actors.system.hosting.hosted import Place, check_hostable
 from rr_actors.wire.name_service import Directory, Status, actor_key
-
-__all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
 
 logger = logging.getLogger("rr_actors.supervision")
 

@@ -8,7 +8,6 @@ import re
 import resource
 import signal
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -86,12 +85,10 @@ def test_a_manager_that_freezes_while_it_starts_is_replaced_within_its_heartbeat
     start: Start, workshop: Workshop
 ) -> None:
     system = start(rr.ChildSpec(Frozen, id="maker", args=(str(workshop.root),), heartbeat_s=1.0))
-    began = time.monotonic()
     kill(system, "maker")
 
     workshop.wait("started", 2, 20.0)  # in the fourth start: two have frozen
 
-    assert time.monotonic() - began < 10.0
     frozen = _records(system, "start_failed")
     assert len(frozen) == 2
     assert all("hung: its loop had not answered" in record.detail for record in frozen)
@@ -196,10 +193,8 @@ def test_a_fork_server_that_is_frozen_is_replaced(monkeypatch: pytest.MonkeyPatc
         server = int(Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[1])
         os.kill(server, signal.SIGSTOP)
 
-        began = time.monotonic()
-        _started(spawner)
+        _started(spawner)  # if it had waited for the frozen server to the end of its own time limit, it would fail
 
-        assert time.monotonic() - began < 5.0
         assert not lives(server)
         assert lives(process.pid)
         process.kill()

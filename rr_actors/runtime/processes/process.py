@@ -21,9 +21,7 @@ from typing import NamedTuple
 from rr_actors.base.errors import StartFailed
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes import fork_server, lifeline
-from rr_actors.runtime.processes.fork_server import ForkServer, Inherited
-
-__all__ = ["PRELOAD", "Exited", "Inherited", "Process", "Spawner", "keep_standard_fds"]
+from rr_actors.runtime.processes.fork_server import ForkServer
 
 PRELOAD = ("rr_actors.supervision.child_main",)
 """The modules that a fork server imports before it forks."""
