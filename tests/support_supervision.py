@@ -12,9 +12,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import pykka
 
@@ -30,21 +29,7 @@ from rr_actors.supervision.supervisor import Child, SupervisorRef, target_of
 from rr_actors.system.hosting.hosted import Hosted, prepare
 from rr_actors.system.hosting.node import Node, SystemInfo
 from rr_actors.wire.name_service import StateDir, open_state_dir
-
-LIMIT_S = 10.0
-
-T = TypeVar("T")
-
-
-def eventually(predicate: Callable[[], T], what: str = "", within_s: float = LIMIT_S) -> T:
-    """The first true value of `predicate`."""
-    deadline = time.monotonic() + within_s
-    while True:
-        value = predicate()
-        if value:
-            return value
-        assert time.monotonic() < deadline, f"not within {within_s:g} s: {what or predicate}"
-        time.sleep(0.002)
+from support import eventually
 
 
 class Tree:
@@ -125,7 +110,7 @@ class Tree:
             child = self.child(path)
             return child.pid if child.state == "running" and child.pid != not_ else None
 
-        pid = eventually(running, f"{path} running in another process than {not_}")
+        pid = eventually(running, what=f"{path} running in another process than {not_}")
         assert pid is not None
         return pid
 

@@ -17,7 +17,7 @@ import pytest
 import rr_actors as rr
 from support import TEST_PATHS, Workshop, hang
 
-HEARTBEAT_S = 0.4
+HEARTBEAT_S = 1.0  # a busy machine may not let a process run for half a second
 STILL_S = 3.0  # longer than any heartbeat or time limit here
 
 

@@ -41,8 +41,8 @@ from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.wire.name_service import Entry, Status, actor_key, open_state_dir, registrar_key
-from support import Gate, lives, quickly, wait_gone
-from support_supervision import Idle, Log, SlowToRegister, StuckManager, Threaded, Tree, Worker, eventually, let_go
+from support import Gate, eventually, lives, quickly, wait_gone
+from support_supervision import Idle, Log, SlowToRegister, StuckManager, Threaded, Tree, Worker, let_go
 
 Plant = Callable[..., Tree]
 both = pytest.mark.parametrize("placement", ["process", "thread"])
@@ -83,7 +83,7 @@ def worker(
 def run_after(tree: Tree, path: str, run: int) -> int:
     """The number of the child's present run, once there is one after `run`."""
     return eventually(
-        lambda: tree.run(path) > run and tree.child(path).state == "running" and tree.run(path), f"{path} up again"
+        lambda: tree.run(path) > run and tree.child(path).state == "running" and tree.run(path), what=f"{path} up again"
     )
 
 
@@ -440,7 +440,7 @@ def test_the_strategy_decides_who_is_started_again(
 ) -> None:
     tree = plant(*(worker(log, id, placement) for id in "abc"), strategy=strategy)
     tree.ref("root/b").tell("fail")
-    eventually(lambda: len(log.lines()) == 3 + len(happened), f"{happened} in {log.lines()}")
+    eventually(lambda: len(log.lines()) == 3 + len(happened), what=f"{happened} in {log.lines()}")
     assert log.lines()[3:] == happened
     eventually(lambda: all(child.state == "running" for child in tree.supervisor().which_children()))
 
@@ -611,7 +611,7 @@ def test_a_supervisor_that_gives_up_is_restarted_by_its_own(plant: Plant, log: L
     inner = Supervisor([worker(log, "a"), worker(log, "b")], id="inner", max_restarts=0, placement=placement)
     tree = plant(inner)
     tree.kill("root/inner/a")
-    eventually(lambda: log.lines()[2:] == ["stop b", "start a", "start b"], f"{log.lines()}")
+    eventually(lambda: log.lines()[2:] == ["stop b", "start a", "start b"], what=f"{log.lines()}")
     eventually(lambda: tree.records("restarted"))
     (record,) = tree.records("exited")
     assert (record.path, record.reason) == ("root/inner", "shutdown")
@@ -830,7 +830,7 @@ def test_random_kills_and_calls_leave_a_tree_that_is_whole(plant: Plant, log: Lo
                     supervisor.which_children()
         except (UsageError, Unavailable, pykka.ActorDeadError, ProcessLookupError, StartFailed, KeyError):
             continue  # the tree was in the middle of something: that is what this is about
-    eventually(lambda: all(_runs_again(tree, "root/" + path) for path in paths), "everything running")
+    eventually(lambda: all(_runs_again(tree, "root/" + path) for path in paths), what="everything running")
     assert not tree.exits
     pids = {tree.pid("root/" + path) for path in paths} - {os.getpid()}
     servers = {process.pid for process in psutil.Process().children()}
