@@ -23,7 +23,7 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.user_loop import log_exception, new_loop, start_loop_thread
-from rr_actors.runtime.workers import WORKERS_LIMIT, Workers
+from rr_actors.runtime.workers import Workers
 
 logger = logging.getLogger("rr_actors")
 
@@ -46,7 +46,7 @@ class Dispatcher:
     loop: asyncio.AbstractEventLoop
     workers: Workers
 
-    def __init__(self, *, workers_limit: int = WORKERS_LIMIT) -> None:
+    def __init__(self) -> None:
         self._calls: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._turn = 0  # the number of times that the loop took the calls
         self._woken_for = -1  # the turn for which the loop was woken last
@@ -60,7 +60,7 @@ class Dispatcher:
         # Closed when no thread can write to it any more, but not at exit, when the loop may still run.
         closing = weakref.finalize(self, os.close, self._bell)
         closing.atexit = False
-        self.workers = Workers(self.call, self.hand_over, limit=workers_limit)
+        self.workers = Workers(self.call, self.hand_over)
         try:
             self.thread = start_loop_thread(self._run, "rr-loop")
         except Unavailable:

@@ -27,6 +27,8 @@ from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.thread_wakeup import Bell, new_bell
 from rr_actors.runtime.user_loop import Done, is_coroutine
 
+_LIMIT = 4096  # the most threads at a time, if set_limit() of Workers sets no other
+_IDLE_S = 10.0  # a thread without work for that long ends
 _QUICK = 8  # the most threads with an EventBell, which takes file descriptors
 
 
@@ -81,7 +83,7 @@ class Threads:
             `idle`: the calling thread ran the task, and has no other task now.
         go_on: called as go_on(task, result, error) instead for a task with a key, or one that gave a coroutine; returns
             the task that the thread runs next.
-        deliver, limit, idle_s: those of Workers.
+        deliver: that of Workers.
     """
 
     def __init__(
@@ -89,15 +91,11 @@ class Threads:
         tell: Callable[[Task, Any, BaseException | None, bool], None],
         go_on: Callable[[Task, Any, BaseException | None], Task | None],
         deliver: Callable[..., None],
-        *,
-        limit: int,
-        idle_s: float,
     ) -> None:
-        self.limit = limit
+        self.limit = _LIMIT
         self._tell = tell
         self._go_on = go_on
         self._deliver = deliver
-        self._idle_s = idle_s
         self._lock = threading.Lock()
         self._tasks: deque[Task] = deque()  # not begun; while it is not empty, a thread is coming, or all are busy
         self._coming: _Thread | None = None  # a thread that was woken or started, and has not taken a task yet
@@ -314,8 +312,8 @@ class Threads:
         return None
 
     def _wait(self, worker: _Thread) -> bool:
-        """Wait for the bell; return False if the thread was idle for `idle_s` seconds."""
-        while worker.bell.wait(self._idle_s):
+        """Wait for the bell; return False if the thread was idle for `_IDLE_S` seconds."""
+        while worker.bell.wait(_IDLE_S):
             if not worker.idle:
                 return True  # otherwise the bell was rung twice for an earlier task
         with self._lock:

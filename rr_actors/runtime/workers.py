@@ -28,9 +28,6 @@ from rr_actors.runtime.user_loop import Done, UserLoop, is_coroutine, name_of
 
 logger = logging.getLogger("rr_actors")
 
-WORKERS_LIMIT = 4096
-IDLE_S = 10.0
-
 
 def is_async(fn: Callable[..., Any]) -> bool:
     """Return whether `fn` is async: a function, a method, a partial or an object with an `async def __call__`."""
@@ -49,23 +46,14 @@ class Workers:
 
     Args:
         deliver: called as deliver(done, result, error) from any thread; calls `done` on the loop.
-        hand_over: the same, for a thread that has no other task now; `deliver` if None.
-        limit: the most threads at a time. While not all are known to be busy, more tasks are accepted, and wait.
-        idle_s: the seconds without work after which a thread ends.
+        hand_over: the same, for a thread that has no other task now.
     """
 
-    def __init__(
-        self,
-        deliver: Callable[..., None],
-        hand_over: Callable[..., None] | None = None,
-        *,
-        limit: int = WORKERS_LIMIT,
-        idle_s: float = IDLE_S,
-    ) -> None:
+    def __init__(self, deliver: Callable[..., None], hand_over: Callable[..., None]) -> None:
         self._deliver = deliver
-        self._hand_over = deliver if hand_over is None else hand_over
+        self._hand_over = hand_over
         self._lock = threading.Lock()
-        self._threads = Threads(self._ran, self._go_on, deliver, limit=limit, idle_s=idle_s)
+        self._threads = Threads(self._ran, self._go_on, deliver)
         self._queues: dict[Hashable, deque[Task] | None] = {}
         self._user_loop: UserLoop | None = None
         self.user_loop_ident: int | None = None
@@ -181,7 +169,7 @@ class Workers:
         return len(self._threads)
 
     def set_limit(self, limit: int) -> None:
-        """Set the most threads at a time."""
+        """Set the most threads at a time. While not all are known to be busy, more tasks are accepted, and wait."""
         self._threads.limit = limit
 
     def close(self, timeout_s: float = 1.0) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from rr_actors.base.errors import MailboxFull, Unavailable
+from rr_actors.runtime import thread_pool
 from rr_actors.runtime.callback_errors import described
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.thread_wakeup import EventBell
@@ -36,6 +37,18 @@ def dispatcher() -> Iterator[Dispatcher]:
 @pytest.fixture
 def workers(dispatcher: Dispatcher) -> Workers:
     return dispatcher.workers
+
+
+def limited(threads: int) -> Dispatcher:
+    """Return a dispatcher with at most that many worker threads."""
+    dispatcher = Dispatcher()
+    dispatcher.workers.set_limit(threads)
+    return dispatcher
+
+
+def deliver(done: Callable[..., object], *outcome: Any) -> None:
+    """Call `done` in the worker's own thread."""
+    done(*outcome)
 
 
 class Outcomes(Calls):
@@ -281,7 +294,7 @@ def test_a_thread_that_cannot_bring_another_tells_those_who_wait(
 
 
 def test_over_the_limit_a_callback_is_refused_with_the_limit_and_what_to_do() -> None:
-    dispatcher = Dispatcher(workers_limit=2)
+    dispatcher = limited(2)
     go_on, entered = threading.Event(), Calls()
     try:
         done = Outcomes()
@@ -303,7 +316,7 @@ def test_over_the_limit_a_callback_is_refused_with_the_limit_and_what_to_do() ->
 def test_what_was_taken_before_all_threads_were_busy_waits_for_a_free_one_and_what_comes_later_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    dispatcher = Dispatcher(workers_limit=2)
+    dispatcher = limited(2)
     workers, go_on, entered = dispatcher.workers, threading.Event(), Calls()
     first, done, beyond = Outcomes(), Outcomes(), Calls()
     rung: list[EventBell] = []
@@ -336,7 +349,7 @@ def test_what_was_taken_before_all_threads_were_busy_waits_for_a_free_one_and_wh
 
 
 def test_callbacks_that_return_may_be_many_more_than_threads() -> None:
-    dispatcher = Dispatcher(workers_limit=50)
+    dispatcher = limited(50)
     try:
         done = Outcomes()
         dispatcher.call(lambda: [dispatcher.workers.submit(int, done=done) for _ in range(5000)])
@@ -345,8 +358,9 @@ def test_callbacks_that_return_may_be_many_more_than_threads() -> None:
         dispatcher.close()
 
 
-def test_idle_threads_end_after_a_while() -> None:
-    workers = Workers(lambda done, *outcome: done(*outcome), idle_s=0.02)
+def test_idle_threads_end_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thread_pool, "_IDLE_S", 0.02)
+    workers = Workers(deliver, deliver)
     done = Outcomes()
     workers.submit(lambda: "ran", done=done)
     assert done.wait() == [("ran", None)]
@@ -370,7 +384,7 @@ def test_an_idle_thread_keeps_nothing_of_what_it_ran(workers: Workers) -> None:
 
 
 def test_close_ends_idle_threads_at_once_and_waits_no_longer_than_told_for_others() -> None:
-    workers = Workers(lambda done, *outcome: done(*outcome))
+    workers = Workers(deliver, deliver)
     go_on, started = threading.Event(), threading.Event()
     done = Outcomes()
     workers.submit(lambda: None, done=done)
@@ -411,7 +425,8 @@ def test_what_the_thread_could_not_tell_at_once_the_loop_is_told(workers: Worker
 
 
 def test_a_thread_that_has_more_to_run_leaves_it_to_the_loop(dispatcher: Dispatcher) -> None:
-    workers = Workers(dispatcher.call, limit=1)
+    workers = Workers(dispatcher.call, dispatcher.call)
+    workers.set_limit(1)
     at_once, done = Calls(), Outcomes()
     begun, go_on = threading.Event(), threading.Event()
 
@@ -667,7 +682,7 @@ def test_keys_are_forgotten_when_their_calls_are_done(workers: Workers) -> None:
 
 
 def test_a_serial_call_over_the_limit_is_refused_and_its_key_is_free_again() -> None:
-    dispatcher = Dispatcher(workers_limit=1)
+    dispatcher = limited(1)
     go_on, entered = threading.Event(), threading.Event()
     try:
         done = Outcomes()
@@ -727,7 +742,7 @@ def test_a_call_of_a_key_that_comes_while_the_first_is_refused_ends_too(
 
 
 def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    workers = Workers(lambda done, result, error: done(result, error))
+    workers = Workers(deliver, deliver)
     being_started, go_on = threading.Event(), threading.Event()
     start = threading.Thread.start
 

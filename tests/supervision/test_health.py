@@ -102,7 +102,7 @@ if os.geteuid() == 0:  # others may not change their root or their user
 
 @pytest.mark.parametrize("what", LOST)
 def test_a_manager_that_has_lost_what_it_needs_is_replaced(start: Start, what: str) -> None:
-    system = start(rr.ChildSpec(Failing, id="maker", heartbeat_s=0.5))
+    system = start(rr.ChildSpec(Failing, id="maker", heartbeat_s=1.0))
     app = system.open_registrar("app")
     old = pid_of(system, "maker")
     loading = threading.Thread(target=_try_to_load, args=(app, what))

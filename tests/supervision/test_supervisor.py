@@ -655,7 +655,7 @@ def test_a_hung_child_is_found_by_its_heartbeat_and_replaced(plant: Plant, log: 
 
 
 def test_a_slow_callback_is_not_taken_for_a_hung_child(plant: Plant, log: Log) -> None:
-    tree = plant(worker(log, "a", heartbeat_s=0.5))
+    tree = plant(worker(log, "a", heartbeat_s=1.0))
     assert tree.ask("root/a", ("pause", 2.0)) == "rested"
     assert tree.records("exited") == []
 
