@@ -64,7 +64,6 @@ class Workers:
         fn: Callable[..., Any],
         *args: Any,
         done: Done | None = None,
-        context: Context | None = None,
         patient: bool = False,
         at_once: Callable[[Any], bool] | None = None,
     ) -> None:
@@ -72,7 +71,6 @@ class Workers:
 
         Args:
             done: called on the loop, once, with (result, None) or (None, error).
-            context: the contextvars of fn; an empty context if None.
             patient: the call waits for a free thread instead of a MailboxFull.
             at_once: called with the result by the worker thread that ran fn, if it has no other task; not if fn is
                 async. If it returns True it has dealt with the result, and `done` is not called. A thread with another
@@ -84,7 +82,7 @@ class Workers:
             Unavailable: the workers are closed.
         """
         when_full = WAITS if patient else REFUSED
-        self._start(Task(fn, args, done, Context() if context is None else context, when_full, None, at_once))
+        self._start(Task(fn, args, done, Context(), when_full, None, at_once))
 
     def serial(
         self,
@@ -96,6 +94,7 @@ class Workers:
     ) -> None:
         """Run fn(*args) as submit() does, but the calls of one key (not None) one at a time, in their order.
 
+        The contextvars of fn are those of `context`; without it there are none, as in submit().
         If no thread can be started for a call that waited for its turn, it gets that error by `done`.
         """
         task = Task(fn, args, done, Context() if context is None else context, key=key)
@@ -121,7 +120,7 @@ class Workers:
         """Bring threads for the gathered calls. On the loop."""
         self._threads.go()
 
-    async def run(self, fn: Callable[..., Any], *args: Any, context: Context | None = None) -> Any:
+    async def run(self, fn: Callable[..., Any], *args: Any) -> Any:
         """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop.
 
         It gets a thread beyond the limit, too: the framework's own work must go on while callbacks take all threads.
@@ -140,7 +139,7 @@ class Workers:
                 failure.__cause__ = error
                 future.set_exception(failure)
 
-        self._start(Task(fn, args, done, Context() if context is None else context, GETS_A_THREAD))
+        self._start(Task(fn, args, done, Context(), GETS_A_THREAD))
         return await future
 
     def in_thread(self, fn: Callable[..., Any], *args: Any, beyond_limit: bool = False) -> None:

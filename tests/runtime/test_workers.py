@@ -523,9 +523,9 @@ def test_a_callback_sees_the_context_it_was_given_and_no_other(workers: Workers,
     context = contextvars.Context()
     context.run(word.set, "given")
     word.set("of the test")
-    workers.submit(read, done=done, context=context)
+    workers.serial("key", read, done=done, context=context)
     done.wait()
-    workers.submit(read, done=done)
+    workers.serial("key", read, done=done)
     assert done.wait(2) == [("given", None), ("none", None)]
 
 
