@@ -288,7 +288,7 @@ def acquire(*, workers_limit: int | None = None) -> Dispatcher:
             _process.dispatcher = Dispatcher()
         _process.holders += 1
         if workers_limit is not None:
-            _process.dispatcher.workers.set_limit(workers_limit)
+            _process.dispatcher.workers.threads.limit = workers_limit
         return _process.dispatcher
 
 

@@ -27,7 +27,7 @@ from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.thread_wakeup import Bell, new_bell
 from rr_actors.runtime.user_loop import Done, is_coroutine
 
-_LIMIT = 4096  # the most threads at a time, if set_limit() of Workers sets no other
+_LIMIT = 4096  # the most threads at a time, if SystemConfig.workers_limit says nothing else
 _IDLE_S = 10.0  # a thread without work for that long ends
 _QUICK = 8  # the most threads with an EventBell, which takes file descriptors
 
@@ -84,6 +84,9 @@ class Threads:
         go_on: called as go_on(task, result, error) instead for a task with a key, or one that gave a coroutine; returns
             the task that the thread runs next.
         deliver: that of Workers.
+
+    Attributes:
+        limit: the most threads at a time. While not all are known to be busy, more tasks are accepted, and wait.
     """
 
     def __init__(

@@ -47,13 +47,16 @@ class Workers:
     Args:
         deliver: called as deliver(done, result, error) from any thread; calls `done` on the loop.
         hand_over: the same, for a thread that has no other task now.
+
+    Attributes:
+        threads: the worker threads, running or idle.
     """
 
     def __init__(self, deliver: Callable[..., None], hand_over: Callable[..., None]) -> None:
         self._deliver = deliver
         self._hand_over = hand_over
         self._lock = threading.Lock()
-        self._threads = Threads(self._ran, self._go_on, deliver)
+        self.threads = Threads(self._ran, self._go_on, deliver)
         self._queues: dict[Hashable, deque[Task] | None] = {}
         self._user_loop: UserLoop | None = None
         self.user_loop_ident: int | None = None
@@ -112,14 +115,6 @@ class Workers:
             self._start_following(key)  # other threads may have submitted more calls meanwhile
             raise
 
-    def gather(self) -> None:
-        """Wake no thread for calls submitted from now on, until go(), which must follow at once. On the loop."""
-        self._threads.gather()
-
-    def go(self) -> None:
-        """Bring threads for the gathered calls. On the loop."""
-        self._threads.go()
-
     async def run(self, fn: Callable[..., Any], *args: Any) -> Any:
         """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop.
 
@@ -145,7 +140,7 @@ class Workers:
     def in_thread(self, fn: Callable[..., Any], *args: Any, beyond_limit: bool = False) -> None:
         """Run a plain function in a thread, without `done`. `beyond_limit`: for work that has begun and must go on."""
         when_full = GETS_A_THREAD if beyond_limit else REFUSED
-        self._threads.start(Task(fn, args, None, Context(), when_full))
+        self.threads.start(Task(fn, args, None, Context(), when_full))
 
     def start_coroutine(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run the coroutine as a task on the user loop; `done` is called in that loop's thread."""
@@ -162,15 +157,6 @@ class Workers:
             coroutine.close()
             raise
 
-    @property
-    def threads(self) -> int:
-        """The number of worker threads now, running or idle."""
-        return len(self._threads)
-
-    def set_limit(self, limit: int) -> None:
-        """Set the most threads at a time. While not all are known to be busy, more tasks are accepted, and wait."""
-        self._threads.limit = limit
-
     def close(self, timeout_s: float = 1.0) -> None:
         """End the idle threads at once, and the running ones after their tasks.
 
@@ -180,7 +166,7 @@ class Workers:
         with self._lock:
             self._closed = True
             user_loop = self._user_loop
-        threads = self._threads.close()
+        threads = self.threads.close()
         if user_loop is not None:
             user_loop.stop()
             threads.append(user_loop.thread)
@@ -193,11 +179,11 @@ class Workers:
         """Refuse everything, in a forked child: it does not have the threads."""
         self._lock = threading.Lock()  # another thread may have held it at the fork
         self._closed = True
-        self._threads.abandon()
+        self.threads.abandon()
 
     def _start(self, task: Task) -> None:
         if not is_async(task.fn):
-            self._threads.start(task)
+            self.threads.start(task)
             return
         coroutine, error = task.call()
         if error is None:
@@ -252,7 +238,7 @@ class Workers:
         """Start the next task of a queue whose first has ended. If no thread can be started, end it with that error."""
         while (following := self._following(key)) is not None:
             try:
-                self._threads.start(msgspec.structs.replace(following, when_full=GETS_A_THREAD))
+                self.threads.start(msgspec.structs.replace(following, when_full=GETS_A_THREAD))
                 return
             except Unavailable as unavailable:
                 self._tell(following, None, unavailable)

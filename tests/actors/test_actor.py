@@ -63,7 +63,7 @@ def test_idle_actors_hold_no_thread() -> None:
     refs = [Echo.start() for _ in range(300)]
     assert [ref.ask(7) for ref in refs] == [7] * 300
     workers = current().workers  # type: ignore[union-attr]
-    assert workers.threads < 10
+    assert len(workers.threads) < 10
 
 
 def test_an_actor_that_cannot_begin_answers_what_it_was_asked_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -716,7 +716,7 @@ def test_a_blocking_ask_on_the_loop_or_in_an_async_handler_is_refused(dispatcher
 def test_a_loop_actor_handles_its_messages_on_the_loop_without_a_worker(dispatcher: Dispatcher) -> None:
     ref = LoopEcho.start()
     assert ref.ask(lambda _: threading.current_thread().name) == "rr-loop"
-    assert dispatcher.workers.threads == 0
+    assert len(dispatcher.workers.threads) == 0
     assert ref.proxy().mailbox_limit.get() == 100_000
     assert ref.stop() is True
 
@@ -781,4 +781,4 @@ def test_a_thousand_loop_actors_pass_a_message_round_without_a_thread(dispatcher
     assert ref is not None
     ref.tell(0)
     assert arrived.wait() == [999]
-    assert dispatcher.workers.threads == 0
+    assert len(dispatcher.workers.threads) == 0

@@ -133,7 +133,7 @@ def test_the_workers_are_closed_while_it_waits_and_nothing_breaks(dispatcher: Di
     dispatcher.workers.close(timeout_s=0.0)
     gate.open()
 
-    eventually(lambda: dispatcher.workers.threads == 0)
+    eventually(lambda: len(dispatcher.workers.threads) == 0)
     assert list(failed) == []
 
 
@@ -153,7 +153,7 @@ def test_a_coroutine_that_comes_after_the_end_is_closed(dispatcher: Dispatcher) 
     dispatcher.workers.close(timeout_s=0.0)
     gate.open()
 
-    eventually(lambda: dispatcher.workers.threads == 0)
+    eventually(lambda: len(dispatcher.workers.threads) == 0)
     assert inspect.getcoroutinestate(given[0]) == inspect.CORO_CLOSED
     ((error, what),) = failed.wait()
     assert isinstance(error, Unavailable)

@@ -59,7 +59,7 @@ def test_callbacks_that_wait_for_one_another_all_run(dispatcher: Dispatcher) -> 
 
 
 def test_no_callback_is_refused_because_all_threads_are_taken(dispatcher: Dispatcher) -> None:
-    dispatcher.workers.set_limit(4)
+    dispatcher.workers.threads.limit = 4
     release, running, done = threading.Event(), threading.Semaphore(0), Calls()
 
     def callback(_number: int) -> None:
@@ -73,7 +73,7 @@ def test_no_callback_is_refused_because_all_threads_are_taken(dispatcher: Dispat
         assert running.acquire(timeout=20.0)
     release.set()
     assert [error for _, error in done.wait(50)] == [None] * 50
-    assert dispatcher.workers.threads <= 4
+    assert len(dispatcher.workers.threads) <= 4
 
 
 def test_what_a_callback_raises_is_its_own(dispatcher: Dispatcher) -> None:

@@ -42,7 +42,7 @@ def workers(dispatcher: Dispatcher) -> Workers:
 def limited(threads: int) -> Dispatcher:
     """Return a dispatcher with at most that many worker threads."""
     dispatcher = Dispatcher()
-    dispatcher.workers.set_limit(threads)
+    dispatcher.workers.threads.limit = threads
     return dispatcher
 
 
@@ -99,7 +99,7 @@ def test_an_idle_thread_is_used_again(workers: Workers) -> None:
         workers.submit(threading.get_ident, done=done)
         done.wait(count + 1)
     assert len({ident for ident, _ in done}) == 1
-    assert workers.threads == 1
+    assert len(workers.threads) == 1
 
 
 def test_callbacks_that_wait_for_one_another_to_any_depth_each_have_a_thread(workers: Workers) -> None:
@@ -129,7 +129,7 @@ def test_what_is_submitted_together_is_done_by_few_threads_if_none_blocks(dispat
     dispatcher.call(submit_many)
     threads = {ident for ident, _ in done.wait(200)}
     assert len(threads) < 20
-    assert dispatcher.workers.threads < 20
+    assert len(dispatcher.workers.threads) < 20
 
 
 def test_what_is_submitted_together_does_not_wait_for_one_that_blocks(dispatcher: Dispatcher) -> None:
@@ -143,7 +143,7 @@ def test_what_is_submitted_together_does_not_wait_for_one_that_blocks(dispatcher
         done = Outcomes()
         dispatcher.call(submit_many, done)
         assert {error for _, error in done.wait(80)} == {None}
-    assert dispatcher.workers.threads >= 40
+    assert len(dispatcher.workers.threads) >= 40
 
 
 def test_while_a_thread_waits_for_its_turn_after_starting_another_that_one_starts_none(
@@ -183,11 +183,11 @@ def test_what_is_gathered_wakes_nobody_before_all_is_submitted_and_none_waits_fo
         ring(bell)
 
     def submit_many() -> None:
-        workers.gather()
+        workers.threads.gather()
         for number in range(40):
             workers.submit(gate if number % 2 else int, done=done)
         before_going.extend(rung)
-        workers.go()
+        workers.threads.go()
 
     workers.submit(int, done=done)
     done.wait()  # there is an idle thread
@@ -210,10 +210,10 @@ def test_what_is_gathered_and_no_thread_can_come_for_is_refused(
         raise RuntimeError("can't start new thread")
 
     def submit_two() -> None:
-        dispatcher.workers.gather()
+        dispatcher.workers.threads.gather()
         dispatcher.workers.submit(print, done=done)
         dispatcher.workers.submit(print, done=done, patient=True)
-        dispatcher.workers.go()
+        dispatcher.workers.threads.go()
 
     monkeypatch.setattr(threading.Thread, "start", no_thread)
     dispatcher.call(submit_two)
@@ -245,7 +245,7 @@ def test_without_a_thread_for_it_a_callback_is_refused_and_those_behind_a_free_o
     with pytest.raises(MailboxFull, match="can't start new thread"):
         dispatcher.workers.submit(print)
     monkeypatch.undo()
-    assert dispatcher.workers.threads == 0
+    assert len(dispatcher.workers.threads) == 0
     dispatcher.workers.submit(lambda: (entered.set(), go_on.wait(10)), done=done)
     entered.wait(10)
     monkeypatch.setattr(threading.Thread, "start", no_thread)
@@ -364,7 +364,7 @@ def test_idle_threads_end_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None
     done = Outcomes()
     workers.submit(lambda: "ran", done=done)
     assert done.wait() == [("ran", None)]
-    eventually(lambda: workers.threads == 0)
+    eventually(lambda: len(workers.threads) == 0)
     workers.submit(lambda: "again", done=done)
     assert done.wait(2)[1] == ("again", None)
     workers.close()
@@ -392,11 +392,11 @@ def test_close_ends_idle_threads_at_once_and_waits_no_longer_than_told_for_other
     workers.submit(lambda: (started.set(), go_on.wait(10)))
     started.wait(10)
     workers.close(timeout_s=0.02)
-    assert workers.threads == 1
+    assert len(workers.threads) == 1
     with pytest.raises(Unavailable):
         workers.submit(print)
     go_on.set()
-    eventually(lambda: workers.threads == 0)
+    eventually(lambda: len(workers.threads) == 0)
 
 
 # -- what a thread does at once --------------------------------------------------------------------------------------
@@ -426,7 +426,7 @@ def test_what_the_thread_could_not_tell_at_once_the_loop_is_told(workers: Worker
 
 def test_a_thread_that_has_more_to_run_leaves_it_to_the_loop(dispatcher: Dispatcher) -> None:
     workers = Workers(dispatcher.call, dispatcher.call)
-    workers.set_limit(1)
+    workers.threads.limit = 1
     at_once, done = Calls(), Outcomes()
     begun, go_on = threading.Event(), threading.Event()
 
@@ -496,9 +496,9 @@ def test_of_what_no_thread_can_run_the_loop_is_told(dispatcher: Dispatcher, monk
         raise RuntimeError("can't start new thread")
 
     def submit() -> None:
-        dispatcher.workers.gather()
+        dispatcher.workers.threads.gather()
         dispatcher.workers.submit(int, done=done, at_once=lambda result: bool(at_once(result)) or True)
-        dispatcher.workers.go()
+        dispatcher.workers.threads.go()
 
     monkeypatch.setattr(threading.Thread, "start", no_thread)
     dispatcher.call(submit)
@@ -761,7 +761,7 @@ def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: p
     go_on.set()
     submitter.join(10.0)
     assert ran.wait(10.0)
-    eventually(lambda: workers.threads == 0)
+    eventually(lambda: len(workers.threads) == 0)
 
 
 @pytest.mark.parametrize("wrap", [lambda fn: fn, lambda fn: described(fn, "the callback")], ids=["plain", "described"])
@@ -781,7 +781,7 @@ def test_a_coroutine_that_comes_after_the_end_is_closed_and_ends_its_thread_in_o
     workers.close(timeout_s=0.0)
     gate.open()
 
-    eventually(lambda: workers.threads == 0)
+    eventually(lambda: len(workers.threads) == 0)
     gc.collect()
     assert [str(warning.message) for warning in recwarn] == []
 

@@ -965,7 +965,7 @@ def test_children_are_restarted_while_callbacks_take_all_threads(plant: Plant, l
     tree = plant(inner, worker(log, "b"))
     old = {path: tree.pid(path) for path in ("root/inner", "root/b")}
     gate, workers = Gate(), tree.dispatcher.workers
-    workers.set_limit(1)
+    workers.threads.limit = 1
     with pytest.raises(MailboxFull):
         take_all_threads(workers, gate)
     try:

@@ -757,12 +757,12 @@ class EffectRunner:
         """
         methods = self._methods
         if len(effects) > 1 and not _CALLBACKS.isdisjoint(map(type, effects)):
-            self._workers.gather()
+            self._workers.threads.gather()
             try:
                 for effect in effects:
                     methods[type(effect)](effect)
             finally:
-                self._workers.go()
+                self._workers.threads.go()
         else:
             for effect in effects:
                 methods[type(effect)](effect)
