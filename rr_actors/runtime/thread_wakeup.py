@@ -12,7 +12,6 @@ import os
 import select
 import threading
 from collections import deque
-from typing import Protocol
 
 
 def new_bell(*, quick: bool) -> Bell:
@@ -25,24 +24,8 @@ def new_bell(*, quick: bool) -> Bell:
     return LockBell()
 
 
-class Bell(Protocol):
-    """A bell that any thread rings, once for each wait."""
-
-    def ring(self) -> None:
-        """End the present wait, or the next one."""
-        ...
-
-    def wait(self, timeout_s: float = -1) -> bool:
-        """Wait for a ring, at most `timeout_s` seconds (for ever if negative); return whether there was one."""
-        ...
-
-    def close(self) -> None:
-        """Close the bell's descriptors. No thread may ring it any more."""
-        ...
-
-
 class LockBell:
-    """A Bell without a descriptor: there may be any number of them."""
+    """A bell without a descriptor: there may be any number of them."""
 
     __slots__ = ("_lock",)
 
@@ -51,18 +34,20 @@ class LockBell:
         self._lock.acquire()
 
     def ring(self) -> None:
+        """End the present wait, or the next one."""
         with contextlib.suppress(RuntimeError):  # it has been rung
             self._lock.release()
 
     def wait(self, timeout_s: float = -1) -> bool:
+        """Wait for a ring, at most `timeout_s` seconds (for ever if negative); return whether there was one."""
         return self._lock.acquire(timeout=timeout_s)
 
     def close(self) -> None:
-        """Do nothing, as there is no descriptor."""
+        """Close the bell's descriptors, of which this one has none. No thread may ring it any more."""
 
 
 class EventBell:
-    """A Bell that wakes quickly.
+    """A bell that wakes quickly, with the methods of LockBell.
 
     The thread that rings it releases Python's lock, so the woken thread can begin at once. It is closed at the latest
     when its last reference is gone.
@@ -96,3 +81,7 @@ class EventBell:
     def __del__(self) -> None:
         if getattr(self, "_held", None):  # it is missing if __init__ was interrupted at once
             self.close()
+
+
+Bell = LockBell | EventBell
+"""A bell that any thread rings, once for each wait."""
