@@ -22,7 +22,7 @@ from rr_actors.base.errors import Unavailable, UsageError
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.shielding import shielded
-from rr_actors.runtime.user_loop import log_exception, new_loop, start_loop_thread
+from rr_actors.runtime.user_loop import log_exception, start_loop_thread
 from rr_actors.runtime.workers import Workers
 
 logger = logging.getLogger("rr_actors")
@@ -62,7 +62,7 @@ class Dispatcher:
         closing.atexit = False
         self.workers = Workers(self.call, self.hand_over)
         try:
-            self.thread = start_loop_thread(self._run, "rr-loop")
+            self.thread = start_loop_thread(self._begin, "rr-loop")
         except Unavailable:
             closing()
             raise
@@ -192,15 +192,13 @@ class Dispatcher:
             except BaseException as error:  # SystemExit on the loop would end all actors of the process
                 logger.error("%s raised on the loop", getattr(fn, "__qualname__", fn), exc_info=error)
 
-    def _run(self, ready: Callable[[], object]) -> None:
+    def _begin(self, loop: asyncio.AbstractEventLoop) -> Coroutine[Any, Any, object]:
         self._ident = threading.get_ident()
-        with asyncio.Runner(loop_factory=new_loop) as runner:
-            self.loop = runner.get_loop()
-            self.loop.set_exception_handler(log_exception)
-            self._stop = asyncio.Event()
-            self.loop.add_reader(self._bell, self._rung)
-            ready()
-            runner.run(self._until_closed())
+        self._stop = asyncio.Event()
+        self.loop = loop
+        loop.set_exception_handler(log_exception)
+        loop.add_reader(self._bell, self._rung)
+        return self._until_closed()
 
     async def _until_closed(self) -> None:
         await self._stop.wait()

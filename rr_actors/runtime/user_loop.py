@@ -49,11 +49,13 @@ def closing(inner: Coroutine[Any, Any, Any], outer: Coroutine[Any, Any, Any]) ->
     return outer
 
 
-def start_loop_thread(run: Callable[[Callable[[], object]], None], name: str) -> threading.Thread:
+def start_loop_thread(
+    begin: Callable[[asyncio.AbstractEventLoop], Coroutine[Any, Any, object]], name: str
+) -> threading.Thread:
     """Start a daemon thread that runs an event loop, and return it when the loop exists.
 
     Args:
-        run: called in that thread as run(ready); it calls ready() when the loop exists.
+        begin: called in that thread with the loop; returns the coroutine with which the loop ends.
 
     Raises:
         Unavailable: the machine gives no thread, or no descriptors, for it.
@@ -63,7 +65,10 @@ def start_loop_thread(run: Callable[[Callable[[], object]], None], name: str) ->
 
     def work() -> None:
         try:
-            run(ready.set)
+            with asyncio.Runner(loop_factory=new_loop) as runner:
+                life = begin(runner.get_loop())
+                ready.set()
+                runner.run(life)
         except BaseException as error:
             if ready.is_set():
                 raise
@@ -94,7 +99,7 @@ class UserLoop:
     def __init__(self, elsewhere: Callable[[Callable[[], object]], None]) -> None:
         self._tasks: set[asyncio.Task[None]] = set()
         self._elsewhere = elsewhere
-        self.thread = start_loop_thread(self._run, "rr-user-loop")
+        self.thread = start_loop_thread(self._begin, "rr-user-loop")
 
     def start(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run a coroutine as a task in `context`; `done` is called in the loop's thread."""
@@ -115,13 +120,11 @@ class UserLoop:
         self._tasks.add(task)  # the loop itself keeps only weak references
         task.add_done_callback(self._tasks.discard)
 
-    def _run(self, ready: Callable[[], object]) -> None:
-        with asyncio.Runner(loop_factory=new_loop) as runner:
-            self._loop = runner.get_loop()
-            self._loop.set_exception_handler(self._log_elsewhere)
-            self._stop = asyncio.Event()
-            ready()
-            runner.run(self._stop.wait())
+    def _begin(self, loop: asyncio.AbstractEventLoop) -> Coroutine[Any, Any, object]:
+        self._loop = loop
+        self._stop = asyncio.Event()
+        loop.set_exception_handler(self._log_elsewhere)
+        return self._stop.wait()
 
     def _log_elsewhere(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         try:

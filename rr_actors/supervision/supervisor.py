@@ -111,8 +111,7 @@ class SupervisorActor(LoopActor):
         await self._all_up
 
     async def on_stop(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if not self._all_down.done():
-            self._supervision.stop(final=self._final)
+        self._supervision.stop(final=self._final)
         ending = await self._all_down
         if ending.error is not None:
             text = "".join(traceback.format_exception(ending.error))
@@ -120,8 +119,7 @@ class SupervisorActor(LoopActor):
 
     async def on_failure(self, *_: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Stop the children after a defect of this class: none must run without a supervisor."""
-        if not self._all_down.done():
-            self._supervision.stop(final=False)
+        self._supervision.stop(final=False)
         await self._all_down
 
     async def _after_stop(self, final: bool) -> None:

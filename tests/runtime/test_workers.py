@@ -46,6 +46,11 @@ def limited(threads: int) -> Dispatcher:
     return dispatcher
 
 
+def no_thread(_thread: threading.Thread) -> None:
+    """Stand for Thread.start() where the system gives no more threads."""
+    raise RuntimeError("can't start new thread")
+
+
 def deliver(done: Callable[..., object], *outcome: Any) -> None:
     """Call `done` in the worker's own thread."""
     done(*outcome)
@@ -206,9 +211,6 @@ def test_what_is_gathered_and_no_thread_can_come_for_is_refused(
 ) -> None:
     done = Outcomes()
 
-    def no_thread(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
     def submit_two() -> None:
         dispatcher.workers.threads.gather()
         dispatcher.workers.submit(print, done=done)
@@ -237,9 +239,6 @@ def test_without_a_thread_for_it_a_callback_is_refused_and_those_behind_a_free_o
 ) -> None:
     go_on, entered = threading.Event(), threading.Event()
     done = Outcomes()
-
-    def no_thread(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", no_thread)
     with pytest.raises(MailboxFull, match="can't start new thread"):
@@ -275,9 +274,6 @@ def test_a_thread_that_cannot_bring_another_tells_those_who_wait(
     go_on = threading.Event()
     first, second = Outcomes(), Outcomes()
     rung: list[EventBell] = []
-
-    def no_thread(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
 
     workers.submit(int, done=first)
     first.wait()
@@ -492,9 +488,6 @@ def test_of_an_error_the_loop_is_told(workers: Workers) -> None:
 def test_of_what_no_thread_can_run_the_loop_is_told(dispatcher: Dispatcher, monkeypatch: pytest.MonkeyPatch) -> None:
     at_once, done = Calls(), Outcomes()
 
-    def no_thread(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
     def submit() -> None:
         dispatcher.workers.threads.gather()
         dispatcher.workers.submit(int, done=done, at_once=lambda result: bool(at_once(result)) or True)
@@ -706,9 +699,6 @@ def test_calls_of_a_key_that_no_thread_can_run_end_with_an_error_and_the_key_is_
 
     async def first() -> bool:
         return go_on.wait(10)
-
-    def no_thread(_thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
 
     workers.serial("key", first, done=done)
     for _ in range(2):
