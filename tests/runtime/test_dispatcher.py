@@ -8,7 +8,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -32,12 +32,13 @@ def test_calls_run_on_the_loop_thread_in_the_order_they_were_made(dispatcher: Di
     assert seen.wait(1000) == [(number, "rr-loop") for number in range(1000)]
 
 
-def test_calls_of_many_threads_all_run_each_threads_in_order(dispatcher: Dispatcher) -> None:
+def _see_each_in_order(put: Callable[[int], Callable[..., None]]) -> None:
+    """Have four threads call put(number)(seen, name, number) 500 times; see that each thread's calls run in order."""
     seen = Calls()
 
     def work(name: int) -> None:
         for number in range(500):
-            dispatcher.call(seen, name, number)
+            put(number)(seen, name, number)
 
     threads = [threading.Thread(target=work, args=(name,)) for name in range(4)]
     for thread in threads:
@@ -47,6 +48,10 @@ def test_calls_of_many_threads_all_run_each_threads_in_order(dispatcher: Dispatc
     calls = seen.wait(2000)
     for name in range(4):
         assert [number for who, number in calls if who == name] == list(range(500))
+
+
+def test_calls_of_many_threads_all_run_each_threads_in_order(dispatcher: Dispatcher) -> None:
+    _see_each_in_order(lambda _number: dispatcher.call)
 
 
 def test_many_pending_calls_cost_one_wake_up_of_the_loop(dispatcher: Dispatcher) -> None:
@@ -69,20 +74,7 @@ def test_many_pending_calls_cost_one_wake_up_of_the_loop(dispatcher: Dispatcher)
 
 
 def test_what_is_handed_over_runs_in_order_with_what_is_called(dispatcher: Dispatcher) -> None:
-    seen = Calls()
-
-    def work(name: int) -> None:
-        for number in range(300):
-            (dispatcher.call if number % 3 else dispatcher.hand_over)(seen, name, number)
-
-    threads = [threading.Thread(target=work, args=(name,)) for name in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    calls = seen.wait(900)
-    for name in range(3):
-        assert [number for who, number in calls if who == name] == list(range(300))
+    _see_each_in_order(lambda number: dispatcher.call if number % 3 else dispatcher.hand_over)
 
 
 def test_a_loop_that_sleeps_wakes_for_what_is_handed_over(dispatcher: Dispatcher) -> None:

@@ -142,13 +142,17 @@ class Manual:
         self._stop(id)
         return None
 
-    def restart_child(self, id: str) -> type[Exception] | None:
+    def _refusal(self, id: str) -> type[Exception] | None:
+        """Return the error of a call that needs a stopped child."""
         if self.simple:
             return NotForDynamic
         if id not in self.kids:
             return NotFound
-        if self.kids[id].up:
-            return ChildRunning
+        return ChildRunning if self.kids[id].up else None
+
+    def restart_child(self, id: str) -> type[Exception] | None:
+        if refusal := self._refusal(id):
+            return refusal
         kid = self.kids[id]
         order = list(self.kids)
         failed = self._start(id) == "fail"
@@ -156,12 +160,8 @@ class Manual:
         return StartFailed if failed else None
 
     def delete_child(self, id: str) -> type[Exception] | None:
-        if self.simple:
-            return NotForDynamic
-        if id not in self.kids:
-            return NotFound
-        if self.kids[id].up:
-            return ChildRunning
+        if refusal := self._refusal(id):
+            return refusal
         del self.kids[id]
         return None
 
