@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import threading
 import weakref
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
@@ -15,13 +15,6 @@ from rr_actors.runtime import backlogs
 from rr_actors.runtime.backlogs import Backlog
 from rr_actors.runtime.event_loop import Dispatcher
 from support import Calls, Gate, eventually
-
-
-@pytest.fixture
-def dispatcher() -> Iterator[Dispatcher]:
-    dispatcher = Dispatcher()
-    yield dispatcher
-    dispatcher.close()
 
 
 class Thing:

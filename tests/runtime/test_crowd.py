@@ -6,7 +6,6 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,6 @@ import rr_actors as rr
 from rr_actors.base.errors import Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from support import Calls, eventually, wait_respawned
-
-
-@pytest.fixture
-def dispatcher() -> Iterator[Dispatcher]:
-    dispatcher = Dispatcher()
-    yield dispatcher
-    dispatcher.close()
 
 
 def submit(dispatcher: Dispatcher, count: int, fn: Any, done: Calls) -> None:

@@ -12,7 +12,7 @@ import logging
 import os
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -25,13 +25,6 @@ from rr_actors.runtime.thread_wakeup import EventBell
 from rr_actors.runtime.user_loop import is_coroutine, start_task
 from rr_actors.runtime.workers import Workers, is_async
 from support import Calls, Gate, eventually
-
-
-@pytest.fixture
-def dispatcher() -> Iterator[Dispatcher]:
-    dispatcher = Dispatcher()
-    yield dispatcher
-    dispatcher.close()
 
 
 @pytest.fixture
