@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -107,7 +108,8 @@ def _stand_still(program: subprocess.Popen[bytes]) -> None:
         hang(process.pid)
     time.sleep(STILL_S)
     for process in processes:
-        process.send_signal(signal.SIGCONT)
+        with contextlib.suppress(psutil.NoSuchProcess):  # while a system stops, one may have been ended meanwhile
+            process.send_signal(signal.SIGCONT)
         time.sleep(HEARTBEAT_S / 10)
 
 

@@ -187,7 +187,7 @@ def test_a_stop_in_the_middle_of_a_start_does_not_wait_for_it(plant: Plant, log:
     slow = worker(log, "slow", on_start="hang", shutdown_s=0.2)
     starter = threading.Thread(target=_fail_to_start, args=(tree, "root/inner", slow))
     starter.start()
-    eventually(lambda: "start slow" in log.lines())
+    eventually(lambda: "start slow" in log.lines(), timeout=30)
     assert tree.stop() < 8
     starter.join(5)
     assert not starter.is_alive()
@@ -203,7 +203,7 @@ def test_a_supervisor_stopped_during_its_own_start_takes_down_what_it_had_starte
     inner = Supervisor([worker(log, "a"), worker(log, "b", on_start="hang", shutdown_s=0.2)], id="inner")
     starter = threading.Thread(target=_fail_to_start, args=(tree, "root", inner))
     starter.start()
-    eventually(lambda: "start b" in log.lines())
+    eventually(lambda: "start b" in log.lines(), timeout=30)
     assert tree.stop() < 8
     starter.join(5)
     assert log.lines()[-1] == "stop a"
