@@ -55,6 +55,29 @@ def names(trace: rr.Trace) -> list[str]:
     ]
 
 
+def wait_recorded(recording: Recording, what: Any, *expected: str) -> None:
+    """Return when the trace has these entries: each process sends its own, and may need long on a busy machine."""
+
+    def arrived() -> bool:
+        try:
+            return set(expected) <= set(names(recording.trace(what)))
+        except NotFound:
+            return False
+
+    eventually(arrived, what=f"{expected} recorded")
+
+
+LOAD_WITH_A_PART = [
+    "app>robots Load",
+    "robots load began",
+    "robots>lidars Load",
+    "lidars load began",
+    "lidars load ended",
+    "lidars>robots Loaded",
+    "robots load ended",
+    "robots>app Loaded",
+]
+
 # -- one trace -------------------------------------------------------------------------------------------------------
 
 
@@ -65,18 +88,10 @@ def test_a_load_its_dependency_its_callbacks_and_the_answers_are_one_trace_over_
     with shops.record() as recording:
         query = app.load("robots/thing", Order("r2", ("lidars/thing:front",)))
         app.load("robots/thing", Order("other"))
+        wait_recorded(recording, query, *LOAD_WITH_A_PART)
     trace = recording.trace(query)
 
-    assert names(trace) == [
-        "app>robots Load",
-        "robots load began",
-        "robots>lidars Load",
-        "lidars load began",
-        "lidars load ended",
-        "lidars>robots Loaded",
-        "robots load ended",
-        "robots>app Loaded",
-    ]
+    assert names(trace) == LOAD_WITH_A_PART
     assert {entry.pid for entry in trace.entries} >= {shops.ref("robots").pid, shops.ref("lidars").pid}
     assert {entry.process for entry in trace.entries if entry.pid} == {"root", "root/robots", "root/lidars"}
     assert recording.missed == 0
@@ -87,6 +102,7 @@ def test_a_load_of_what_is_loaded_has_its_own_messages_and_not_the_callback_of_t
     with shops.record() as recording:
         first = app.load("robots/thing", Order("r2"))
         second = other.load("robots/thing", Order("r2"))
+        wait_recorded(recording, second, "other>robots Load", "robots>other Loaded")
 
     assert names(recording.trace(second)) == ["other>robots Load", "robots>other Loaded"]
     assert "robots load began" in names(recording.trace(first))
@@ -116,6 +132,7 @@ def test_an_answer_is_sent_before_it_is_received(start: Start) -> None:
     app.load("preempted/thing", "x")
     with system.record() as recording:
         query = app.load("preempted/thing", "x")
+        wait_recorded(recording, query, "preempted>app Loaded")
     trace = recording.trace(query)
 
     assert [(entry.registrar, entry.event, entry.name) for entry in trace.entries] == [
@@ -153,6 +170,7 @@ def test_an_unload_and_a_status_are_in_the_trace_of_their_query(shops: rr.System
         shops.registrar("lidars").send_status(front.id, rr.Status("WARNING", "dirty"))
         statuses.wait()
         query.unload()
+        wait_recorded(recording, query, "app>robots Unload", "robots>app Unloaded", "lidars unload ended")
     heard = names(recording.trace(query))
 
     assert heard.index("lidars>robots Noticed") < heard.index("robots status began") < heard.index("robots>app Noticed")
@@ -190,6 +208,7 @@ def test_the_death_of_a_manager_in_the_middle_of_a_load_is_in_the_trace(shops: r
         workshop.open("load r2")
         query = loading.get(timeout=30)
         eventually(lambda: any(entry.event == "restarted" for entry in recording.entries()))
+        wait_recorded(recording, query, "robots load ended")
     trace = recording.trace(query)
     diagram = trace.sequence()
 
@@ -284,6 +303,7 @@ def test_spans_have_their_parents_in_other_processes(shops: rr.System) -> None:
     app = shops.open_registrar("app")
     with shops.record() as recording:
         query = app.load("robots/thing", Order("r2", ("lidars/thing:front",)))
+        wait_recorded(recording, query, *LOAD_WITH_A_PART)
     exporter = InMemorySpanExporter()
     exporter.export(recording.trace(query).spans())
     spans: dict[str, Any] = {span.name: span for span in exporter.get_finished_spans()}
