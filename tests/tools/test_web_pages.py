@@ -63,10 +63,10 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.S
         tab.do(tab.locate(node("root/shop")).click())
         tab.clicks("kill -9")
         tab.sees("body", f"sent SIGKILL to root/shop (pid {pid})")
+        tab.sees(node("root"), "1/3")  # first: the window empties by itself
         tab.sees(node("root/shop"), "↻1", "running")
-        tab.sees(node("root"), "1/3")
         tab.sees(".rr-rows", "SIGKILL", "restarted")
-        tab.sees(node("root"), "0/3")  # the window empties by itself
+        tab.sees(node("root"), "0/3")
         tab.clicks("stop")
         tab.sees(node("root/shop"), "■", "stopped")
         assert child(shop, "shop").state == "stopped"
@@ -140,17 +140,34 @@ def test_a_page_without_the_token_shows_nothing(shop: rr.System, tab: Tab) -> No
 # -- resources -------------------------------------------------------------------------------------------------------
 
 
+LOOKS = """(chart) => {
+    if (!chart || !chart.getOption()) return "";
+    const graph = chart.getOption().series[1];
+    const looks = (n) => [n.label.formatter, n.itemStyle.opacity, n.itemStyle.borderWidth || 0];
+    return JSON.stringify([graph.data.map(looks), graph.links.length]);
+}"""
+CHART = """(() => {
+    const element = document.querySelector('.nicegui-echart');
+    return element && getElement(element.id.slice(1)).chart;
+})()"""
+
+
 def titles(tab: Tab) -> str:
     """What the graph draws, as ECharts has it: names, labels, sizes."""
-    script = """() => {
-        const element = document.querySelector('.nicegui-echart');
-        const chart = element && getElement(element.id.slice(1)).chart;
-        if (!chart || !chart.getOption()) return "";
-        const graph = chart.getOption().series[1];
-        const looks = (n) => [n.label.formatter, n.itemStyle.opacity, n.itemStyle.borderWidth || 0];
-        return JSON.stringify([graph.data.map(looks), graph.links.length]);
-    }"""
-    return tab.do(tab.page.evaluate(script))
+    return tab.do(tab.page.evaluate(f"({LOOKS})({CHART})"))
+
+
+def keep_pictures(tab: Tab) -> None:
+    """Have the page keep what the graph draws from now on: some of it is soon gone."""
+    script = f"""() => {{
+        const chart = {CHART}, draw = chart.setOption;
+        window.pictures = [];
+        chart.setOption = (...options) => {{
+            draw.apply(chart, options);
+            window.pictures.push(({LOOKS})(chart));
+        }};
+    }}"""
+    tab.do(tab.page.evaluate(script))
 
 
 def sees_drawn(tab: Tab, *words: str) -> None:
@@ -194,9 +211,16 @@ def test_a_status_is_seen_travelling_up(camera: rr.System, tab: Tab) -> None:
         tab.goes_to(page.url)
         tab.goes_to(page.url.partition("?")[0] + "resources")
         sees_drawn(tab, "lens")
-        provider.send_status(lens.id, rr.Status("WARNING", "dirty"))
-        for name in ('! lens \\"50 mm\\"', '! camera \\"front\\"', "@app"):
-            sees_drawn(tab, f'["{name}",1,6]')
+        keep_pictures(tab)
+
+        def travelled() -> bool:
+            """Send a status. A page that hears of it a second late shows nothing of its way."""
+            provider.send_status(lens.id, rr.Status("WARNING", "dirty"))
+            tab.do(asyncio.sleep(ON_ITS_WAY_S))
+            pictures = tab.do(tab.page.evaluate("window.pictures.join()"))
+            return all(f'["{name}",1,6]' in pictures for name in WAY)
+
+        tab.waits(travelled, f"a status that travels over {WAY}")
         sees_drawn(tab, '["! lens \\"50 mm\\"",1,0]')  # it has passed
 
 
@@ -261,6 +285,9 @@ def test_the_slider_shows_the_graph_as_it_was_whatever_happens_meanwhile(camera:
 
 
 PARTS = ("front", "table", "50 mm")
+WAY = ('! lens \\"50 mm\\"', '! camera \\"front\\"', "@app")
+ON_ITS_WAY_S = 2.0
+"""How long a status travels in the picture: two steps of 0.5 s, and the last that it reaches stands out for 1 s."""
 MANY = 100_000
 
 
