@@ -24,7 +24,7 @@ from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
 from rr_actors.tools import console_verbs, graphs
 from rr_actors.tools.explanations import ago
-from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
+from support import REPOSITORY, Calls, Gate, Workshop, eventually, kill, pid_of, serve, wait_gone, wait_respawned
 from support_cli import run_cli
 from support_managers import Order, Shop
 
@@ -190,8 +190,7 @@ def test_following_ends_with_the_system_and_with_ctrl_c(shop: rr.System) -> None
 
 
 def test_history_tells_why_a_child_ended(shop: rr.System) -> None:
-    os.kill(shop.ref("shop").pid or 0, signal.SIGKILL)
-    eventually(lambda: shop.tree().data["children"][0]["restarts"])
+    wait_respawned(shop, "shop", kill(shop, "shop"))
 
     assert "SIGKILL" in said("history", "shop")
     lines = [json.loads(line) for line in said("history", "--json").splitlines()]
@@ -552,8 +551,7 @@ def test_time_spans_are_readable() -> None:
 def test_events_about_something_are_those_that_mention_it_with_and_without_follow(
     shop: rr.System, app: rr.Registrar
 ) -> None:
-    kill(shop, "shop")
-    eventually(lambda: child(shop, "shop").state == "running")
+    wait_respawned(shop, "shop", kill(shop, "shop"))
 
     assert "exited" in said("events", "--about", "root/sh")
     assert "exited" in said("events", "--about", "SIGKILL", "--json")
@@ -561,9 +559,9 @@ def test_events_about_something_are_those_that_mention_it_with_and_without_follo
     assert said("events", "--about", "root/nobody") == ""
     asked = command("events", "--follow", "--about", "shop/thi", "--count", 1)
     with subprocess.Popen(asked, stdout=subprocess.PIPE, text=True) as following:
-        assert shop._console is not None
-        feed = shop._console.feed
-        eventually(lambda: feed._readers)
+        assert shop._node is not None
+        watched = shop._node.watched
+        eventually(lambda: bool(watched))
         app.load("shop/thing", Order("lamp"))
         line, _ = following.communicate(timeout=30)
     assert "loaded" in line
@@ -704,8 +702,11 @@ def test_a_narrow_terminal_wraps_a_table_rather_than_leaving_out_its_columns(sho
 
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
     assert "recorded" in said("record", tmp_path / "one", "--seconds", "0.2")
+    assert shop._node is not None
+    watched = shop._node.watched
+    eventually(lambda: not watched.recording)
     with subprocess.Popen(command("record", tmp_path / "two"), stdout=subprocess.PIPE, text=True) as recording:
-        eventually(lambda: (tmp_path / "two").exists())
+        eventually(lambda: watched.recording)
         shop.stop()
         told, _ = recording.communicate(timeout=20)
 
