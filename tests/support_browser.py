@@ -118,7 +118,7 @@ class Tab:
         self.asked: list[str] = []
         self.outside: list[str] = []
         self.errors: list[str] = []
-        self.expected = ("net::ERR_", "WebSocket")
+        self.expected: tuple[str, ...] = ("net::ERR_", "WebSocket")
         self._chromium = chromium
         page.set_default_timeout(PATIENCE_S * 1000)
         context.on("request", lambda request: self._note(request.url))
