@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Iterable
 from typing import Any, Literal
 
 from rr_actors.base.errors import RrError, UsageError
@@ -13,6 +14,7 @@ from rr_actors.system.console.console_messages import ChildRow
 
 Part = Literal["tree", "dependencies", "both"]
 _LABEL = 60  # characters of a request
+_HOLDER = "holder "  # no id of a resource begins so
 
 
 def mermaid(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> str:
@@ -38,10 +40,8 @@ def svg(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> s
         boxes |= svg_boxes(root)
         edges += tree_edges(root)
     if part != "tree":
-        known = {resource.id for resource in resources}
-        held = [(above if above in known else f"holder {above}", below) for above, below in edges_of(resources)]
-        holders = [above for above, _ in held if above not in known]
-        boxes |= {above: Box([above.removeprefix("holder ")], "#eeeeff", True) for above in holders}
+        held = edges_of(resources, _HOLDER)
+        boxes |= {holder: Box([name], "#eeeeff", True) for holder, name in _holders(held)}
         boxes |= {one.id: Box(_resource_lines(one), _COLOURS.get(one.state, "#ffffff")) for one in resources}
         edges += held
     return draw(boxes, edges)
@@ -85,18 +85,32 @@ def _nested(rows: list[ChildRow]) -> dict[str, Any]:
     return nodes[rows[0].path]
 
 
-def edges_of(resources: list[ResourceRow]) -> list[tuple[str, str]]:
+def edges_of(resources: Iterable[ResourceRow], mark: str) -> list[tuple[str, str]]:
     """Return pairs of a holder and the id of the resource that it holds.
 
-    A holder is the id of a resource, or the name of a registrar that holds for itself.
+    A holder is the id of a resource, or `mark` and the name of a registrar that holds for itself.
     """
     known = {resource.id for resource in resources}
     found: dict[tuple[str, str], None] = {}
     for resource in resources:
         for holder in resource.holders:
-            above = holder.parent if holder.parent in known else holder.origin
+            above = holder.parent if holder.parent in known else mark + holder.origin
             found[above, resource.id] = None
     return list(found)
+
+
+def _holders(edges: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return the holders among these edges that are registrars, each once, with their names."""
+    marked = dict.fromkeys(above for above, _ in edges if above.startswith(_HOLDER))
+    return [(holder, holder.removeprefix(_HOLDER)) for holder in marked]
+
+
+def _by_registrar(resources: list[ResourceRow]) -> list[tuple[str, list[ResourceRow]]]:
+    """Return the registrars in the order of their names, each with its resources."""
+    found: dict[str, list[ResourceRow]] = {}
+    for resource in resources:
+        found.setdefault(resource.server.partition("/")[0], []).append(resource)
+    return sorted(found.items())
 
 
 def _label(resource: ResourceRow) -> str:
@@ -107,29 +121,23 @@ def _label(resource: ResourceRow) -> str:
 def _mermaid_dependencies(resources: list[ResourceRow]) -> list[str]:
     names = {resource.id: f"r{number}" for number, resource in enumerate(resources)}
     lines: list[str] = []
-    for number, registrar in enumerate(sorted({resource.server.partition("/")[0] for resource in resources})):
+    for number, (registrar, mine) in enumerate(_by_registrar(resources)):
         lines.append(f"    subgraph g{number}[{mermaid_text(registrar)}]")
-        mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
         lines += [f"        {names[resource.id]}[{mermaid_text(_label(resource))}]" for resource in mine]
         lines.append("    end")
-    edges = edges_of(resources)
-    for number, above in enumerate(dict.fromkeys(above for above, _ in edges if above not in names)):
-        names[above] = f"h{number}"
-        lines.append(f"    h{number}([{mermaid_text(above)}])")
+    edges = edges_of(resources, _HOLDER)
+    for number, (holder, name) in enumerate(_holders(edges)):
+        names[holder] = f"h{number}"
+        lines.append(f"    h{number}([{mermaid_text(name)}])")
     return [*lines, *(f"    {names[above]} --> {names[below]}" for above, below in edges)]
 
 
 def _dot_dependencies(resources: list[ResourceRow]) -> list[str]:
     lines: list[str] = []
-    for registrar in sorted({resource.server.partition("/")[0] for resource in resources}):
-        mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
+    for registrar, mine in _by_registrar(resources):
         lines.append(f"    subgraph {dot_text(f'cluster_{registrar}')} {{ label={dot_text(registrar)}")
         lines += [f"        {dot_text(resource.id)} [label={dot_text(_label(resource))}]" for resource in mine]
         lines.append("    }")
-    known = {resource.id for resource in resources}
-    edges = edges_of(resources)
-    for above in dict.fromkeys(above for above, _ in edges if above not in known):
-        lines.append(f"    {dot_text(f'holder {above}')} [label={dot_text(above)}, shape=ellipse]")
-    for above, below in edges:
-        lines.append(f"    {dot_text(above if above in known else f'holder {above}')} -> {dot_text(below)}")
-    return lines
+    edges = edges_of(resources, _HOLDER)
+    lines += [f"    {dot_text(holder)} [label={dot_text(name)}, shape=ellipse]" for holder, name in _holders(edges)]
+    return [*lines, *(f"    {dot_text(above)} -> {dot_text(below)}" for above, below in edges)]

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from rr_actors.base.config import CATALOG_FILE
@@ -25,9 +24,9 @@ from rr_actors.registrar.model.rows import (
     Query,
     Resource,
     Row,
-    ServerType,
     State,
     StoredServer,
+    content_of,
     is_own,
 )
 from rr_actors.storage.opening import read_rows
@@ -35,19 +34,20 @@ from rr_actors.storage.opening import read_rows
 _SECOND_LOOK_S = 0.5
 
 
-@dataclass
 class Contents:
     """The rows of one catalog, by id; `damage` says why it could not be read."""
 
-    name: str
-    path: Path
-    resources: dict[str, Resource] = field(default_factory=dict[str, Resource])
-    queries: dict[str, Query] = field(default_factory=dict[str, Query])
-    held: dict[str, Held] = field(default_factory=dict[str, Held])
-    notices: dict[str, Notice] = field(default_factory=dict[str, Notice])
-    peers: set[str] = field(default_factory=set[str])
-    stored_servers: set[str] = field(default_factory=set[str])
-    damage: str = ""
+    def __init__(self, name: str, path: Path, rows: Iterable[Row] = (), damage: str = "") -> None:
+        self.name = name
+        self.path = path
+        self.damage = damage
+        tables = content_of(rows)
+        self.resources: dict[str, Resource] = tables["resources"]
+        self.queries: dict[str, Query] = tables["queries"]
+        self.held: dict[str, Held] = tables["held"]
+        self.notices: dict[str, Notice] = tables["notices"]
+        self.peers: dict[str, Peer] = tables["peers"]
+        self.stored_servers: dict[str, StoredServer] = tables["stored_servers"]
 
     def holders(self, resource_id: str) -> list[Query]:
         """Return the queries on a resource, in the order of their ids, and so of their creation."""
@@ -56,24 +56,6 @@ class Contents:
     def parts(self, resource_id: str) -> list[Held]:
         """Return the queries that a resource holds elsewhere, oldest first."""
         return sorted((h for h in self.held.values() if h.parent == resource_id), key=lambda held: held.seq)
-
-    def add(self, row: Row) -> None:
-        """Add a row to the rows of its kind."""
-        match row:
-            case Resource():
-                self.resources[row.id] = row
-            case Query():
-                self.queries[row.id] = row
-            case Held():
-                self.held[row.id] = row
-            case Notice():
-                self.notices[row.id] = row
-            case Peer():
-                self.peers.add(row.id)
-            case StoredServer():
-                self.stored_servers.add(row.id)
-            case ServerType():
-                pass
 
 
 def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
@@ -118,13 +100,10 @@ def _catalogs(root: Path) -> list[Path]:
 
 
 def _read(path: Path) -> Contents:
-    contents = Contents(path.parent.name, path)
     try:
-        for row in read_rows(path):
-            contents.add(row)
+        return Contents(path.parent.name, path, read_rows(path))
     except CatalogError as error:
-        contents.damage = str(error)
-    return contents
+        return Contents(path.parent.name, path, damage=str(error))
 
 
 def check_state(state_dir: str | os.PathLike[str]) -> list[str]:

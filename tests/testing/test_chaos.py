@@ -20,7 +20,7 @@ from typing import Any, cast
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, Row, State
 from rr_actors.testing.callback_log import Journal, Line, check_journal, read_journal
 from rr_actors.testing.invariants import check_at_rest, check_empty, check_told
 from rr_actors.testing.monkey import Monkey
@@ -327,13 +327,13 @@ def test_a_killed_process_leaves_whole_lines_and_a_long_journal_several_files(tm
 # -- the catalogs --------------------------------------------------------------------------------------------------
 
 
-def agreeing() -> dict[str, Contents]:
-    """App holds query q on resource q of the maker."""
-    maker, app = Contents("maker", Path("maker")), Contents("app", Path("app"))
-    maker.add(Resource("q", "thing", b"1", b"2", Phase.LOADED, State.OK, "", 1))
-    maker.add(Query("q", "q", "app", "", 1, 1))
-    app.add(Held("q", "maker", "thing", b"1", b"2", "q", "", 1, 1, Hold.HELD, State.OK))
-    return {"maker": maker, "app": app}
+def agreeing(*more: Row) -> dict[str, Contents]:
+    """App holds query q on resource q of the maker; `more` rows come after these, or take their place."""
+    resource = Resource("q", "thing", b"1", b"2", Phase.LOADED, State.OK, "", 1)
+    held = Held("q", "maker", "thing", b"1", b"2", "q", "", 1, 1, Hold.HELD, State.OK)
+    of_maker = [resource, Query("q", "q", "app", "", 1, 1), *(row for row in more if not isinstance(row, Held))]
+    of_app = [held, *(row for row in more if isinstance(row, Held))]
+    return {name: Contents(name, Path(name), rows) for name, rows in (("maker", of_maker), ("app", of_app))}
 
 
 def test_agreeing_catalogs_are_at_rest_and_not_empty() -> None:
@@ -344,10 +344,8 @@ def test_agreeing_catalogs_are_at_rest_and_not_empty() -> None:
 
 
 def test_whatever_moves_hangs_or_disagrees_is_found() -> None:
-    def wrong(*rows: Resource | Query | Held | Notice, lacks: str = "") -> str:
-        state = agreeing()
-        for row in rows:
-            state["app" if isinstance(row, Held) else "maker"].add(row)
+    def wrong(*rows: Row, lacks: str = "") -> str:
+        state = agreeing(*rows)
         if lacks:
             getattr(state["app" if lacks == "held" else "maker"], lacks).clear()
         return "; ".join(check_at_rest(state))

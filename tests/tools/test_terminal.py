@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import shlex
 import shutil
@@ -21,7 +20,6 @@ from textual.pilot import Pilot
 import rr_actors as rr
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import NotRunning
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import EventsPane, Pane, Terminal
 from rr_actors.tools.terminal.terminal_rows import Served, Tree, Window
@@ -261,11 +259,7 @@ def test_a_thread_that_follows_ends_when_the_link_is_closed(start: Start, state_
     link = ConsoleLink(state_dir)
     reached = threading.Event()
 
-    def follow() -> None:
-        with contextlib.suppress(NotRunning):  # it was closed before the system had answered
-            link.follow(lambda welcome: reached.set(), lambda part: None)
-
-    following = threading.Thread(target=follow)
+    following = threading.Thread(target=link.follow, args=(lambda _welcome: reached.set(), lambda _part: None))
     following.start()
     assert reached.wait(LIMIT_S)
 

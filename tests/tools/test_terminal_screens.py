@@ -104,10 +104,11 @@ class Stage(ConsoleLink):
             case _:
                 return c.Queries(0, [])
 
-    def follow(self, found: Callable[[c.Welcome], None], hear: Callable[[c.Events | c.Missed], None]) -> None:
+    def follow(self, found: Callable[[c.Welcome], None], hear: Callable[[c.Events | c.Missed], None]) -> str:
         found(c.Welcome(1, "robot", PID, "/srv/robot", NOW - 100))
         hear(c.Events(EVENTS))
         self._closed.wait(LIMIT_S)
+        return "the link is closed"
 
     def close(self) -> None:
         self._closed.set()

@@ -6,7 +6,8 @@ import os
 from collections.abc import Callable
 from typing import TypeVar
 
-from rr_actors.system.console.console_client import Connections, find_console
+from rr_actors.base.errors import RrError
+from rr_actors.system.console.console_client import Connections, NotRunning, find_console
 from rr_actors.system.console.console_messages import Events, Follow, Missed, Request, Welcome
 
 _A = TypeVar("_A")
@@ -41,17 +42,21 @@ class ConsoleLink:
         """
         return self._connections.ask(request, expected, timeout_s)
 
-    def follow(self, found: Callable[[Welcome], None], hear: Callable[[Events | Missed], None]) -> None:
-        """Call `found` when the system is reached, then `hear` with its events. Return when the system ends.
+    def follow(self, found: Callable[[Welcome], None], hear: Callable[[Events | Missed], None]) -> str:
+        """Call `found` when the system is reached, then `hear` with its events; return why that has ended.
 
-        Raises:
-            NotRunning: no system runs in the state directory, or the link is closed.
-            RrError: the system refused the connection.
+        It ends when the system does, or when the link is closed; at once if no system runs, or if it refuses.
         """
-        with self._connections.open() as client:
-            found(client.welcome)
-            for part in client.follow(Follow()):
-                hear(part)
+        try:
+            with self._connections.open() as client:
+                found(client.welcome)
+                for part in client.follow(Follow()):
+                    hear(part)
+        except NotRunning:
+            return f"no system runs in {self.state_dir}"
+        except RrError as error:
+            return str(error)
+        return f"the system in {self.state_dir} has stopped"
 
     def close(self) -> None:
         """Close all connections. Calls that wait in other threads raise NotRunning. A second call does nothing."""

@@ -526,13 +526,7 @@ class Terminal(App[None]):
     async def _follow(self) -> None:
         """Take the system's events, and when the system ends, look for it until it runs again."""
         while True:
-            try:
-                await self._in_thread(self._link.follow, self._reached, self._hear)
-                problem = f"the system in {self._link.state_dir} has stopped"
-            except NotRunning:
-                problem = f"no system runs in {self._link.state_dir}"
-            except RrError as error:
-                problem = str(error)
+            problem = await self._in_thread(self._link.follow, self._reached, self._hear)
             self._lose(f"{problem}: waiting for it; q leaves")
             await asyncio.sleep(_AGAIN_S)
 

@@ -32,8 +32,7 @@ _TEXT = 34
 
 def edges_in(moment: Moment) -> list[Edge]:
     """Return pairs of a holder and the resource that it holds: resources as ids, registrars as "@name"."""
-    known = {row.id for row in moment.resources}
-    return [(above if above in known else f"@{above}", below) for above, below in edges_of(list(moment.resources))]
+    return edges_of(moment.resources, "@")
 
 
 def around(chosen: str, edges: Iterable[Edge]) -> set[str]:

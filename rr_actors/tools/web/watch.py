@@ -20,7 +20,6 @@ import msgspec
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import NotRunning
 from rr_actors.tools.terminal.console_link import ConsoleLink
 
 GROUPED_FROM = 300
@@ -134,13 +133,7 @@ class Watch:
 
     def _follow(self) -> None:
         while not self._closed.is_set():
-            try:
-                self.link.follow(self._reached, self._hear)
-                problem = f"the system in {self.link.state_dir} has stopped"
-            except NotRunning:
-                problem = f"no system runs in {self.link.state_dir}"
-            except RrError as error:
-                problem = str(error)
+            problem = self.link.follow(self._reached, self._hear)
             if not self.now.problem:
                 self._add(replace(self.now, at=time.time(), problem=problem))
             self._closed.wait(_AGAIN_S)
