@@ -8,17 +8,16 @@ import inspect
 import math
 import os
 from collections.abc import Callable, Generator, Sequence
-from types import TracebackType
 from typing import Any, TypeGuard, cast
 
 from rr_actors.base.errors import InvalidName, InvalidSpec, RrError, UsageError, exact_text, is_a, shown, text_of
-from rr_actors.base.names import check_name
+from rr_actors.base.names import NAME_RULE, check_name
 
 # Checks of specification fields: each failure is an InvalidSpec with the field, the expected and the actual value.
 
 
 @contextlib.contextmanager
-def examined(who: str) -> Generator[None, None, None]:
+def examined(who: str) -> Generator[None]:
     """Turn an error of a user's code, which the block runs to examine a user's value, into an InvalidSpec of `who`."""
     try:
         yield
@@ -79,8 +78,7 @@ def check_id(value: object, who: str) -> None:
     try:
         check_name(value, "id")
     except InvalidName as error:
-        expected = "1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'"
-        raise invalid(who, "id", expected, value) from error
+        raise invalid(who, "id", NAME_RULE, value) from error
 
 
 def path_text(path: object) -> str:
@@ -131,8 +129,9 @@ def check_takes(callback: Callable[..., Any], names: Sequence[str], who: str, fi
 # Checks of installed libraries: those of an extra are imported where they are first needed.
 
 
-class Extra:
-    """Guard the import of a module that needs the libraries of an extra, as the context of a `with` block.
+@contextlib.contextmanager
+def needing(what: str, extra: str, instead: str = "") -> Generator[None]:
+    """Guard the import of a module that needs the libraries of an extra.
 
     Args:
         what: the part that needs the libraries, for the error: "web".
@@ -142,23 +141,17 @@ class Extra:
     Raises:
         UsageError: a library is not installed; the text names the library and the extra.
     """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library in ("", "rr_actors"):
+            raise
+        raise missing_library(library, what, extra, instead) from error
 
-    def __init__(self, what: str, extra: str, instead: str = "") -> None:
-        self._what = what
-        self._extra = extra
-        self._instead = instead
 
-    def missing(self, library: str) -> UsageError:
-        """Return the error for a library that is not installed."""
-        install = f"pip install 'rr-actors[{self._extra}]' (in a checkout: '.[{self._extra}]'){self._instead}"
-        text = f"{self._what} needs the library {library}, which is not installed. Install it with: {install}"
-        return UsageError(text, library=library, extra=self._extra)
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: BaseException | None, _traceback: TracebackType | None) -> None:
-        if isinstance(error, ModuleNotFoundError):
-            library = (error.name or "").partition(".")[0]
-            if library not in ("", "rr_actors"):
-                raise self.missing(library) from error
+def missing_library(library: str, what: str, extra: str, instead: str = "") -> UsageError:
+    """Return the error for a library that is not installed; the other arguments are those of needing()."""
+    install = f"pip install 'rr-actors[{extra}]' (in a checkout: '.[{extra}]'){instead}"
+    text = f"{what} needs the library {library}, which is not installed. Install it with: {install}"
+    return UsageError(text, library=library, extra=extra)

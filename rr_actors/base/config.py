@@ -24,7 +24,7 @@ import msgspec
 
 from rr_actors.base.checks import has_home, is_number, path_text
 from rr_actors.base.errors import InvalidName
-from rr_actors.base.names import check_name
+from rr_actors.base.names import NAME_RULE, check_name
 from rr_actors.base.toml import check_keys, file_name, read_toml, wrong
 
 Durability = Literal["process", "power", "none"]
@@ -150,10 +150,8 @@ class SystemConfig:
 
     def registrar(self, name: str) -> RegistrarConfig:
         """Return the configuration of the registrar called `name`."""
-        found = self.registrars.get(name)
-        if found is None:
-            return RegistrarConfig(name=name, durability=self.durability)
-        return found if found.name == name else dataclasses.replace(found, name=name)
+        found = self.registrars.get(name) or RegistrarConfig(durability=self.durability)
+        return dataclasses.replace(found, name=name)
 
 
 # -- the values that each key accepts ------------------------------------------------------------------------------
@@ -208,7 +206,7 @@ _BOOL = _Rule("true or false", lambda value: isinstance(value, bool))
 _DURABILITY = _one_of("process", "power", "none")
 
 _REGISTRAR_RULES: dict[str, _Rule] = {
-    "name": _Rule("a name: 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'", _is_name),
+    "name": _Rule(f"a name: {NAME_RULE}", _is_name),
     "location": _Rule("a directory's path", _is_location),
     "save_interval_s": _SECONDS,
     "save_on_modify": _BOOL,

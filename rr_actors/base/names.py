@@ -18,6 +18,7 @@ from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
 CLIENTS = "client."
 """The prefix of the registrars of clients (rr.connect()); no other registrar has it."""
 
+NAME_RULE = "1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'"
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
 
@@ -37,10 +38,7 @@ def check_name(name: object, what: str = "name") -> str:
         raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
     name = exact_text(name)
     if not _NAME.match(name):
-        raise InvalidName(
-            f"{what} {shown(name)}: expected 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'",
-            name=name,
-        )
+        raise InvalidName(f"{what} {shown(name)}: expected {NAME_RULE}", name=name)
     return name
 
 

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import cast
 
-from rr_actors.base.checks import Extra, check_takes, examined
+from rr_actors.base.checks import check_takes, examined, needing
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
 from rr_actors.registrar.engine.progress import Progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -78,7 +78,7 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     if progress is False or progress is None:
         return None
     if progress is True:
-        with Extra("load: progress=True", "progress", ", or give a callable: load(..., progress=print)"):
+        with needing("load: progress=True", "progress", ", or give a callable: load(..., progress=print)"):
             from rr_actors.registrar.progress_bar import Bar  # `import rr_actors` works without it
         bar = Bar()
         return Hearer(actor, bar.show, bar.close)

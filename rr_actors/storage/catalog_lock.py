@@ -53,12 +53,11 @@ class CatalogLock:
         self._folder = folder
         self._catalog = catalog
         self._name = catalog.with_suffix(".lock").name
-        self._file = self._taken()
+        self._take()
         while not self.is_there():  # its last holder erased the catalog, and this file with it
             self._file.close()
-            self._file = self._taken()
+            self._take()
         _locks.add(self)
-        self._size = os.fstat(self._file.fileno()).st_size
         self.reached = _read(self._file)[1]
         self._write(os.getpid())
 
@@ -109,13 +108,13 @@ class CatalogLock:
             " temporary files",
             self._folder.path / self._name,
         )
-        file = self._taken()
-        lost, self._file, self._size = self._file, file, os.fstat(file.fileno()).st_size
+        lost = self._file
+        self._take()
         lost.close()
         self._write(os.getpid())
 
-    def _taken(self) -> io.FileIO:
-        """Open and lock the lock's file, and return it."""
+    def _take(self) -> None:
+        """Open and lock the lock's file."""
         try:
             file = self._folder.open(self._name, os.O_RDWR | os.O_CREAT)
         except NotAFile as error:
@@ -136,7 +135,7 @@ class CatalogLock:
                 path=str(self._catalog),
                 pid=pid,
             ) from error
-        return file
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
 
     def _write(self, pid: int | None) -> None:
         """Write pid and progress in one call, with a fixed length: a killed process leaves the old text or the new."""

@@ -8,7 +8,7 @@ import sys
 import time
 from typing import Self
 
-from rr_actors.base.checks import Extra
+from rr_actors.base.checks import missing_library
 from rr_actors.base.errors import Unavailable, shown
 from rr_actors.runtime.processes.lifeline import is_readable, kill_group
 
@@ -30,7 +30,7 @@ class WebPage:
     def __init__(self, state_dir: str, host: str, port: int) -> None:
         for library in _LIBRARIES:
             if importlib.machinery.PathFinder.find_spec(library) is None:
-                raise Extra("serve_web", "web").missing(library)
+                raise missing_library(library, "serve_web", "web")
         where = ["--state", state_dir, "--host", host, "--port", str(port), "--child"]
         self._program = subprocess.Popen(
             [sys.executable, "-m", "rr_actors", "web", *where],

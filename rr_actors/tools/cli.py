@@ -10,7 +10,7 @@ import os
 import sys
 from typing import NoReturn
 
-from rr_actors.base.checks import Extra
+from rr_actors.base.checks import needing
 from rr_actors.base.errors import CatalogError, RrError, UsageError
 from rr_actors.system.console.console_client import NotRunning
 
@@ -20,7 +20,7 @@ def main() -> None:
     if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison] - Python sets None if it was closed
         _leave("rr-actors: expected a standard output, got a closed one")
     try:
-        with Extra("the command line", "cli"):  # import rr_actors.tools.cli works without it
+        with needing("the command line", "cli"):  # import rr_actors.tools.cli works without it
             from rr_actors.tools.recording_verbs import app
         app(standalone_mode=True)
     except RrError as error:

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rr_actors.actors.messaging.dead_letters import DeadLetters
-from rr_actors.base.checks import Extra
+from rr_actors.base.checks import needing
 from rr_actors.base.errors import RrError, UsageError, shown
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
@@ -283,7 +283,7 @@ def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOpti
 @app.command(epilog="Example: rr-actors top --state rr_state")
 def top(state: StateOption = None) -> None:
     """Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys."""
-    with Extra("top", "top"):  # the other verbs work without it
+    with needing("top", "top"):  # the other verbs work without it
         from rr_actors.tools.terminal.terminal_app import watch
     watch(state)
 
@@ -297,7 +297,7 @@ def web(
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
 ) -> None:
     """Serve a live web page of a running system: its tree, its resources, the last minutes; print its address."""
-    with Extra("web", "web"):  # the other verbs work without it
+    with needing("web", "web"):  # the other verbs work without it
         from rr_actors.tools.web.web_server import serve
     serve(state, lab=lab, host=host, port=port, is_child=child, say=typer.echo)
 

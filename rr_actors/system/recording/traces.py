@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.base.checks import Extra
+from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotFound, UsageError, shown
 from rr_actors.base.notebook import bundle, table
 from rr_actors.registrar.model.recorded import Entry
@@ -53,7 +53,7 @@ class Trace:
         Raises:
             UsageError: the extra is not installed.
         """
-        with Extra("spans()", "otel"):  # even an installed extra is imported only here
+        with needing("spans()", "otel"):  # even an installed extra is imported only here
             from rr_actors.system.recording.otel_export import span_of
         return [span_of(timing) for timing in self.timings()]
 
