@@ -41,7 +41,6 @@ from rr_actors.base.values.codecs import (
 from rr_actors.base.values.fitting import (
     Mark,
     Misfit,
-    Unfit,
     bare,
     fit,
     plain,
@@ -131,8 +130,8 @@ class Codec:
             first = error
         try:  # perhaps the only reason is that the bytes name classes inside of declared types
             fitted = write_tree(fit(read_tree(raw), self._shape, what))
-        except Unfit as unfit:
-            _refuse(unfit.misfit, server, what, first)
+        except Misfit as misfit:
+            _refuse(misfit, server, what, first)
         except Exception:
             _refuse(_misfit(first, raw, self._shape, what), server, what, first)
         try:

@@ -34,20 +34,14 @@ class Mark:
         return hash((self.code, self.data))
 
 
-class Misfit(msgspec.Struct, frozen=True):
+class Misfit(Exception):
     """A value that does not fit a shape, and the path to it."""
 
-    path: str
-    expected: str
-    got: str
-
-
-class Unfit(Exception):
-    """A tree does not fit a shape."""
-
-    def __init__(self, misfit: Misfit) -> None:
-        super().__init__(misfit.got)
-        self.misfit = misfit
+    def __init__(self, path: str, expected: str, got: str) -> None:
+        super().__init__(got)
+        self.path = path
+        self.expected = expected
+        self.got = got
 
 
 # -- without a declared type ---------------------------------------------------------------------------------------
@@ -171,7 +165,7 @@ def bare(raw: bytes) -> bytes:
 def fit(node: Any, shape: Shape, path: str) -> Any:
     """Open each mark for which the shape declares a type, and return the tree.
 
-    Raise Unfit for a mark that this process cannot open, and any error for a damaged one.
+    Raise Misfit for a mark that this process cannot open, and any error for a damaged one.
     """
     if isinstance(shape, inspect.UnionType):
         shape = _chosen(shape, node)
@@ -243,11 +237,11 @@ def _chosen(shape: inspect.UnionType, node: Any) -> Shape:
 
 
 def _check_marks(node: Any, path: str) -> None:
-    """Raise Unfit if `restore` cannot open all marks in the tree."""
+    """Raise Misfit if `restore` cannot open all marks in the tree."""
     if isinstance(node, Mark):
         known = node.code in BY_CODE or node.code in (ARRAY, SCALAR)
         if not known and not (node.code == CODEC and codec_named(split_name(node.data)[0]) is not None):
-            raise Unfit(Misfit(path, name_of(inspect.AnyType()), _undeclared(node)))
+            raise Misfit(path, name_of(inspect.AnyType()), _undeclared(node))
         if node.code not in (ARRAY, SCALAR):
             _check_marks(opened(node), path)
     elif isinstance(node, dict):

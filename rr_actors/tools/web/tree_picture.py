@@ -60,7 +60,6 @@ class TreePicture(ui.element, component="tree_picture.js"):
         rows = [_node(row) for row in children]
         if rows != self._props["rows"] or chosen != self._props["chosen"]:
             self._props["rows"], self._props["chosen"] = rows, chosen
-            self.update()
 
 
 def _node(row: ChildRow) -> dict[str, Any]:

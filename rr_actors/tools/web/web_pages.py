@@ -260,7 +260,6 @@ class ResourcesPage(Page):
         options = graph_picture.chart(moment, self._chosen, self.step())
         self._graph.options.clear()
         self._graph.options.update(options)
-        self._graph.update()
         grouped = moment.total > GROUPED_FROM
         self._said.text = f"{moment.total} resources" + (": too many to draw, these are their registrars" * grouped)
         if self.at is None:
