@@ -99,7 +99,7 @@ def test_a_client_loads_shares_and_releases(client: rr.Client, camera: Served, p
 
 
 def test_what_a_client_holds_is_released_when_it_is_killed(
-    camera: Served, provider: rr.Registrar, program: Program
+    camera: Served, system: rr.System, provider: rr.Registrar, program: Program
 ) -> None:
     process = program("worker", "provider/camera", "front")
     assert process.stdout is not None
@@ -111,6 +111,7 @@ def test_what_a_client_holds_is_released_when_it_is_killed(
 
     eventually(lambda: provider.resources() == [])
     assert len(camera.unloads) == 1
+    eventually(lambda: "client.worker" not in system.snapshot()["registrars"])
     replaced = program("worker", "provider/camera", "front")  # the name is free again
     assert replaced.stdout is not None
     assert replaced.stdout.readline()
@@ -303,7 +304,7 @@ def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
     gate.open()
 
     eventually(lambda: provider.resources() == [])
-    assert worker.queries() == []
+    eventually(lambda: worker.queries() == [])
 
 
 def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(

@@ -534,6 +534,7 @@ def test_a_disk_that_is_slow_holds_up_nobody_and_what_there_is_no_room_for_is_co
         for number in range(10):
             app.load("provider/thing", number)
         eventually(lambda: recording.missed > 10)
+        eventually(lambda: sum(e.event == "received" and e.name == "Loaded" for e in everything.entries()) == 11)
         disk.open()
     everything.stop()
 
