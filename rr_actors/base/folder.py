@@ -178,6 +178,19 @@ class Folder:
         with self.open(name) as file:
             return file.readall()
 
+    def write(self, name: str, data: bytes, *, synced: bool = False) -> None:
+        """Write a file whole, by a rename: a crash, or with `synced` a power cut, leaves the old file or the new."""
+        new = f".{name}.new"
+        self.discard(new)  # left by a crash
+        with io.BufferedWriter(self.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)) as file:
+            file.write(data)
+            if synced:
+                file.flush()
+                os.fsync(file.fileno())
+        self.rename(new, name)
+        if synced:
+            os.fsync(self.fd)
+
     def look(self, name: str) -> os.stat_result | None:
         """Return a file's stat result, checked as by open(), without opening the file; None if there is no file."""
         try:

@@ -6,8 +6,6 @@ the registry's values.
 
 from __future__ import annotations
 
-import io
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -50,9 +48,5 @@ class Reliabilities:
 
     def _save(self) -> None:
         make_directories(self._path.parent)
-        new = self._path.with_suffix(".new").name
         with Folder.at(self._path.parent) as folder:
-            folder.discard(new)
-            with io.BufferedWriter(folder.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)) as file:
-                file.write(msgspec.json.format(msgspec.json.encode(self._record)))
-            folder.rename(new, self._path.name)
+            folder.write(self._path.name, msgspec.json.format(msgspec.json.encode(self._record)))

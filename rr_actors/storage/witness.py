@@ -16,7 +16,6 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.base.folder import Folder
-from rr_actors.storage.checked_records import write_whole
 
 _PLACE = ".catalogs"  # no registrar is called that
 
@@ -51,18 +50,10 @@ class Witness:
 
     def note(self, known: Known, *, synced: bool = False) -> None:
         """Record that the catalog was opened. `synced`: a power cut neither loses the record nor damages it."""
-        new = f".{self.registrar}.new"
+        body = msgspec.json.encode(known)
         with self._errors_logged(), Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
-            if place.has(new):
-                place.unlink(new)
-            with place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
-                body = msgspec.json.encode(known)
-                write_whole(file.fileno(), b"%08x %b\n" % (zlib.crc32(body), body), 0)
-                if synced:
-                    os.fsync(file.fileno())
-            place.rename(new, self.registrar)
+            place.write(self.registrar, b"%08x %b\n" % (zlib.crc32(body), body), synced=synced)
             if synced:
-                os.fsync(place.fd)
                 os.fsync(state.fd)
 
     def forget(self) -> None:
