@@ -26,12 +26,10 @@ _LISTS = (
 
 
 def shape_of(type_: Any, what: str) -> Shape:
-    """Return the type's shape; None stands for any plain value.
+    """Return the type's shape.
 
     Raise NotSerializable for a type that plain data cannot have; `.path` leads to the part.
     """
-    if type_ is None:
-        return inspect.AnyType()
     try:
         shape = inspect.type_info(type_)
         msgspec.msgpack.Decoder(type_)
