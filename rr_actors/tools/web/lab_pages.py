@@ -86,9 +86,9 @@ class LabPage:
         watch = running.watch
         self._status.text = f"{running.name} {'runs' if running.is_running else 'has ended'}"
         self._said.text = "\n".join(list(running.lines.copy())[-_LINES:])
-        if watch is None or watch.version == self._drawn:
+        if watch is None or (running, watch.version) == self._drawn:
             return
-        self._drawn = watch.version
+        self._drawn = running, watch.version
         self._tree.show(watch.now.children)
         self._graph_panel.set_visibility(bool(watch.now.registrars))
         self._graph.options.clear()
