@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections import deque
+import queue
 from collections.abc import Callable
 from typing import Any
 
 from rr_actors.registrar.model.messages import Load, Message
-from rr_actors.runtime.thread_wakeup import Bell, LockBell
 from rr_actors.runtime.time_limits import left_until
 from rr_actors.wire.transport import Hello
 
@@ -24,8 +23,7 @@ class LocalLine:
         self._registrar = registrar
         self.hello = hello
         self._unanswered = [None]  # only the thread that takes the entry out may answer
-        self._answers: deque[Message | None] = deque()
-        self._bell: Bell = LockBell()
+        self._answers: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self.epoch: int = registrar.epoch
 
     def exchange(self, message: Message, deadline: float) -> Message:
@@ -36,13 +34,14 @@ class LocalLine:
         origin, epoch = self.hello.origin, self.hello.epoch
         if type(message) is Load and (joined := self._registrar.join_here(message, epoch)) is not None:
             return joined
-        if not self._unanswered and not self._answers:
+        if not self._unanswered and self._answers.empty():
             self._unanswered.append(None)
         self._node.dispatcher.hand_over(consumers.received_directly, origin, epoch, self, message)
         left_s = left_until(deadline)
-        if not self._bell.wait(-1 if left_s is None else left_s):
-            raise TimeoutError
-        answer = self._answers.popleft()
+        try:
+            answer = self._answers.get(timeout=left_s)
+        except queue.Empty:
+            raise TimeoutError from None
         if answer is None:
             raise ConnectionResetError("the registrar was closed")
         return answer
@@ -53,8 +52,7 @@ class LocalLine:
             self._unanswered.pop()
         except IndexError:  # there is an answer already, and no thread waits
             return
-        self._answers.append(answer)
-        self._bell.ring()
+        self._answers.put(answer)
 
     def open_outlet(self) -> None:
         """Do nothing: any thread can answer on this line already."""
