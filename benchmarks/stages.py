@@ -45,11 +45,12 @@ class CannedLine:
 
     epoch = 1
 
-    def __init__(self) -> None:
+    def __init__(self, types: int) -> None:
         self._response = encode(Answer(PAYLOAD))
+        self._types = types
 
     def exchange(self, message: Any, deadline: float) -> Any:
-        return Loaded(message.query_id, "resource", self._response)
+        return Loaded(message.query_id, "resource", self._response, self._types)
 
     def cut(self) -> None:
         pass
@@ -114,7 +115,7 @@ def answered_at_once(consumer: rr.Registrar) -> Iterator[None]:
     (client,) = actor_of(consumer).clients.values()
     connections = client.connections
     assert connections is not None, "nothing has been loaded yet"
-    connections._idle.append(CannedLine())
+    connections._idle.append(CannedLine(client.checksums["echo"]))
     try:
         yield
     finally:

@@ -392,8 +392,7 @@ class Loads:
         """
         actor = self.actor
         client = actor.clients.get(query.registrar)
-        connections = None if client is None else client.connections
-        if connections is None:
+        if client is None or (connections := client.connections) is None:
             return False
         line: Exchange | None = None
         over: list[RrError] = []  # with the error, once the loop has ended this load; at any moment
@@ -428,10 +427,13 @@ class Loads:
             connections.drop_mine()
             raise
         else:
-            if type(answer) is Loaded and actor.hold(answer):
+            if type(answer) is Loaded and client.checksums.get(query.server, answer.types) != answer.types:
+                command = c.SendAgain(query.id)  # the link brings the types, and then the answer once more
+            elif type(answer) is Loaded and actor.hold(answer):
                 loaded_directly(query, answer.resource_id, answer.response)
                 return True
-            command = self._not_held(query, answer)
+            else:
+                command = self._not_held(query, answer)
         connections.drop_mine()
         if not over:
             left_s = left_until(deadline)

@@ -99,7 +99,8 @@ def test_it_is_in_memory_and_on_disk_when_it_is_answered_and_the_inbox_has_seen_
         patch.setattr(provider._actor.monitor, "put", None)
         (line,) = lines.ask(load("new"))
     (resource,) = provider.resources()
-    assert line.sent == [Loaded("new", resource.id, encode(resource.response))]
+    server = provider._actor.catalog.servers[resource.server]
+    assert line.sent == [Loaded("new", resource.id, encode(resource.response), server.types_checksum)]
     assert line.flushed == 1
     assert "new" in on_disk(state_dir)
     assert [len(resource.queries) for resource in provider.resources()] == [2]

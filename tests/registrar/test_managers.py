@@ -20,6 +20,7 @@ from typing import Any, Literal
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.model.messages import Loaded
 from rr_actors.system.hosting import remote_calls
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, child, eventually, hang, kill, pid_of, wait_respawned
 from support_managers import Made, Order, Shop
@@ -882,6 +883,34 @@ def test_a_server_that_is_registered_again_may_have_other_types(start: Start, wo
         query = app.load(f"{where}/again", request)
         assert (query.request, query.response) == (request, response)
         provider.unregister_server("again")
+
+
+@pytest.mark.parametrize("where", ["here", "there"])
+def test_a_response_is_read_with_its_own_types_though_a_thread_has_it_before_these_types(
+    start: Start, workshop: Workshop, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = start(*shops(workshop, "there"))
+    app = system.open_registrar("app")
+    provider = system.open_registrar("here") if where == "here" else system.registrar("there")
+    provider.register_server("again", lambda _: Feed("b", 1), request_type=OpenCamera, response_type=Feed)
+    first = app.load(f"{where}/again", OpenCamera("a"))
+    assert (first.request, first.response) == (OpenCamera("a"), Feed("b", 1))
+    provider.unregister_server("again")
+    actor = app._actor  # pyright: ignore[reportPrivateUsage]
+    client, receive = actor.clients[where], actor.monitor.receive
+    late: list[Any] = []
+
+    def receive_behind_types(message: Any, sender: str, *, more: bool) -> None:
+        if type(message) is Loaded:
+            monkeypatch.undo()
+            client._take_types(*late)  # pyright: ignore[reportPrivateUsage]
+        receive(message, sender, more=more)
+
+    monkeypatch.setattr(client, "_take_types", late.append)  # as though the loop had not read what the link has brought
+    monkeypatch.setattr(actor.monitor, "receive", receive_behind_types)
+    provider.register_server("again", lambda _: Made("d", "e", 2), request_type=Order, response_type=Made)
+    query = app.load(f"{where}/again", Order("c"))
+    assert (query.request, query.response) == (Order("c"), Made("d", "e", 2))
 
 
 # -- the whole system as data --------------------------------------------------------------------------------------

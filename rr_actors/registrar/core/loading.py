@@ -77,7 +77,7 @@ def _join(decision: Decision, message: Load, resource: Resource) -> None:
     if resource.phase is LOADED:
         if alone:
             decision.cause(SetTimer("linger:" + resource.id, None, None))
-        decision.cause(Reply(message.origin, Loaded(message.query_id, resource.id, resource.response or b"")))
+        decision.cause(Reply(message.origin, loaded(catalog, message.query_id, resource)))
         return
     decision.note(catalog.waiting, message.query_id, resource.id)
     if alone and resource.phase is LOADING:
@@ -103,6 +103,13 @@ def join(catalog: Catalog, message: Load) -> Query | None:
     return _query_of(message, resource.id)
 
 
+def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:
+    """Return the answer to a Load whose resource is loaded."""
+    server = catalog.servers.get(resource.server)
+    types = 0 if server is None else server.types_checksum
+    return Loaded(query_id, resource.id, resource.response or b"", types)
+
+
 def _load_again(decision: Decision, message: Load, query: Query) -> None:
     """Decide a Load of a known query: its answer was lost, or is still to come."""
     catalog = decision.catalog
@@ -113,7 +120,7 @@ def _load_again(decision: Decision, message: Load, query: Query) -> None:
         decision.note(catalog.waiting, query.id, resource.id)
         _look_for_ring(decision, message, resource)
     else:
-        decision.cause(Reply(query.origin, Loaded(query.id, resource.id, resource.response or b"")))
+        decision.cause(Reply(query.origin, loaded(catalog, query.id, resource)))
 
 
 def _look_for_ring(decision: Decision, message: Load, resource: Resource) -> None:
@@ -146,8 +153,7 @@ def load_done(decision: Decision, done: LoadDone) -> None:
     if holders:
         for query_id in holders:
             if decision.forget(catalog.waiting, query_id) is not None:
-                origin = catalog.queries[query_id].origin
-                decision.cause(Reply(origin, Loaded(query_id, resource.id, done.response)))
+                decision.cause(Reply(catalog.queries[query_id].origin, loaded(catalog, query_id, resource)))
         # The owner may have unloaded it while it was loading; its present holders came after that.
         decision.effects += answers_to_owners(decision, resource, None)
     else:

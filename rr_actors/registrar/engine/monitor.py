@@ -39,7 +39,7 @@ from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError, MailboxFull, RegistrarDown, RrError, Unavailable
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.decide import Item, decide, refuse_uncommitted
-from rr_actors.registrar.core.loading import join
+from rr_actors.registrar.core.loading import join, loaded
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved
@@ -173,8 +173,7 @@ class RegistrarState:
                 return None
             if not written:
                 return None
-            resource = catalog.resources[query.resource_id]
-            return Loaded(query.id, resource.id, resource.response or b"")
+            return loaded(catalog, query.id, catalog.resources[query.resource_id])
 
     # -- fast paths of a thread that loads and releases by its own direct line ---------------------------------------
 

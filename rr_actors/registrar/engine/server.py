@@ -11,6 +11,7 @@ import functools
 import inspect
 import logging
 import typing
+import zlib
 from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Any, NoReturn, cast
@@ -213,7 +214,7 @@ class ServerActor:
         self.restored = False  # whether it came from the catalog; then a second registration replaces it
         has = spec.status is not None, spec.recover is not None
         limits = spec.linger_s, spec.load_timeout_s, spec.recovery or "keep"
-        self.facts = Server(spec.name, *limits, *has, types)  # what decisions need to know
+        self.facts = Server(spec.name, *limits, *has, types, zlib.crc32(types))  # what decisions need to know
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
         if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -75,6 +76,7 @@ class Client:
         self._linked = False  # whether there was ever a link
         self._described: set[str] = set()
         self._undescribed: set[str] = set()
+        self.checksums: dict[str, int] = {}  # by server, those of the types that are known (Loaded.types)
         self._connections: ThreadConnections[Exchange] = ThreadConnections(self._dial_for_thread)
 
     # -- for threads ---------------------------------------------------------------------------------------------
@@ -293,6 +295,7 @@ class Client:
             self._described.add(message.server)
             self._undescribed.discard(message.server)
             self._registrar.types.described(server, message.blob)
+            self.checksums[message.server] = zlib.crc32(message.blob)
 
     def _fetched(self, link: Link, message: Fetched) -> None:
         if message.number != self._number:
@@ -309,9 +312,10 @@ class Client:
                 catalog = self._registrar.whole()
                 if message.same and not self._linked:  # and those of queries that agree, and so are not listed
                     self._undescribed.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
-                known = [server for server in catalog.server_types if server.startswith(prefix)]
+                known = [row for server, row in catalog.server_types.items() if server.startswith(prefix)]
             self._linked = True
-            self._undescribed.update(server.removeprefix(prefix) for server in known)  # sent to an earlier incarnation
+            self.checksums = {row.id.removeprefix(prefix): zlib.crc32(row.blob) for row in known}
+            self._undescribed.update(self.checksums)  # types that were sent to an earlier incarnation
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()

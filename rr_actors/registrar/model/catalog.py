@@ -67,6 +67,7 @@ class Server(msgspec.Struct, frozen=True):
     has_status: bool = False
     has_recover: bool = False
     types: bytes = b""  # the types of requests and responses, for consumers (rows.ServerType)
+    types_checksum: int = 0
 
 
 class Closing(msgspec.Struct, frozen=True):

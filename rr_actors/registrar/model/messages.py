@@ -47,11 +47,15 @@ class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
 
 
 class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
-    """The query is held, and is on disk in the provider's catalog."""
+    """The query is held, and is on disk in the provider's catalog.
+
+    `types`: the checksum (CRC-32) of the types in Described with which the response is to be read.
+    """
 
     query_id: str
     resource_id: str
     response: bytes
+    types: int = 0
 
 
 class LoadRefused(msgspec.Struct, frozen=True, array_like=True, tag=3):
