@@ -581,8 +581,11 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        catalog = self._actor.catalog
-        resource = catalog.find(target)
+        self.calls.check_may_wait()
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            resource = catalog.find(target)
+            is_unserved = resource is not None and resource.server not in catalog.servers
 
         def is_of_it(me: Current) -> bool:
             return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
@@ -590,7 +593,7 @@ class Unloads:
         what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")
         what = f"unloading {shortened(target)}"
-        if resource is not None and resource.server not in catalog.servers:
+        if resource is not None and is_unserved:
             what += f", which waits for its server {catalog.origin_of(resource)!r} to be registered again,"
         self.calls.finish(self.force_future(target), timeout_s, what)
 

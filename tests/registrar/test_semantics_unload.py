@@ -49,6 +49,30 @@ def test_unload_drops_one_query_of_several_of_the_same_registrar(app: rr.Registr
     assert len(served.unloads) == 0
 
 
+def test_a_forced_unload_waits_for_a_decision_that_is_being_made(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    actor = provider._actor
+    removed, forced = threading.Event(), threading.Event()
+
+    def decide() -> None:
+        with actor.lock:
+            resource = actor.catalog.resources.pop(query.resource_id)  # half of a decision: the query is still there
+            removed.set()
+            forced.wait(0.1)
+            actor.catalog.resources[query.resource_id] = resource
+
+    with ThreadPoolExecutor(1) as other:
+        deciding = other.submit(decide)
+        assert removed.wait(LIMIT_S)
+        try:
+            provider.unload(query.id, force=True)
+        finally:
+            forced.set()
+        deciding.result(LIMIT_S)
+    assert (len(served.unloads), provider.resources()) == (1, [])
+
+
 # -- the last query ------------------------------------------------------------------------------------------------
 
 
