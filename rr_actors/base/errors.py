@@ -257,8 +257,12 @@ class LoadError(RrError):
 
 
 class LoadFailed(LoadError):
-    """A load callback raised. `.trace`: one Frame per registrar on the way, innermost first; `.server`.
+    """The provider could not load the resource; most often its load callback raised.
 
+    Or the callback took longer than `load_timeout_s`, its response cannot be sent, no thread was free for it, or its
+    process died in each attempt. Or the resource was unloaded by force, or its server unregistered, while it loaded.
+
+    `.trace`: one Frame per registrar on the way, innermost first; `.server`.
     `.traceback`: the lines of the innermost callback as Python prints them, where it ran; a note shows them, too.
     """
 

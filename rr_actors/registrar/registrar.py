@@ -445,7 +445,8 @@ class Registrar:
             The Query, or with ``block=False`` a future of it.
 
         Raises:
-            LoadFailed: a load callback raised. `.trace` has the places.
+            LoadFailed: the provider could not load it, most often because a load callback raised. `.trace` has the
+                places.
             CircularDependency: the request would wait for itself. `.ring` has the servers around the ring; the text
                 names the request that closes it.
             LoadTimeout: the provider did not answer in time.
