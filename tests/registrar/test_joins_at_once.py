@@ -60,7 +60,7 @@ class Lines:
 
         async def read() -> None:
             for line, message in zip(lines, messages, strict=True):
-                self.provider.consumers.received_directly("app", self.epoch, line, message)
+                self.provider.consumers.received_directly(line, message)
 
         self.provider.node.dispatcher.run(read(), timeout_s=10.0)
         return lines

@@ -32,6 +32,7 @@ from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import Held, Hold, Put, State
 from rr_actors.storage.journaled_store import End, Segment
 from rr_actors.storage.sql_tables import Meta
+from rr_actors.wire.transport import Hello
 from support import Calls
 
 LOADS = 100
@@ -78,13 +79,13 @@ def test_the_caller_of_a_warm_load_makes_few_calls(registrars: tuple[rr.Registra
 
 def test_the_provider_of_a_warm_load_makes_few_calls(registrars: tuple[rr.Registrar, rr.Registrar]) -> None:
     """On a direct line: it joins what is held, at once."""
-    actor, epoch = actor_of(registrars[0]), actor_of(registrars[1]).epoch
+    actor, consumer = actor_of(registrars[0]), actor_of(registrars[1])
     loads = list(itertools.islice(warm_loads(), LOADS))
-    line = FramingLink()
+    line = AnsweredLine(consumer)
 
     def handle() -> None:
         for load in loads:
-            actor.consumers.received_directly(load.origin, epoch, line, load)
+            actor.consumers.received_directly(line, load)
 
     calls = on_loop(actor, lambda: calls_of(handle))
     assert line.flushed == LOADS
@@ -94,8 +95,9 @@ def test_the_provider_of_a_warm_load_makes_few_calls(registrars: tuple[rr.Regist
 class AnsweredLine(FramingLink):
     """A direct line that threads answer."""
 
-    def __init__(self) -> None:
+    def __init__(self, consumer: RegistrarActor) -> None:
         super().__init__()
+        self.hello = Hello("direct", "provider", consumer.name, consumer.epoch)
         self.answers = Calls()
 
     def open_outlet(self) -> None:
@@ -112,13 +114,13 @@ class AnsweredLine(FramingLink):
 def test_the_loop_of_a_first_load_makes_few_calls(registrars: tuple[rr.Registrar, rr.Registrar]) -> None:
     """On a direct line: it decides, commits and wakes a thread, which does the rest."""
     actor, consumer = actor_of(registrars[0]), actor_of(registrars[1])
-    line = AnsweredLine()
+    line = AnsweredLine(consumer)
     calls: list[int] = []
     for number in range(1, LOADS + 1):
         load = Load(f"{number:032x}", "echo", encode(Ask(number)), consumer.name, "", 0, 1)
 
         def handle(load: Load = load) -> None:
-            actor.consumers.received_directly(load.origin, consumer.epoch, line, load)
+            actor.consumers.received_directly(line, load)
 
         calls.append(on_loop(actor, lambda handle=handle: calls_of(handle)))
         line.answers.wait(number)

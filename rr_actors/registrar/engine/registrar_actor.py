@@ -115,8 +115,7 @@ class RegistrarActor(RegistrarState):
         if self.closed or not (self.serving or hello.origin == self.name):
             status = "stopped" if self.closed else "starting"
             raise RegistrarDown(f"registrar {self.name!r}: {status}", registrar=self.name, status=status)
-        attach = self.consumers.attach_direct if hello.kind == THREADS else self.consumers.attach
-        return Welcome(self.epoch), attach(hello.origin)
+        return Welcome(self.epoch), self.consumers.attach_direct if hello.kind == THREADS else self.consumers.attach
 
     def leave_to_parent(self) -> None:
         """Stop using this registrar in a forked child: its links and its catalog belong to the parent process."""
@@ -178,12 +177,12 @@ class RegistrarActor(RegistrarState):
         if not self.closed:
             self.monitor.put(command, more=more or self.node.dispatcher.more)
 
-    def join_here(self, load: Load, epoch: int) -> Loaded | None:
-        """Decide a Load of a thread of this process by the fast path; return None if it has to be sent.
+    def join_here(self, load: Load, hello: Hello) -> Loaded | None:
+        """Decide a Load of a thread of this process, with the Hello of its line, by the fast path.
 
-        `epoch` is the incarnation of the thread's registrar.
+        Return None if the Load has to be sent.
         """
-        if self.closed or interpreter.possible() or not self.consumers.listens_to(load.origin, epoch):
+        if self.closed or interpreter.possible() or not self.consumers.listens_to(hello):
             return None
         return self.join(load)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import time
 from collections.abc import Callable, Sequence
@@ -32,7 +31,7 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
     retired,
 )
-from rr_actors.wire.transport import Attach, Link
+from rr_actors.wire.transport import Hello, Link
 
 logger = logging.getLogger("rr_actors.registrar")
 
@@ -49,26 +48,19 @@ class Consumers:
         self.routes = Routes()  # for each answer, the line or link by which it goes
         self._dirty: dict[int, Any] = {}
 
-    def attach(self, origin: str) -> Attach:
-        """Return the function that receives the link of a consumer; it replaces an older one."""
+    def attach(self, link: Link) -> _Inlet:
+        """Take the link of a consumer; it replaces an older one."""
+        origin = link.hello.origin
+        old = self._links.get(origin)
+        self._links[origin] = link
+        if old is not None:
+            old.close()
+            self._lost(origin)
+        return _Inlet(self.received, self.lost)
 
-        def attach(link: Link) -> _Inlet:
-            old = self._links.get(origin)
-            self._links[origin] = link
-            if old is not None:
-                old.close()
-                self._lost(origin)
-            return _Inlet(functools.partial(self.received, origin), functools.partial(self.lost, origin))
-
-        return attach
-
-    def attach_direct(self, origin: str) -> Attach:
-        """Return the function that receives a direct line of a consumer's thread."""
-
-        def attach(line: Link) -> _Inlet:
-            return _Inlet(functools.partial(self.received_directly, origin, line.hello.epoch), self.lost_directly)
-
-        return attach
+    def attach_direct(self, _line: Link) -> _Inlet:
+        """Take a direct line of a consumer's thread."""
+        return _Inlet(self.received_directly, self.lost_directly)
 
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer by its link, when flushed, or at once by the line that asked. Lost if there is neither."""
@@ -166,8 +158,9 @@ class Consumers:
         """Return the link of a consumer, or None."""
         return self._links.get(origin)
 
-    def received(self, origin: str, link: Link, message: Any) -> None:
+    def received(self, link: Link, message: Any) -> None:
         """Pass on a message of a link. If a newer link is open, ignore it: the consumer sends it again over that."""
+        origin = link.hello.origin
         _check(message, origin)
         if self._links.get(origin) is link:
             if self._provider.node.watched.level[0] > 1:
@@ -188,8 +181,9 @@ class Consumers:
             link.close()
             self._lost(origin)
 
-    def lost(self, origin: str, link: Link, _reason: Exception | None) -> None:
+    def lost(self, link: Link, _reason: Exception | None) -> None:
         """Note that the link of a consumer is down."""
+        origin = link.hello.origin
         if self._links.get(origin) is link:
             del self._links[origin]
             self._lost(origin)
@@ -198,16 +192,17 @@ class Consumers:
         self.routes.link_lost(origin)
         self._provider.post(c.ConsumerLost(origin))
 
-    def listens_to(self, origin: str, epoch: int) -> bool:
-        """Return whether direct lines of the consumer's incarnation `epoch` may ask: as long as that has a link."""
-        link = self._links.get(origin)
-        return not self._provider.closed and link is not None and link.hello.epoch == epoch  # else it may have died
+    def listens_to(self, hello: Hello) -> bool:
+        """Return whether direct lines of this incarnation of a consumer may ask: as long as that has a link."""
+        link = self._links.get(hello.origin)
+        return not self._provider.closed and link is not None and link.hello.epoch == hello.epoch  # else it may be dead
 
-    def received_directly(self, origin: str, epoch: int, line: Any, message: Any) -> None:
-        """Decide a message of a direct line of the consumer's incarnation `epoch`; the answer goes by that line."""
-        if not self.listens_to(origin, epoch):
+    def received_directly(self, line: Any, message: Any) -> None:
+        """Decide a message of a direct line; the answer goes by that line."""
+        if not self.listens_to(line.hello):
             line.close()
             return
+        origin = line.hello.origin
         _check(message, origin)
         if self._provider.node.watched.level[0] > 1:
             self._record("received", origin, message)

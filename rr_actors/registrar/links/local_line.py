@@ -31,12 +31,11 @@ class LocalLine:
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
-        origin, epoch = self.hello.origin, self.hello.epoch
-        if type(message) is Load and (joined := self._registrar.join_here(message, epoch)) is not None:
+        if type(message) is Load and (joined := self._registrar.join_here(message, self.hello)) is not None:
             return joined
         if not self._unanswered and self._answers.empty():
             self._unanswered.append(None)
-        self._node.dispatcher.hand_over(consumers.received_directly, origin, epoch, self, message)
+        self._node.dispatcher.hand_over(consumers.received_directly, self, message)
         left_s = left_until(deadline)
         try:
             answer = self._answers.get(timeout=left_s)
