@@ -768,3 +768,23 @@ def test_what_a_lost_line_waits_for_is_answered_by_the_link() -> None:
     assert routes.way_of(Unloaded("q")) == (None, True)
     assert routes.clear() == ["other"]
     assert routes.way_of(Unloaded("o")) == (None, True)
+
+
+def test_a_question_may_be_answered_while_its_line_or_link_is_lost() -> None:
+    """A worker answers, and the loop notes the loss."""
+    routes = Routes()
+
+    class Questions(dict[str, Any]):
+        def items(self) -> Any:
+            found = list(super().items())
+            routes.answered(Unloaded("q"))
+            return found
+
+    routes._loads.links, routes._unloads.lines = Questions(), Questions()
+    routes.asked_by_link("app", Load("q", "thing", b"", "app", "", 0, 1))
+    routes.asked_by_line("line", Unload("q", "app"))
+    routes.line_lost("line")
+    assert routes.lines() == []
+    routes.asked_by_link("app", Load("q", "thing", b"", "app", "", 0, 1))
+    routes.link_lost("app")
+    assert routes.open_by_link == 0

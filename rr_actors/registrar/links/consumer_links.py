@@ -317,8 +317,7 @@ class Routes:
     def line_lost(self, line: Any) -> None:
         """Forget the questions of a line that is down: their answers go by the link."""
         for ways in (self._loads, self._unloads):
-            for query_id in [query_id for query_id, route in list(ways.lines.items()) if route is line]:
-                del ways.lines[query_id]
+            _forget_way(ways.lines, line)
 
     def lines(self) -> list[Any]:
         """Return the lines that wait for an answer."""
@@ -327,11 +326,16 @@ class Routes:
     def link_lost(self, consumer: str) -> None:
         """Forget the questions of a consumer's link that is down: the next link asks again."""
         for ways in (self._loads, self._unloads):
-            for query_id in [query_id for query_id, origin in ways.links.items() if origin == consumer]:
-                del ways.links[query_id]
+            _forget_way(ways.links, consumer)
 
     def clear(self) -> list[Any]:
         """Forget all questions; return the lines that wait for an answer."""
         lines = self.lines()
         self.__init__()
         return lines
+
+
+def _forget_way(ways: dict[str, Any], lost: object) -> None:
+    for query_id, way in list(ways.items()):
+        if way == lost:
+            ways.pop(query_id, None)  # another thread may have answered this question just now
