@@ -8,6 +8,8 @@ from collections.abc import Callable, Coroutine
 from types import FunctionType
 from typing import Any, Generic, Literal, TypeVar, cast, overload
 
+from msgspec.structs import replace
+
 from rr_actors.base.checks import check_takes, examined
 from rr_actors.base.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
 from rr_actors.registrar.engine.server import ARGUMENTS, ServerSpec, checked_spec
@@ -48,9 +50,8 @@ class server:  # noqa: N801 - used as a decorator
         if callable(name):  # @rr.server on the method itself
             meant = name.__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
-        self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
-        self._types = (request_type, response_type)
-        self._name = checked_spec(ServerSpec(name, _nothing, **self._options)).name
+        callbacks, types = (_nothing, None, None, None), (request_type, response_type)
+        self._spec = checked_spec(ServerSpec(name, *callbacks, *types, linger_s, load_timeout_s, recovery))
 
     @overload
     def __call__(  # pyright: ignore[reportOverlappingOverload] - the first that fits is meant
@@ -66,9 +67,9 @@ class server:  # noqa: N801 - used as a decorator
         """
         if not callable(load):
             expected = "a method to decorate"
-            text = f"@rr.server({self._name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
+            text = f"@rr.server({self._spec.name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
             raise InvalidSpec(text, field="load", expected=expected, got=load)
-        return Declared(self._name, load, self._types, self._options)
+        return Declared(self._spec, load)
 
 
 class Declared(Generic[Request, Returned, Response]):
@@ -79,16 +80,13 @@ class Declared(Generic[Request, Returned, Response]):
     On an instance the attribute is still the method. On the class it names the server in Registrar.load().
     """
 
-    def __init__(self, name: str, load: Callable[..., Any], types: tuple[Any, Any], options: dict[str, Any]) -> None:
-        with examined(f"@rr.server({name!r})"):
+    def __init__(self, spec: ServerSpec, load: Callable[..., Any]) -> None:
+        with examined(f"@rr.server({spec.name!r})"):
             functools.update_wrapper(cast("Callable[..., Any]", self), load)
-        self._name = name
         self._load = load
-        self._options = options
         self._owner: type | None = None
         self._others: dict[str, Callable[..., Any]] = {}
-        spec = checked_spec(ServerSpec(name, _without_self(load), **options))
-        self._types = types[0] or spec.request_type, types[1] or spec.response_type
+        self._spec = checked_spec(replace(spec, load=_without_self(load)))
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._owner = owner
@@ -96,7 +94,7 @@ class Declared(Generic[Request, Returned, Response]):
     @property
     def name(self) -> str:
         """The server's name."""
-        return self._name
+        return self._spec.name
 
     def unload(self, callback: F) -> F:
         """Declare a method as the unload callback: ``(self, request, response)``."""
@@ -139,9 +137,7 @@ class Declared(Generic[Request, Returned, Response]):
     def _spec_for(self, manager: object) -> ServerSpec:
         """Return the spec of one manager's server. Its callbacks are bound; a subclass may override all but `load`."""
         roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
-        load = functools.partial(self._load, manager)
-        types = dict(zip(("request_type", "response_type"), self._types, strict=True))
-        return checked_spec(ServerSpec(self.name, load, **types, **roles, **self._options))
+        return checked_spec(replace(self._spec, load=functools.partial(self._load, manager), **roles))
 
     def _id_in(self, directory: Directory) -> str:
         """Return "registrar/server". The registrar is that of the one child of the system that has the declaring class.
