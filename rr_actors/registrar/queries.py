@@ -71,7 +71,6 @@ class Query(Generic[Response]):
         "_codec",
         "_holder",
         "_is_released",
-        "_over",
         "_request",
         "_response",
         "_statuses",
@@ -106,7 +105,6 @@ class Query(Generic[Response]):
         self.released = False
         self._holder = holder
         self._codec: Codec | None = None  # of the response type that the load was given
-        self._over = False  # whether no status will come any more
         self._is_released = False
         self._request: Any = _Bytes(request)
         self._response: Any = None
@@ -186,7 +184,7 @@ class Query(Generic[Response]):
             try:
                 if (found := self._take(wanted)) is not None:
                     return found
-                if self._over:
+                if self._is_released or self._is_copy():
                     text = f"no status of query {self.id} will come: it is released, or another process holds it"
                     raise UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
                 left_s = None if deadline is None else deadline - time.monotonic()
@@ -220,7 +218,7 @@ class Query(Generic[Response]):
 
     def _end(self) -> None:
         """Note that the query is not held any more, and wake the threads that wait for a status. On the loop."""
-        self._over = self._is_released = True
+        self._is_released = True
         self._wake()
 
     def _wake(self) -> None:
@@ -252,7 +250,6 @@ class Query(Generic[Response]):
         for name, value in state.items():
             setattr(self, name, value)
         self._holder = self._codec = self._waiters = self._statuses = None
-        self._over = True
         self._is_released = False
         self._types = _no_types
 
@@ -304,7 +301,11 @@ class Query(Generic[Response]):
 
     def _may_be_gone(self) -> bool:
         """Return whether the query is gone, or belongs to a handle: such a query is not notified of its end."""
-        return self._is_gone() or (self._over and self._holder is not None)
+        return self._is_gone() or (self._is_copy() and self._holder is not None)
+
+    def _is_copy(self) -> bool:
+        """Return whether the query is of another process, and so hears of no status here."""
+        return self._types is _no_types
 
     def _is_gone(self) -> bool:
         """Return whether the query is released already, by its holder or its provider."""
