@@ -190,8 +190,8 @@ def _recorded(actor: RegistrarActor, line: Exchange, provider: str, message: Mes
 class Loads:
     """The loads of one registrar. From any thread."""
 
-    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
-        self.actor = actor
+    def __init__(self, calls: Calls, views: Views) -> None:
+        self.actor = calls.actor
         self.calls = calls
         self.views = views
 
@@ -548,8 +548,8 @@ class _Unloading:
 class Unloads:
     """The unloads of one registrar. From any thread."""
 
-    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
-        self._actor = actor
+    def __init__(self, calls: Calls, views: Views) -> None:
+        self._actor = calls.actor
         self.calls = calls
         self._views = views
 

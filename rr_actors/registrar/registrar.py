@@ -102,9 +102,9 @@ class Registrar:
         self._node = actor.node
         self._calls = Calls(actor)
         self._views = Views(actor, self)
-        self._loads = Loads(actor, self._calls, self._views)
-        self._unloads = Unloads(actor, self._calls, self._views)
-        self._replacements = Replacements(actor, self._calls, self._views, self._loads, self._unloads)
+        self._loads = Loads(self._calls, self._views)
+        self._unloads = Unloads(self._calls, self._views)
+        self._replacements = Replacements(self._loads, self._unloads)
         self._warned_in_event_loop = False
         actor.audience = self._views
 

@@ -15,13 +15,12 @@ from typing import Any, NamedTuple
 from rr_actors.base.errors import UnknownQuery, UsageError
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.server import ServerActor, status_callback_of
 from rr_actors.registrar.engine.status import Status, next_spare
-from rr_actors.registrar.loads import Calls, Loads, Unloads
+from rr_actors.registrar.loads import Loads, Unloads
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.rows import Held, Hold, Resource
-from rr_actors.registrar.queries import Query, Views
+from rr_actors.registrar.queries import Query
 
 
 class _Found(NamedTuple):
@@ -36,10 +35,8 @@ class _Found(NamedTuple):
 class Replacements:
     """The replacements of one registrar. From any thread."""
 
-    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views, loads: Loads, unloads: Unloads) -> None:
-        self._actor = actor
-        self._calls = calls
-        self._views = views
+    def __init__(self, loads: Loads, unloads: Unloads) -> None:
+        self._actor, self._calls, self._views = loads.actor, loads.calls, loads.views
         self._loads = loads
         self._unloads = unloads
 
