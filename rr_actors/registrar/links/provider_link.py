@@ -122,11 +122,14 @@ class Client:
 
     def link_again(self) -> None:
         """Close the link and open another, over which the provider lists again what is held there."""
+        self._drop_link()
+        self.want()
+
+    def _drop_link(self) -> None:
         link, self.link = self.link, None
         self._connections.close()
         if link is not None:
             link.close()
-        self.want()
 
     def describe(self, server: str, *, at_once: bool = False) -> None:
         """Ask for a server's types, unless this link has brought them; `at_once`: do not wait for other messages."""
@@ -157,13 +160,10 @@ class Client:
 
     def close(self) -> None:
         """Close the link, as the registrar is closed."""
-        self._connections.close()
         if self._task is not None:
             self._task.cancel()
             self._task = None
-        if self.link is not None:
-            link, self.link = self.link, None
-            link.close()
+        self._drop_link()
 
     # -- connecting ----------------------------------------------------------------------------------------------
 
