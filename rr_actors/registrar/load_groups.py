@@ -12,6 +12,8 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Self, cast
 
+import msgspec
+
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import RrError, Unavailable, UnknownQuery, UsageError, shown
 from rr_actors.base.names import ServerId
@@ -94,25 +96,16 @@ def iterated(requests: Any) -> Iterable[Any]:
         raise UsageError(text) from None
 
 
-class Group:
+class Group(msgspec.Struct):
     """The loads of one load_all(): wait() or result() begins them all."""
 
-    def __init__(
-        self,
-        loads: Loads,
-        unloads: Unloads,
-        requests: Sequence[Wanted],
-        parent: str,
-        on_status: StatusCallback | None,
-        timeout_s: float | None,
-    ) -> None:
-        self._loads = loads
-        self._unloads = unloads
-        self._requests = requests
-        self._parent = parent
-        self._on_status = on_status
-        self._timeout_s = timeout_s
-        self._replies: list[Reply[Query]] = []
+    loads: Loads
+    unloads: Unloads
+    requests: Sequence[Wanted]
+    parent: str
+    on_status: StatusCallback | None
+    timeout_s: float | None
+    replies: list[Reply[Query]] = []
 
     def wait(self) -> Queries:
         """Load all requests, and return their queries when all are held.
@@ -120,16 +113,16 @@ class Group:
         Raises:
             RrError: the error of the first load that failed; nothing is held.
         """
-        if not self._requests:
+        if not self.requests:
             return Queries()
-        self._loads.calls.dispatcher.check_may_block(f"{self._loads.actor.name}.load_all()")
+        self.loads.calls.dispatcher.check_may_block(f"{self.loads.actor.name}.load_all()")
         settled = Flag()
         try:
             self._begin(settled.set)
             settled.wait()
             failed = self._failed()
             if failed is None:
-                return Queries(reply.get() for reply in self._replies)
+                return Queries(reply.get() for reply in self.replies)
             raise self._error(failed, shielded(self._undo))
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
             self._undo()
@@ -137,7 +130,7 @@ class Group:
 
     async def result(self) -> Queries:
         """Load all requests as wait() does, awaited on any event loop. If it is cancelled, nothing stays held."""
-        if not self._requests:
+        if not self.requests:
             return Queries()
         loop = asyncio.get_running_loop()
         settled = asyncio.Event()
@@ -153,7 +146,7 @@ class Group:
             await settled.wait()
             failed = self._failed()
             if failed is None:
-                return Queries(reply.get() for reply in self._replies)
+                return Queries(reply.get() for reply in self.replies)
             raise await asyncio.to_thread(self._error, failed, self._undo())
         except BaseException:
             self._undo()
@@ -161,36 +154,36 @@ class Group:
 
     def _begin(self, settled: Callable[[], object]) -> None:
         """Begin all loads. `settled` is called when one has failed, and when all have ended."""
-        left = itertools.count(len(self._requests) - 1, -1)
+        left = itertools.count(len(self.requests) - 1, -1)
 
         def ended(reply: Reply[Query]) -> None:
             if not next(left) or _error_of(reply) is not None:
                 settled()
 
-        for server, request, _ in self._requests:
-            self._replies.append(self._loads.future(server, request, self._parent, self._on_status, self._timeout_s))
-            self._replies[-1].add_done_callback(ended)
+        for server, request, _ in self.requests:
+            self.replies.append(self.loads.future(server, request, self.parent, self.on_status, self.timeout_s))
+            self.replies[-1].add_done_callback(ended)
 
     def _failed(self) -> tuple[int, RrError] | None:
         """Return the place and error of the first load that failed, or None."""
-        errors = map(_error_of, self._replies)
+        errors = map(_error_of, self.replies)
         return next(((place, error) for place, error in enumerate(errors) if error is not None), None)
 
     def _undo(self) -> list[Reply[None]]:
         """Release the held queries, newest first, and withdraw the other loads; return the futures of the releases."""
         undone: list[Reply[None]] = []
-        while self._replies:
-            reply = self._replies.pop()
+        while self.replies:
+            reply = self.replies.pop()
             if not reply.cancel() and _error_of(reply) is None:
                 with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
-                    undone.append(self._unloads.future(reply.get().id, self._timeout_s))
+                    undone.append(self.unloads.future(reply.get().id, self.timeout_s))
         return undone
 
     def _error(self, failed: tuple[int, RrError], undone: Sequence[Reply[None]]) -> RrError:
         """Return the error, with notes that name its request and what was not released. Wait for all of `undone`."""
         place, error = failed
-        server, _, request = self._requests[place]
-        error.add_note(f"load_all: request {place + 1} of {len(self._requests)}, {server} with {request}")
+        server, _, request = self.requests[place]
+        error.add_note(f"load_all: request {place + 1} of {len(self.requests)}, {server} with {request}")
         errors = [error]
         for reply in undone:
             try:

@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+import msgspec
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
@@ -516,33 +517,28 @@ _DOING = {
 Release = Callable[[str, UnloadWaiter], None]
 
 
-class _Unloading:
+class _Unloading(msgspec.Struct):
     """One unload by the loop: one object, as thousands may be in flight, and the garbage collector visits each."""
 
-    __slots__ = ("_left_s", "_query_id", "_reply", "_timeout_s", "_unloads")
-
-    def __init__(
-        self, unloads: Unloads, query_id: str, left_s: float | None, timeout_s: float | None, reply: Reply[None]
-    ) -> None:
-        self._unloads = unloads
-        self._query_id = query_id
-        self._left_s = left_s
-        self._timeout_s = timeout_s
-        self._reply = reply
+    unloads: Unloads
+    query_id: str
+    left_s: float | None
+    timeout_s: float | None
+    reply: Reply[None]
 
     def begin(self, release: Release) -> None:
         """Begin the time limit, and release the query."""
-        if self._left_s is not None:
-            self._unloads.calls.limits.begin(self._left_s, self._overdue)
-        release(self._query_id, self._ended)
+        if self.left_s is not None:
+            self.unloads.calls.limits.begin(self.left_s, self._overdue)
+        release(self.query_id, self._ended)
 
     def _ended(self, error: RrError | None) -> None:
-        if self._left_s is not None:
-            self._unloads.calls.limits.end(self._left_s, self._overdue)
-        settle(self._reply, error)
+        if self.left_s is not None:
+            self.unloads.calls.limits.end(self.left_s, self._overdue)
+        settle(self.reply, error)
 
     def _overdue(self) -> None:
-        self._unloads.release_overdue(self._query_id, self._timeout_s)
+        self.unloads.release_overdue(self.query_id, self.timeout_s)
 
 
 class Unloads:

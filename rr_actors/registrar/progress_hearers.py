@@ -15,6 +15,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import cast
 
+import msgspec
+
 from rr_actors.base.checks import check_takes, examined, needing
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
 from rr_actors.registrar.engine.progress import Progress
@@ -30,25 +32,22 @@ ProgressWanted = bool | ProgressCallback
 """What load() takes as `progress`: a callable, True for a bar, or False."""
 
 
-class Hearer:
+class Hearer(msgspec.Struct):
     """The hearer of one load, until it is closed.
 
-    Args:
+    Attributes:
         actor: the registrar that loads.
-        callback: the callable, called with each report.
+        callback: the callable, called with each report until it has raised, or the load has ended.
         end: called once, when the load has ended.
     """
 
-    def __init__(
-        self, actor: RegistrarActor, callback: ProgressCallback, end: Callable[[], None] | None = None
-    ) -> None:
-        self._actor = actor
-        self._callback: Callable[[Progress], object] | None = described(callback, "load: progress")
-        self._end = end
+    actor: RegistrarActor
+    callback: ProgressCallback | None
+    end: Callable[[], None] | None = None
 
     def hear(self, progress: Progress) -> None:
         """Pass a report on to the callable, in this thread."""
-        callback = self._callback
+        callback = self.callback
         if callback is None:
             return
         try:
@@ -56,15 +55,15 @@ class Hearer:
         except Exception as error:
             if isinstance(error, Raised) and not isinstance(error.error, Exception):
                 raise error.error from None  # such as KeyboardInterrupt: it is for the caller
-            self._callback = None
-            self._actor.callback_failures += 1
+            self.callback = None
+            self.actor.callback_failures += 1
             text = "%s: the progress callable of a load of %s raised, and is not called again"
-            log_raised(logger, error, text, self._actor.name, progress.server)
+            log_raised(logger, error, text, self.actor.name, progress.server)
 
     def close(self) -> None:
         """Stop calling the callable, and call `end`: the load has ended."""
-        self._callback = None
-        end, self._end = self._end, None
+        self.callback = None
+        end, self.end = self.end, None
         if end is not None:
             end()
 
@@ -85,7 +84,7 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     if not callable(progress):
         raise UsageError(f"load: progress: expected a callable or a bool, got {shown(progress)}")
     callback = cast("ProgressCallback", progress)
-    hearer = Hearer(actor, callback)
+    hearer = Hearer(actor, described(callback, "load: progress"))
     if is_async(callback):
         raise UsageError(f"load: progress: expected a plain function, got an async one ({shown(progress)})")
     with examined("load: progress"):
