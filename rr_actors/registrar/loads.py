@@ -122,18 +122,6 @@ class Calls:
         else:
             wait.ended(value, None)
 
-    def ask_other(self, registrar: str, method: str, *args: Any) -> Any:
-        """Call a method of another registrar of the system, wherever it runs.
-
-        Raises:
-            RrError: the method raised it, or the other registrar cannot be reached.
-        """
-        node = self.actor.node
-        here = node.registrars.get(registrar)
-        if here is not None and here.audience is not None:
-            return getattr(here.audience.holder, method)(*args)
-        return self.finish(node.handle(registrar).call(method, args, {}), CALL_TIMEOUT_S, f"{method} of {registrar!r}")
-
     def start(self, begin: Callable[[Callable[[RrError | None], None]], None]) -> Reply[None]:
         """Have begin(done) called on the loop, and return a reply, which done(error) sets."""
         future: Reply[None] = Reply()

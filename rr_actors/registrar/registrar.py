@@ -47,7 +47,7 @@ from rr_actors.registrar.engine.server import (
 )
 from rr_actors.registrar.engine.status import Status, message_text
 from rr_actors.registrar.load_groups import Group, Queries, wanted
-from rr_actors.registrar.loads import Calls, Loads, Unloads, settle
+from rr_actors.registrar.loads import CALL_TIMEOUT_S, Calls, Loads, Unloads, settle
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import FetchedQuery, error_of
@@ -765,7 +765,11 @@ class Registrar:
             provider = None if held is None else held.registrar
         if provider in (None, self.name):
             return self._calls.call(self._children_now, id)
-        return self._calls.ask_other(provider, "children", resource_target(query))
+        target, here = resource_target(query), self._node.registrars.get(provider)
+        if here is not None and here.audience is not None:
+            return here.audience.holder.children(target)
+        reply = self._node.handle(provider).call("children", (target,), {})
+        return self._calls.finish(reply, CALL_TIMEOUT_S, f"children of {provider!r}")
 
     def _children_now(self, target: str) -> list[Query]:
         self._actor.settle()
