@@ -67,7 +67,8 @@ def on_disk(state_dir: Path, request: str) -> list[Phase]:
 
 def nothing_is_left_open(provider: rr.Registrar) -> bool:
     routes = provider._actor.consumers.routes
-    return not (routes._loads.lines or routes._unloads.lines) and routes.open_by_link == 0
+    ways = routes._loads, routes._unloads
+    return not any(way.lines or way.links for way in ways)
 
 
 def in_thread(fn: Callable[[], object], outcome: Calls) -> threading.Thread:

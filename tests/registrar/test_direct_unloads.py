@@ -740,18 +740,22 @@ def test_what_comes_by_a_line_after_the_link_has_asked_is_answered_by_both() -> 
     assert routes.way_of(Unloaded("q")) == ("line", True)
 
 
+def open_by_link(routes: Routes) -> int:
+    return len(routes._loads.links) + len(routes._unloads.links)
+
+
 def test_what_a_link_has_asked_is_asked_no_more_when_it_is_answered_withdrawn_or_lost() -> None:
     routes = Routes()
     for query_id in ("answered", "withdrawn", "lost"):
         routes.asked_by_link("app", Load(query_id, "thing", b"", "app", "", 0, 1))
     routes.asked_by_link("app", Unload("withdrawn", "app"))
     routes.asked_by_link("other", Unload("others", "other"))
-    assert routes.open_by_link == 5
+    assert open_by_link(routes) == 5
     assert routes.way_of(Loaded("answered", "r", b"")) == (None, True)
     assert routes.way_of(Unloaded("withdrawn")) == (None, True)
-    assert routes.open_by_link == 2
+    assert open_by_link(routes) == 2
     routes.link_lost("app")
-    assert routes.open_by_link == 1
+    assert open_by_link(routes) == 1
 
 
 def test_a_refused_unload_goes_by_the_link_as_well() -> None:
@@ -787,4 +791,4 @@ def test_a_question_may_be_answered_while_its_line_or_link_is_lost() -> None:
     assert routes.lines() == []
     routes.asked_by_link("app", Load("q", "thing", b"", "app", "", 0, 1))
     routes.link_lost("app")
-    assert routes.open_by_link == 0
+    assert open_by_link(routes) == 0

@@ -275,11 +275,6 @@ class Routes:
             UnloadRefused: unloads,
         }
 
-    @property
-    def open_by_link(self) -> int:
-        """The number of questions of links that are not answered yet."""
-        return len(self._loads.links) + len(self._unloads.links)
-
     def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
         """Note a question that came by a consumer's link."""
         self._ways[type(question)].links[question.query_id] = consumer
