@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import rr_actors as rr
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.messages import Unload
-from support import eventually, serve
+from support import LIMIT_S, eventually, serve
 
 
 def test_what_was_decided_for_a_link_does_not_go_over_the_next(
@@ -69,3 +70,25 @@ def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answ
     eventually(lambda: len(heard) == 3)
     assert heard == [[first.id], *[sorted((first.id, second.id))] * 2]
     assert not client._asked  # a stopped provider is no error, as nobody asks for anything there
+
+
+def test_a_fetch_ends_when_its_registrar_is_closed(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serve(provider, "thing")
+    app.load("provider/thing", "x")
+    client = app._actor.client("provider")
+    monkeypatch.setattr(client, "_fetched", lambda *_: None)  # as though the provider were slow
+    with ThreadPoolExecutor(1) as thread:
+        fetching = thread.submit(app.fetch_queries, "provider", timeout_s=None)
+        eventually(lambda: client._fetching)
+        app.close()
+        try:
+            with pytest.raises(rr.RegistrarDown, match="'app': closed"):
+                fetching.result(LIMIT_S)
+        finally:
+            for done in client._fetching:
+                done([], None)
+    heard: list[Any] = []
+    client.fetch(lambda *answer: heard.append(answer))  # one that the loop takes after the close
+    assert [type(error) for _, error in heard] == [rr.RegistrarDown]

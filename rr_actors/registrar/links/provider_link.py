@@ -144,6 +144,9 @@ class Client:
 
     def fetch(self, done: Fetching) -> None:
         """Ask for the queries that this registrar holds at the provider; `done` gets them, or the error."""
+        if self._registrar.closed:
+            done(None, self._registrar.down())
+            return
         self._fetching.append(done)
         if self.link is None:
             self.want()
@@ -164,6 +167,7 @@ class Client:
             self._task.cancel()
             self._task = None
         self._drop_link()
+        self._end_fetches(self._registrar.down())
 
     # -- connecting ----------------------------------------------------------------------------------------------
 
@@ -261,10 +265,13 @@ class Client:
 
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False
+        self._end_fetches(error)
+        self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id()))
+
+    def _end_fetches(self, error: RrError) -> None:
         fetching, self._fetching = self._fetching, []
         for done in fetching:
             done(None, error)
-        self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id()))
 
     def _attach(self, _link: Link) -> Client:
         return self
