@@ -123,9 +123,22 @@ class Calls:
             wait.ended(value, None)
 
     def start(self, begin: Callable[[Callable[[RrError | None], None]], None]) -> Reply[None]:
-        """Have begin(done) called on the loop, and return a reply, which done(error) sets."""
+        """Have begin(done) called on the loop, and return a reply, which done(error) sets, or the registrar's close."""
         future: Reply[None] = Reply()
-        self.dispatcher.call(begin, functools.partial(settle, future))
+        actor = self.actor
+
+        def done(error: RrError | None) -> None:
+            actor.callers.discard(done)
+            settle(future, error)
+
+        def work() -> None:
+            if actor.closed:
+                done(actor.down())
+            else:
+                actor.callers.add(done)
+                begin(done)
+
+        self.dispatcher.call(work)
         return future
 
     def command(self, command: Callable[[Any], Any], what: str) -> None:

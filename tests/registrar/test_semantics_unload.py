@@ -651,3 +651,29 @@ def test_closing_a_registrar_that_holds_what_it_serves_itself_is_no_error(
     both.close()
     assert len(served.unloads) == 10
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+@pytest.mark.parametrize("how", ["by force", "with its server"])
+def test_an_owners_unload_that_its_callback_holds_up_ends_when_the_registrar_is_closed(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate, how: str
+) -> None:
+    serve(provider, "thing", unload=lambda _request, _response: gate())
+    query = app.load("provider/thing", "x")
+    ended = Calls()
+
+    def unload() -> None:
+        try:
+            if how == "by force":
+                provider.unload(query.resource_id, force=True, timeout_s=None)
+            else:
+                provider.unregister_server("thing", timeout_s=None)
+        except rr.RrError as error:
+            ended(error)
+
+    threading.Thread(target=unload, daemon=True).start()
+    gate.wait_arrived()
+    provider.close(timeout_s=0.1)
+    (error,) = ended.wait()
+    gate.open()
+    assert type(error) is rr.RegistrarDown
+    assert "registrar 'provider': closed" in str(error)

@@ -72,6 +72,7 @@ class RegistrarActor(RegistrarState):
         self.serving = False
         self.servers = Servers(self)
         self.clients: dict[str, Client] = {}
+        self.callers: set[UnloadWaiter] = set()  # the callbacks of commands whose end somebody waits for
         self.audience: Audience | None = None
         self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
@@ -151,8 +152,8 @@ class RegistrarActor(RegistrarState):
         for load_waiter in loads.values():
             steps.take("telling who loads", load_waiter, None, down)
         unloads, self.unloads = self.unloads, {}
-        for unload_waiter in unloads.values():
-            steps.take("telling who unloads", unload_waiter, down)
+        for waiter in (*unloads.values(), *self.callers):
+            steps.take("telling who unloads, or has given a command", waiter, down)
         with self.lock:
             catalog = self.whole()
             told = catalog.outbound.keys() <= catalog.up.keys()
