@@ -265,14 +265,10 @@ class Routes:
     """
 
     def __init__(self) -> None:
-        self._loads, self._unloads = loads, unloads = _Ways(), _Ways()
+        self._loads, self._unloads = _Ways(), _Ways()
         self._ways: dict[type[Any], _Ways] = {
-            Load: loads,
-            Loaded: loads,
-            LoadRefused: loads,
-            Unload: unloads,
-            Unloaded: unloads,
-            UnloadRefused: unloads,
+            **dict.fromkeys((Load, Loaded, LoadRefused), self._loads),
+            **dict.fromkeys((Unload, Unloaded, UnloadRefused), self._unloads),
         }
 
     def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
