@@ -312,22 +312,6 @@ def test_no_descriptor_is_left_of_many_links(run: Run, tmp_path: Path) -> None:
 # -- of a line within a process ---------------------------------------------------------------------------------------
 
 
-class Bell:
-    """Counts how often it was rung; a wait does not wait."""
-
-    def __init__(self) -> None:
-        self.rings: list[None] = []
-
-    def ring(self) -> None:
-        self.rings.append(None)
-
-    def wait(self, timeout_s: float = -1) -> bool:
-        return bool(self.rings) and self.rings.pop() is None
-
-    def close(self) -> None:
-        """See bells.Bell."""
-
-
 class Provider:
     """Dispatcher and registrar of a local line; what is handed over `answer` deals with."""
 
@@ -357,9 +341,7 @@ def provider() -> Provider:
 
 @pytest.fixture
 def line(provider: Provider) -> LocalLine:
-    line = LocalLine(provider, provider, HELLO)
-    line._bell = Bell()
-    return line
+    return LocalLine(provider, provider, HELLO)
 
 
 LOAD = Load("q", "thing", b"", "app", "", 0, 1)
@@ -376,21 +358,20 @@ def together(*calls: Callable[[], object]) -> None:
         thread.join()
 
 
-def test_threads_that_answer_a_line_and_close_it_at_once_ring_once(provider: Provider, line: LocalLine) -> None:
-    bell = cast(Bell, line._bell)
-    rings: list[int] = []
+def test_of_threads_that_answer_a_line_and_close_it_at_once_one_is_heard(provider: Provider, line: LocalLine) -> None:
+    answers: list[int] = []
     calls: deque[Callable[[], object]] = deque([line.answering(LOADED), line.answering(LOADED), line.close])
 
     def answer(_line: LocalLine) -> None:
         calls.rotate()
         together(*calls)
-        rings.append(len(bell.rings))
+        answers.append(line._answers.qsize())
 
     provider.answer = answer
     for _ in range(100):
         with contextlib.suppress(ConnectionResetError):
             assert line.exchange(LOAD, math.inf) == LOADED
-    assert rings == [1] * 100
+    assert answers == [1] * 100
 
 
 def test_a_line_that_was_answered_is_asked_again_and_hears_nothing_of_before(
@@ -402,7 +383,7 @@ def test_a_line_that_was_answered_is_asked_again_and_hears_nothing_of_before(
         assert line.exchange(LOAD, math.inf) == loaded
         line.answering(LOADED)()
         line.send(LOADED)
-        assert cast(Bell, line._bell).rings == []
+        assert line._answers.empty()
 
 
 def test_nobody_is_told_anything_by_a_line_that_was_left(provider: Provider, line: LocalLine) -> None:
@@ -411,4 +392,4 @@ def test_nobody_is_told_anything_by_a_line_that_was_left(provider: Provider, lin
     line.close()
     line.answering(LOADED)()
     line.close()
-    assert len(cast(Bell, line._bell).rings) == 1
+    assert line._answers.qsize() == 1

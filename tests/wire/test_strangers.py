@@ -192,7 +192,7 @@ def messages_with(trap: bytes) -> dict[str, tuple[str, Any]]:
         "call": (remote_calls.KIND, remote_calls.Call(1, "queries", trap)),
         "stored server": (remote_calls.KIND, remote_calls.Call(2, "_register_stored", trap)),
         "returned": (remote_calls.KIND, remote_calls.Returned(1, trap)),
-        "ask": (protocol.KIND, protocol.Ask(1, "root/shop", trap, [])),
+        "ask": (protocol.KIND, protocol.Ask(1, "root/shop", trap, ())),
         "tell": (protocol.KIND, protocol.Tell("root/shop", trap)),
         "answered": (protocol.KIND, protocol.Answered(1, trap)),
         "raised": (protocol.KIND, protocol.Raised(1, trap, "ValueError: x", "")),
