@@ -116,12 +116,12 @@ class _Shop:
             client._number, client._reconciled = 7, bool(hello.epoch & 1)  # pyright: ignore[reportPrivateUsage]
             return None
         if role == 0:
-            link.attach(provider.consumers.attach(_MISTAKEN))
+            link.attach(provider.consumers.attach)
             return None
         hello = Hello("registrar", "provider", _MISTAKEN, hello.epoch)
         first = UnixLink(set(), cast("Any", _Connection()), _WIRE, hello, Welcome(1), _MISTAKEN)
-        first.attach(provider.consumers.attach(_MISTAKEN))
-        link.attach(provider.consumers.attach_direct(_MISTAKEN))
+        first.attach(provider.consumers.attach)
+        link.attach(provider.consumers.attach_direct)
         return first
 
     def check(self) -> None:
