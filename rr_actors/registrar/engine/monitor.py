@@ -609,13 +609,11 @@ class CommitLog:
         """Roll back a decision that was interrupted. From any thread, with the lock.
 
         The interrupt came before the write or after it. Therefore the rows that the decision began to change are
-        written as they were before, a moment later.
+        written as they were before, a moment later, and no row counts as never written.
         """
+        self.unsaved.doubt()
         for table, id in catalog.roll_back():
             row = catalog.tables[table].get(id)
-            if row is None and table == "held" and id in self.unsaved.new:
-                self.unsaved.drop(id)
-                continue
             pending = type(row) is Held and row.hold is PENDING  # a pending row is never on disk
             self.unsaved.add([Drop(table, id) if row is None or pending else Put(row)])
         self.save_soon()

@@ -563,6 +563,11 @@ class Unsaved:
         self.new.clear()  # first: if an interrupt comes in between, `some` is only written once more
         self.some.clear()
 
+    def doubt(self) -> None:
+        """Note that the rows of `new` may be on disk, as a commit may have been interrupted behind its write."""
+        self.some.update({("held", id): Put(row) for id, row in self.new.items()})
+        self.new.clear()
+
     def drop(self, query_id: str) -> None:
         """Note that a held query is gone, so that its row is removed from the disk, if it is there."""
         if query_id in self.new:
