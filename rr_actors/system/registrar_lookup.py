@@ -130,8 +130,8 @@ async def give_up(node: Node, name: str, *, erase: bool = False) -> None:
     """
     config, state_dir = node.config.registrar(name), Path(node.info.state_dir)
     await node.dispatcher.workers.run(owe, config, state_dir)
-    await node.retire(name)
-    down = {other for other, status in node.statuses().items() if status is not Status.UP}
+    told = await node.retire(name)
+    down = {other for other, status in node.statuses().items() if status is not Status.UP or other not in told}
     await node.dispatcher.workers.run(functools.partial(forget, config, state_dir, down=down, erase=erase))
 
 

@@ -22,6 +22,7 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.model.rows import Held, Peer
 from rr_actors.storage.opening import read_rows
 from rr_actors.wire.name_service import Directory, Status, registrar_key
+from rr_actors.wire.unix_transport import UnixTransport
 from support import (
     LIMIT_S,
     TEST_PATHS,
@@ -816,6 +817,25 @@ def test_a_release_while_its_provider_is_down_is_owed_when_the_application_is_st
     workshop.wait("unload wheel")
     eventually(lambda: holders(system) == {})
     assert system.dormant() == []
+
+
+def test_a_release_of_which_a_provider_that_seems_to_be_up_cannot_be_told_is_owed(
+    start: Start, workshop: Workshop, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_and_be_killed(workshop, state_dir, HOLDS)
+    system = start(shop(workshop))
+
+    async def dead(*_: Any) -> Any:
+        raise rr.RegistrarDown("its process has died just now", registrar="shop", status="")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(UnixTransport, "connect", dead)
+        system.release("other")
+    system.stop()
+    system = start(shop(workshop))
+    assert system.dormant() == ["other"]
+    system.release("other")
+    workshop.wait("unload wheel")
 
 
 def test_what_was_released_while_its_provider_was_down_is_not_held_again_by_who_opens_it_meanwhile(

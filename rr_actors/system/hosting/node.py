@@ -383,30 +383,36 @@ class Node:
                 registrar.post(ForceUnload(resource_id, new_id(), unloaded, why))
             await unloaded.future
 
-    async def retire(self, name: str) -> None:
+    async def retire(self, name: str) -> set[str]:
         """Mark a registrar as gone for good, and have every provider that is up release what it held.
 
-        Other providers read it in the directory when they are back.
+        Other providers read it in the directory when they are back. Return those that have been told.
         """
         if self.status_of(name) is not _GONE:  # an existing entry may also have the reason
             self.directory.mark(registrar_key(name), _GONE)
         for registrar in list(self.registrars.values()):
             registrar.monitor.receive(Gone(name), name)
+        told = set(self.registrars)
         for provider in self.directory.registrars():
             entry = self.find(provider)
-            if provider not in self.registrars and entry is not None and entry.status is Status.UP:
-                await self._tell_gone(provider, entry.address, name)
+            if provider in self.registrars or entry is None or entry.status is not Status.UP:
+                continue
+            if await self._tell_gone(provider, entry.address, name):
+                told.add(provider)
+        return told
 
-    async def _tell_gone(self, provider: str, address: str, name: str) -> None:
+    async def _tell_gone(self, provider: str, address: str, name: str) -> bool:
         try:
             hello = Hello("registrar", provider, retired(name), 0)
             link = await self.transport.connect(address, hello, lambda _link: _NOBODY)
             link.send(Gone(name))
             link.close()
+            return True
         except RegistrarDown:
             logger.info("%s is not up; it hears that %s is gone when it comes back", provider, name)
         except RrError as error:
             logger.warning("could not tell %s that %s is gone: %s", provider, name, error)
+        return False
 
     def emit(self, event: str, **facts: Any) -> None:
         """Pass an event with its facts to on_event."""
