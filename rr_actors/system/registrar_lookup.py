@@ -156,9 +156,9 @@ def forget(config: RegistrarConfig, state_dir: Path, *, down: Collection[str] = 
     """
 
     def changes(content: Content) -> list[Change]:
-        own = {query.origin for query in content["queries"].values()} & {config.name}
-        held = [row.id for row in content["held"].values() if row.registrar not in {*down, *own}]
-        peers = [name for name in content["peers"] if name not in {*down, *own}]
+        staying = {*down, *({query.origin for query in content["queries"].values()} & {config.name})}
+        held = [row.id for row in content["held"].values() if row.registrar not in staying]
+        peers = [name for name in content["peers"] if name not in staying]
         return [*(Drop("held", id) for id in held), *(Drop("peers", name) for name in peers)]
 
     _change(config, state_dir, changes, erase=erase)
