@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Any, Literal
 
 from rr_actors.base.errors import RrError, UsageError
@@ -85,7 +85,7 @@ def _nested(rows: list[ChildRow]) -> dict[str, Any]:
     return nodes[rows[0].path]
 
 
-def edges_of(resources: Iterable[ResourceRow], mark: str) -> list[tuple[str, str]]:
+def edges_of(resources: Collection[ResourceRow], mark: str) -> list[tuple[str, str]]:
     """Return pairs of a holder and the id of the resource that it holds.
 
     A holder is the id of a resource, or `mark` and the name of a registrar that holds for itself.

@@ -354,6 +354,19 @@ def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
     assert [row.id for row in worker.queries()] == [held.query_id]
 
 
+def test_a_load_whose_connection_asks_for_something_else_before_its_keep_is_released(
+    client: rr.Client, provider: rr.Registrar
+) -> None:
+    worker, connection = client.open_registrar("worker"), client._connections.open()
+    for request in ("front", "rear"):
+        held = connection.ask(Hold("client.worker", "provider/camera", encode(request)), Holding)
+    connection.keep()
+    connection.close()
+
+    eventually(lambda: [row.id for row in worker.queries()] == [held.query_id])
+    eventually(lambda: [resource.request for resource in provider.resources()] == ["rear"])
+
+
 def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(
     client: rr.Client, system: rr.System, monkeypatch: pytest.MonkeyPatch
 ) -> None:

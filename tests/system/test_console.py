@@ -16,8 +16,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError, NotFound, RrError, Unavailable, UnknownQuery, UsageError
-from rr_actors.registrar.pages import ResourceRow
-from rr_actors.system.console import console_feed
+from rr_actors.registrar.pages import Page, ResourceRow, Wanted
+from rr_actors.system.console import console_feed, console_questions
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import (
     Done,
@@ -281,6 +281,27 @@ def test_resources_are_listed_also_if_their_statuses_are_together_too_long_for_a
     rows = console.resources("provider").rows
     assert len({row.id for row in rows}) == 130
     assert {row.message for row in rows} == {long}
+
+
+def test_resources_have_room_in_an_answer_beside_the_notes_on_registrars_that_do_not_answer(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    serve(provider, "thing")
+    long, longer = "\N{BELL}" * 9_000, "\N{BELL}" * 9_900
+    for query in app.load_all([("provider/thing", number) for number in range(130)]):
+        provider.send_status(query, rr.Status("WARNING", long))
+    page = console_questions.page
+
+    def answered(registrar: rr.Registrar, wanted: Wanted) -> Page:
+        if registrar.name == "app":
+            raise Unavailable(longer)
+        return page(registrar, wanted)
+
+    monkeypatch.setattr(console_questions, "page", answered)
+    found = console.resources()
+    assert len({row.id for row in found.rows}) == 130
+    assert found.notes == [f"Unavailable: {longer}"]
 
 
 def test_the_history_of_a_child_tells_of_its_exits(shop: rr.System, console: ConsoleClient) -> None:

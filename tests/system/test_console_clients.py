@@ -31,6 +31,7 @@ from rr_actors.system.console.console_messages import (
     Follow,
     Hello,
     Hold,
+    Keep,
     ListChildren,
     ListResources,
     Load,
@@ -115,6 +116,16 @@ def test_who_breaks_the_rules_is_told_and_cut_off(
 
     assert isinstance(said, Refused)
     assert_unharmed(state_dir)
+
+
+def test_a_keep_is_no_greeting(dialled: Callable[[], socket.socket]) -> None:
+    peer = dialled()
+    peer.sendall(framed(Keep(), 1000))
+
+    (said,) = said_until_cut_off(peer)
+
+    assert isinstance(said, Refused)
+    assert "expected Hello of version 3, got Keep" in said.failure.message
 
 
 @pytest.mark.parametrize("begin", [b"", HELLO[:3], HELLO[:-1], HELLO + b"\0\0", HELLO + b"\0\0\1\0abc"])

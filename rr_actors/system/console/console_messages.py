@@ -211,7 +211,7 @@ class OpenRegistrar(_Message, frozen=True):
 class Hold(_Message, frozen=True):
     """Load a resource with a client's registrar, by a request's canonical bytes.
 
-    If the connection ends after the answer, and before its Keep, the query is released.
+    If the connection ends, or makes another request, after the answer and before its Keep, the query is released.
     """
 
     registrar: _Text

@@ -110,7 +110,7 @@ class View:
                 return Registrars(len(names), [self._registrar(name) for name in names[offset : offset + limit]])
             case ListResources(match, offset, limit, registrar):
                 found, notes = self._page("resources", registrar, match, offset, limit)
-                return Resources(found.total, found.resources[: _room_for(found.resources)], notes)
+                return Resources(found.total, found.resources[: _room_for(found.resources, notes)], notes)
             case ListQueries(match, offset, limit, registrar):
                 found, notes = self._page("queries", registrar, match, offset, limit)
                 return Queries(found.total, found.queries, notes)
@@ -250,10 +250,11 @@ class View:
         return Found(resources, queries, notes)
 
 
-def _room_for(rows: Sequence[ResourceRow | Record]) -> int:
-    """Return how many of these rows, from the first on, have room in an answer: they may have long texts."""
+def _room_for(rows: Sequence[ResourceRow | Record], notes: Sequence[str] = ()) -> int:
+    """Return how many of these rows, from the first on, have room in an answer with the notes: texts may be long."""
+    limit = RESPONSE_LIMIT_BYTES - len(msgspec.msgpack.encode(notes))
     sizes = itertools.accumulate(len(msgspec.msgpack.encode(row)) for row in rows)
-    return sum(size <= RESPONSE_LIMIT_BYTES for size in sizes)
+    return sum(size <= limit for size in sizes)
 
 
 def _fitting(record: Record) -> Record:

@@ -293,7 +293,7 @@ class Connection(asyncio.Protocol):
         """Begin with the next request, if the last one is answered and the client has read the answer."""
         if self._ended or self._busy or self._blocked:
             return
-        while self._requests and isinstance(self._requests[0], Keep):
+        while self._greeted and self._requests and isinstance(self._requests[0], Keep):
             self._unheard = ()
             del self._requests[0]
         if not self._requests:
@@ -326,7 +326,7 @@ class Connection(asyncio.Protocol):
 
     def _begin(self, request: Request) -> None:
         self._busy = True
-        self._unheard = ()
+        self._release_unheard()
         workers = self._console.node.dispatcher.workers
         answer = self._console.answered, request, lambda: self._ended, self
         try:
