@@ -424,10 +424,11 @@ def test_a_child_stopped_by_its_supervisor_ends_with_shutdown(start: Start, plac
     assert [down.reason for down in calls.wait()] == ["shutdown"]
 
 
-def test_a_child_in_a_thread_that_is_abandoned_was_killed(start: Start) -> None:
+@pytest.mark.parametrize(("base", "end"), [(rr.Actor, "shutdown"), (pykka.ThreadingActor, "normal")])
+def test_a_child_in_a_thread_that_is_abandoned_was_killed(start: Start, base: Any, end: str) -> None:
     gate = Gate()
 
-    class Stuck(rr.Actor):
+    class Stuck(base):
         def on_receive(self, message: Any) -> None:
             gate()
 
@@ -445,7 +446,7 @@ def test_a_child_in_a_thread_that_is_abandoned_was_killed(start: Start) -> None:
     settle()
     assert len(calls) == 1
     system.supervisor().terminate_child("a")
-    assert [down.reason for down in calls.wait(2)] == ["killed", "shutdown"]
+    assert [down.reason for down in calls.wait(2)] == ["killed", end]
 
 
 def test_an_actor_that_nobody_supervises_is_watched_from_another_process(start: Start) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import asyncio
 import logging
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
@@ -211,7 +212,7 @@ class Hosted(abc.ABC):
             self._place.abandoned()
         if self.ref is not None:
             self._ask_to_stop(final=False)  # wakes it, if it is not stuck
-            self.ref.actor_stopped.set()
+            threading.Event.set(self.ref.actor_stopped)  # a Pykka actor's own set() would tell of a normal end
         self._end(report)
 
     def _end(self, report: ExitReport) -> None:
