@@ -6,6 +6,7 @@ import asyncio
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -310,10 +311,11 @@ def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
 def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
     client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    worker = client.open_registrar("worker")
+    worker, copies = client.open_registrar("worker"), list[socket.socket]()
 
     def interrupted(connection: ConsoleClient, _timeout_s: float) -> None:
         assert select.select([connection._socket], [], [], LIMIT_S)[0]
+        copies.append(connection._socket.dup())  # as a child has one that was forked while the connection was made
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -323,6 +325,7 @@ def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
 
     eventually(lambda: provider.resources() == [])
     eventually(lambda: worker.queries() == [])
+    copies[0].close()
 
 
 def test_a_load_that_is_interrupted_at_any_point_is_released(

@@ -346,7 +346,7 @@ class Connections:
             if kept:
                 self._idle.append(client)
         if not kept:
-            client.drop()
+            client.close()
 
 
 def _forked() -> None:
