@@ -110,6 +110,21 @@ def test_a_watch_keeps_what_was_and_shares_what_has_not_changed(start: Start, st
         watch.stop()
 
 
+def test_a_watch_has_all_resources_also_if_their_statuses_are_together_too_long_for_an_answer(
+    app: rr.Registrar, provider: rr.Registrar, state_dir: Path
+) -> None:
+    serve(provider, "thing")
+    for query in app.load_all([("provider/thing", number) for number in range(130)]):
+        provider.send_status(query, rr.Status("WARNING", "\N{BELL}" * 9_000))
+    watch = Watch(state_dir)
+    watch.start()
+    try:
+        eventually(lambda: watch.now.total)
+        assert len({row.id for row in watch.now.resources}) == 130
+    finally:
+        watch.stop()
+
+
 def test_a_watch_looks_at_once_for_news_of_the_tree_alone(start: Start, state_dir: Path) -> None:
     start()
     watch = Watch(state_dir)

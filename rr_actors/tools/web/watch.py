@@ -190,15 +190,17 @@ class Watch:
             page = self.link.ask(c.ListChildren("", len(rows)), c.Children, _LOOK_S)
             rows += page.rows
         registrars = self.link.ask(c.ListRegistrars(), c.Registrars, _LOOK_S).rows
-        resources = self.link.ask(c.ListResources(limit=GROUPED_FROM), c.Resources, _LOOK_S)
-        if resources.total > GROUPED_FROM:
-            resources = c.Resources(resources.total, self._samples(registrars))
+        found = self.link.ask(c.ListResources(limit=GROUPED_FROM), c.Resources, _LOOK_S)
+        resources = self._samples(registrars) if found.total > GROUPED_FROM else list(found.rows)
+        while len(resources) < found.total <= GROUPED_FROM and found.rows:  # an answer has no room for many long texts
+            found = self.link.ask(c.ListResources(offset=len(resources), limit=GROUPED_FROM), c.Resources, _LOOK_S)
+            resources += found.rows
         return Moment(
             time.time(),
             _shared([msgspec.structs.replace(row, up_s=None) for row in rows[:CHILDREN]], before.children),
             _shared(registrars, before.registrars),
-            _shared(resources.rows, before.resources),
-            resources.total,
+            _shared(resources, before.resources),
+            found.total,
         )
 
     def _samples(self, registrars: list[c.RegistrarRow]) -> list[ResourceRow]:
