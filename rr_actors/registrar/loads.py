@@ -36,7 +36,7 @@ from rr_actors.registrar.model.messages import (
     error_of,
     failure_of,
 )
-from rr_actors.registrar.model.rows import Held, Hold
+from rr_actors.registrar.model.rows import Held, Hold, Resource
 from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers, on_this_loop
 from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
 from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until
@@ -578,11 +578,7 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        self.calls.check_may_wait()
-        with self._actor.enter():
-            catalog = self._actor.whole()
-            resource = catalog.find(target)
-            is_unserved = resource is not None and resource.server not in catalog.servers
+        resource, is_served = self.calls.call(self._find, target)
 
         def is_of_it(me: Current) -> bool:
             return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
@@ -590,9 +586,16 @@ class Unloads:
         what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")
         what = f"unloading {shortened(target)}"
-        if resource is not None and is_unserved:
-            what += f", which waits for its server {catalog.origin_of(resource)!r} to be registered again,"
+        if resource is not None and not is_served:
+            what += f", which waits for its server {self._actor.catalog.origin_of(resource)!r} to be registered again,"
         self.calls.finish(self.force_future(target), timeout_s, what)
+
+    def _find(self, target: str) -> tuple[Resource | None, bool]:
+        """Return a resource that is served here, and whether its server is registered. On the loop."""
+        with self._actor.lock:
+            catalog = self._actor.whole()
+            resource = catalog.find(target)
+            return resource, resource is not None and resource.server in catalog.servers
 
     def force_future(self, target: str) -> Reply[None]:
         """Begin to unload a resource served here, even if it is held, and return a future of its end at once."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import pickle
+import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.model.catalog import Catalog
 from support import LIMIT_S, Calls, Gate, Workshop, eventually, kill, loaded_with_parts, serve, wait_respawned
 from support_managers import Order, Shop
 
@@ -71,6 +73,27 @@ def test_a_forced_unload_waits_for_a_decision_that_is_being_made(app: rr.Registr
             forced.set()
         deciding.result(LIMIT_S)
     assert (len(served.unloads), provider.resources()) == (1, [])
+
+
+def test_a_signal_handler_may_call_the_registrar_while_a_forced_unload_looks_for_the_resource(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    find = Catalog.find
+
+    def find_and_raise_signal(catalog: Catalog, target: str) -> Any:
+        if threading.current_thread() is threading.main_thread():  # only it runs handlers
+            signal.raise_signal(signal.SIGUSR1)
+        return find(catalog, target)
+
+    before = signal.signal(signal.SIGUSR1, lambda *_: provider.resources())
+    monkeypatch.setattr(Catalog, "find", find_and_raise_signal)
+    try:
+        provider.unload(query.id, force=True)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert len(served.unloads) == 1
 
 
 # -- the last query ------------------------------------------------------------------------------------------------
