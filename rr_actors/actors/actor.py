@@ -29,7 +29,7 @@ from rr_actors.actors.monitors import Monitor, begin, take
 from rr_actors.actors.refs import ActorRef
 from rr_actors.actors.remote.hub import running, urn_of_path
 from rr_actors.actors.remote.proxy import as_answer
-from rr_actors.base.errors import Unavailable, text_of
+from rr_actors.base.errors import Unavailable, shortened, text_of
 from rr_actors.runtime.callback_errors import log_raised, raised_by
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import shielded
@@ -323,7 +323,7 @@ class BaseActor(pykka.Actor):
     def _not_opened(self, packed: Packed, error: Exception, reply: pykka.Future[Any] | None) -> None:
         if reply is None:
             logger.error("a message for %s cannot be opened here, and is dropped", self, exc_info=error)
-            why = f"cannot be opened: {text_of(error)}"
+            why = f"cannot be opened: {shortened(text_of(error))}"
             dead_letters.office.record(self._target.name, [packed], why, unheard=0)  # the log has it
         else:
             fail(reply, error)

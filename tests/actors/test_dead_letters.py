@@ -46,7 +46,7 @@ class Unopened:
     """It can be sent, and not opened where it arrives."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return int, ("no number",)
+        return getattr, (1, "x" * 10_000)
 
 
 class Odd:
@@ -253,7 +253,8 @@ def test_a_told_message_that_cannot_be_opened_is_one(start: Start) -> None:
     ((to, message, why),) = letters(system)
     assert to == "root/a"
     assert message.endswith("bytes>")
-    assert why.startswith("cannot be opened: ValueError: invalid literal")
+    assert why.startswith("cannot be opened: AttributeError: 'int' object has no attribute 'xxx")
+    assert len(why) < TEXT_LIMIT + 20
     assert system.ref("a").ask("pid") > 0  # it lives on
 
 
@@ -310,6 +311,29 @@ def test_a_message_is_shown_shortened_and_need_not_have_a_text(system: rr.System
     assert all(len(text) <= TEXT_LIMIT for text in shown)
     assert shown[0].startswith("xxx")
     assert "Odd" in shown[1]
+
+
+def test_what_other_processes_tell_does_not_wait_for_the_text_of_a_message_of_this_one(start: Start) -> None:
+    gate = Gate()
+
+    class Slow:
+        def __repr__(self) -> str:
+            gate()
+            return "slow"
+
+    system = start(rr.ChildSpec(Worker, id="a"))
+    gone = Worker.start()
+    gone.stop()
+    node = system._node  # pyright: ignore[reportPrivateUsage]
+    assert node is not None
+    node.dispatcher.call(lambda: dead_letters.office.record("somebody", [Slow()], "test", unheard=1))
+    gate.wait_arrived()
+    system.ref("a").ask(("tell", gone, "hello"))
+
+    try:
+        eventually(lambda: [to for to, _, _ in letters(system)] == [str(gone.actor_urn)])
+    finally:
+        gate.open()
 
 
 def test_the_text_of_a_message_is_never_made_on_the_loop(system: rr.System) -> None:

@@ -1,6 +1,7 @@
 """Dead letters: messages of this process that reached no actor. They are counted, reported, and the newest are kept.
 
 The text of a message is made in the thread that records it, never on the loop: a message's `__repr__` is users' code.
+Messages without a text (Lost) do not wait for that code: another process may send them faster than it returns.
 A log line comes at most every LOG_EVERY_S seconds, and only for letters whose sender got no error. At most
 EVENTS_A_SECOND letters a second reach the listener.
 """
@@ -87,7 +88,7 @@ class Office:
         """Record messages that did not reach one actor, for one reason. `unheard`: how many senders get no error."""
         process = event_loop.current()
         at = time.time()
-        if process is not None and process.is_loop_thread():
+        if process is not None and process.is_loop_thread() and not all(type(message) is Lost for message in messages):
             try:
                 process.workers.serial("dead letters", self._record, to, messages, why, unheard, at)
                 return

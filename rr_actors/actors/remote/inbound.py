@@ -32,7 +32,7 @@ from rr_actors.actors.remote.protocol import (
 )
 from rr_actors.actors.remote.proxy import attributes_of
 from rr_actors.base import pickling
-from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable, text_of
+from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable, shortened, text_of
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.transport import Link
 from rr_actors.wire.unix_link import UnixLink
@@ -181,7 +181,7 @@ class Visitor:
         full = isinstance(error, MailboxFull)
         if not full:  # the traceback helps to find the fault
             logger.error("a message told to %s by %s was not taken", to, self._link.peer, exc_info=error)
-        self._record(to, message, f"not taken: {text_of(error)}", unheard=int(full))
+        self._record(to, message, f"not taken: {shortened(text_of(error))}", unheard=int(full))
 
     def _undeliverable(self, to: str, call: int | None, message: Any) -> None:
         self._record(to, message, "found nobody", unheard=int(call is None))
@@ -190,6 +190,8 @@ class Visitor:
 
     def _record(self, to: str, message: Any, why: str, *, unheard: int) -> None:
         name = to.removeprefix(PATH_URN)
+        if type(message) is Packed:
+            message = dead_letters.Lost(f"{message.size} bytes")
         dead_letters.office.record(name, [message], f"sent by {self._link.peer}, {why}", unheard=unheard)
 
     def _watch(self, call: int, to: str) -> None:
