@@ -123,7 +123,7 @@ def test_what_is_held_briefly_is_loaded_and_unloaded_and_never_on_disk(
 
 
 class Brief(rr.Manager):
-    """Holds something, and releases something else while the provider hangs, whose pid it is told."""
+    """Holds something, and releases something else while the provider hangs, whose pid is the message."""
 
     def on_receive(self, message: Any) -> Any:
         if message == "queries":
