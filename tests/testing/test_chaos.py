@@ -143,13 +143,17 @@ def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_run_has_ended_before_its_watch_says_so() -> None:
-    watch = Watch(20.0)
-    main = threading.main_thread().ident
-    told, go_on, ended = threading.Event(), threading.Event(), threading.Event()
+    waits, told, go_on, ended = (threading.Event() for _ in range(4))
+
+    class WatchThatSays(Watch):
+        def _see_end(self, ended: threading.Event) -> None:
+            waits.set()
+            super()._see_end(ended)
+
+    watch = WatchThatSays(20.0)
 
     def work() -> None:
-        while main is None or not _stands_in(main, "_see_end"):
-            time.sleep(0.001)
+        waits.wait()
         os.kill(os.getpid(), signal.SIGINT)
         try:
             while True:
@@ -175,14 +179,6 @@ def test_an_interrupted_run_has_ended_before_its_watch_says_so() -> None:
     finally:
         told.set()
         other.join()
-
-
-def _stands_in(thread: int, function: str) -> bool:
-    """Whether a call of a function of this name is under way in a thread of this process."""
-    frame = sys._current_frames().get(thread)
-    while frame is not None and frame.f_code.co_name != function:
-        frame = frame.f_back
-    return frame is not None
 
 
 STANDSTILL = """
