@@ -4,9 +4,13 @@
 #   make test   the tests, side by side on two cores and more: a few minutes
 #   make test-all  those that take longer, too: faults at every operation, fixed worlds of the simulation, breakages
 #   make lint   ruff, pyright, import-linter
+#   make docs   the docs as a site, in build/docs/index.html, with the reference of all public names; without the network
+#   make names  docs/names.md, from the code
+#   make figures  how large and how tangled the package is, each count with its aim (ARGS=--list: where)
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
 #   make breakages  the product broken on purpose in twenty places and more, each noticed by chaos within a minute
 #   make simulate  simulated worlds with crashes at every step, each checked (ARGS="--help" for how many)
+#   make explore  small worlds in every interleaving, not a sample, as far as ARGS="--seconds 3600" allows (two minutes)
 #   make fuzz   bad bytes, guided by the code they reach, into whatever reads bytes (atheris, which it installs in an
 #               environment of its own; ARGS="--runs 1000000 --only frames")
 #   make fuzz-quick  each of these tools, and the fuzz targets without atheris, for some seconds; on another Python, too
@@ -29,7 +33,7 @@ CORES := $(shell getconf _NPROCESSORS_ONLN)
 SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 2 ? 2 : 4)))
 SLOW_SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 
-.PHONY: demo lab test test-slow test-all lint format chaos breakages simulate fuzz fuzz-quick bench bench-quick bench-peers clean
+.PHONY: demo lab docs names test test-slow test-all lint format chaos breakages simulate explore fuzz fuzz-quick bench bench-quick bench-peers figures clean
 .DELETE_ON_ERROR:
 
 # Where nothing is set up yet, these two do not wait for what the tests need.
@@ -38,6 +42,13 @@ demo: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-demo)
 
 lab: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-web)
 	$(BIN)/rr-actors web --lab $(ARGS)
+
+docs: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-docs)
+	$(BIN)/python -m sphinx -qWE --keep-going -c docs/_site -d build/doctrees docs build/docs $(ARGS)
+	@echo "built build/docs/index.html"
+
+names: $(STAMP)
+	$(BIN)/python docs/_site/names.py
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow" $(ARGS)
@@ -57,6 +68,9 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+figures: $(STAMP)
+	$(BIN)/python tests/project/package_figures.py $(ARGS)
+
 chaos: $(STAMP)
 	$(BIN)/python -m rr_actors.testing $(ARGS)
 
@@ -65,6 +79,9 @@ breakages: $(STAMP)
 
 simulate: $(STAMP)
 	cd tests && ../$(BIN)/python -m simulation $(ARGS)
+
+explore: $(STAMP)
+	cd tests && ../$(BIN)/python -m simulation.small_worlds $(ARGS)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m fuzz $(ARGS)

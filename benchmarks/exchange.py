@@ -22,7 +22,8 @@ from benchmarks.table import Row
 from benchmarks.workload import PAYLOAD
 from benchmarks.yardsticks import in_turn, pipe_echoes
 
-AT_LEAST = 0.8
+_PAIR_AT_LEAST = 0.8
+_EACH_AT_LEAST = 0.4  # no two loads share a read, a commit or a write then (docs/performance.md)
 _IN_FLIGHT = 64
 _ROUNDS = 3
 _ECHOES = 20_000
@@ -78,16 +79,16 @@ def exchange(many: int, loads: int) -> list[Row]:
     what = f"{many} managers in full exchange, {_IN_FLIGHT} loads in flight for each"
     return [
         Row(f"2 managers in full exchange, {_IN_FLIGHT} loads in flight for each", few_rate, "/s"),
-        _beside(few_rate, f"{what} pair", pair_rate),
-        _beside(few_rate, what, many_rate),
+        _beside(few_rate, f"{what} pair", pair_rate, _PAIR_AT_LEAST),
+        _beside(few_rate, what, many_rate, _EACH_AT_LEAST),
         Row("threads in each process, 2 managers", few_threads, ""),
         Row(f"threads in each process, {many} managers", max(pair_threads, many_threads), "", at_most=few_threads + 1),
         *_floor(many),
     ]
 
 
-def _beside(few_rate: float, what: str, rate: float) -> Row:
-    return Row(what, rate, "/s", ratio=rate / few_rate, against="2 managers", at_least=AT_LEAST)
+def _beside(few_rate: float, what: str, rate: float, at_least: float) -> Row:
+    return Row(what, rate, "/s", ratio=rate / few_rate, against="2 managers", at_least=at_least)
 
 
 def _floor(many: int) -> list[Row]:

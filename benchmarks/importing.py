@@ -1,4 +1,4 @@
-"""How long `import rr_actors` takes, and how much of that what it needs takes by itself."""
+"""How long `import rr_actors`, `rr-actors --help` and a TAB take, beside a bare Python and the libraries needed."""
 
 from __future__ import annotations
 
@@ -20,38 +20,60 @@ msgspec imports typing_extensions where it finds it. Here the tools bring it; rr
 """
 
 
+COMMAND = "import os, sys; sys.modules['pydantic'] = None; sys.argv = ['rr-actors', {!r}]; os.environ |= {!r}; "
+COMMAND += "sys.stdout = open(os.devnull, 'w'); from rr_actors.tools.cli import main; main()"
+"""The command with one argument and these variables; without pydantic, which Typer imports for a TAB if it is there."""
+
+STATEMENTS = {
+    "bare": "pass",
+    "theirs": ALONE + NEEDED,
+    "import rr_actors": ALONE + "import rr_actors",
+    "rr-actors --help": COMMAND.format("--help", {}),
+    "a TAB after rr-actors": COMMAND.format(
+        "", {"_RR_ACTORS_COMPLETE": "complete_bash", "COMP_WORDS": "rr-actors p", "COMP_CWORD": "1"}
+    ),
+}
+"""What is compared: each runs in an interpreter of its own."""
+
+
 def importing(times: int) -> list[Row]:
-    """The statement by itself; and interpreters that import it, or only what it needs, less one that does nothing.
+    """The import by itself; and interpreters for each statement, beside a bare one, and less it beside the libraries.
 
     All in turns. What an interpreter takes to end, some milliseconds more with all the modules, is in the latter.
     """
-    _run("import rr_actors")
+    for statement in STATEMENTS.values():
+        _run(statement)
     ours: list[float] = []
     beside: list[float] = []
     whole: list[float] = []
-    cpu: list[float] = []
-    needed: list[float] = []
+    cpu: dict[str, list[float]] = {what: [] for what in STATEMENTS}
     for _ in range(times):
-        bare, needs, all_of_it = _run("pass"), _run(ALONE + NEEDED), _run(ALONE + "import rr_actors")
+        taken = {what: _run(statement) for what, statement in STATEMENTS.items()}
         ours.append(_timed(ALONE))
         beside.append(_timed(""))
-        whole.append(max(0.0, all_of_it[0] - bare[0]))
-        cpu.append(max(0.0, all_of_it[1] - bare[1]))
-        needed.append(max(1e-6, needs[1] - bare[1]))
-    taken, more, ended, worked, least = (Samples(tuple(some)) for some in (ours, beside, whole, cpu, needed))
+        whole.append(taken["import rr_actors"][0] - taken["bare"][0])
+        for what, (_, worked) in taken.items():
+            cpu[what].append(worked)
+    bare, theirs, *rest = (Samples(tuple(some)) for some in cpu.values())
+    least = theirs.median - bare.median
+    rows = [
+        Row("a bare Python, CPU time", bare.median * 1e3, "ms", bare.p99 * 1e3),
+        Row("the libraries that rr_actors needs, less it, CPU time", least * 1e3, "ms"),
+    ]
+    for what, some in zip(list(STATEMENTS)[2:], rest, strict=True):
+        more = some.median - bare.median
+        rows += [
+            Row(f"{what}, CPU time", some.median * 1e3, "ms", some.p99 * 1e3, some.median / bare.median, "bare"),
+            Row("  less a bare Python", more * 1e3, "ms", None, more / least, "theirs"),
+        ]
+    taken_s, more_s, ended_s = (Samples(tuple(some)) for some in (ours, beside, whole))
     return [
-        Row("the libraries that rr_actors needs, CPU time", least.median * 1e3, "ms", least.p99 * 1e3),
+        *rows,
+        Row("import rr_actors", taken_s.median * 1e3, "ms", taken_s.p99 * 1e3, at_most=120.0),
         Row(
-            "import rr_actors, with them, CPU time",
-            worked.median * 1e3,
-            "ms",
-            worked.p99 * 1e3,
-            ratio=worked.median / least.median,
-            against="theirs",
+            "the same, with typing_extensions, which other packages bring", more_s.median * 1e3, "ms", more_s.p99 * 1e3
         ),
-        Row("import rr_actors", taken.median * 1e3, "ms", taken.p99 * 1e3, at_most=120.0),
-        Row("the same, with typing_extensions, which other packages bring", more.median * 1e3, "ms", more.p99 * 1e3),
-        Row("a program that only imports it, less an empty one", ended.median * 1e3, "ms", ended.p99 * 1e3),
+        Row("a program that only imports it, less an empty one", ended_s.median * 1e3, "ms", ended_s.p99 * 1e3),
     ]
 
 

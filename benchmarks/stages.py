@@ -175,7 +175,8 @@ def _frames(rounds: int) -> dict[str, float]:
 
 def decided_alone(actor: RegistrarActor, load: Load) -> Decision:
     """What one Load changes and causes, if nothing else comes with it."""
-    return decide(actor.catalog, [actor.monitor._readable(load, _ORIGIN)])
+    with actor.lock:
+        return decide(actor.catalog, [actor.servers.read(load, _ORIGIN)])
 
 
 def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
@@ -198,7 +199,7 @@ def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
             actor.catalog.set("queries", query.id, query)
         decided = clock()
         for query in queries:
-            actor._commits.commit_row(query)
+            actor.commits.commit_row(query)
         committed = clock()
         for query in queries:
             answer(query)

@@ -5,7 +5,8 @@
     python examples/mission.py --no-faults      the first run alone
     python examples/mission.py --no-recovery    the last run alone
 
-It ends with a table beside the figures of the thesis, and writes path.png and distance.png to the output directory.
+It ends with a table beside the figures of the thesis, and writes path.png, distance.png and a timeline of each run to
+the output directory.
 What happens in it is in mission/action.py; the programs of the robot are beside that.
 """
 

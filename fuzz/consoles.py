@@ -9,19 +9,22 @@ import msgspec
 from fuzz.packed import framed, in_frames, samples
 from fuzz.target import Target, pieces
 from rr_actors.base.errors import RrError, Unavailable
-from rr_actors.registrar.model.messages import error_of
+from rr_actors.base.values.failure import error_of
 from rr_actors.system.console import console_messages
-from rr_actors.system.console.console_messages import Answer, Refused, Request
+from rr_actors.system.console.console_messages import Refused
+from rr_actors.system.console.console_protocol import ANSWERS, REQUESTS, decoder_of
 from rr_actors.wire.frames import FrameReader
 
 _SIDES: list[tuple[msgspec.msgpack.Decoder[Any], int, tuple[type, ...]]] = [
-    (msgspec.msgpack.Decoder(Request), console_messages.REQUEST_LIMIT_BYTES, Request.__args__),
-    (msgspec.msgpack.Decoder(Answer), console_messages.ANSWER_LIMIT_BYTES, Answer.__args__),
+    (decoder_of(REQUESTS), console_messages.REQUEST_LIMIT_BYTES, REQUESTS),
+    (decoder_of(ANSWERS), console_messages.ANSWER_LIMIT_BYTES, ANSWERS),
 ]
 
 
 def _seeds() -> list[bytes]:
-    sides = [(bytes([side]), samples(types)) for side, types in enumerate((Request, Answer))]
+    sides = [
+        (bytes([side]), [body for kind in kinds for body in samples(kind)]) for side, (_, _, kinds) in enumerate(_SIDES)
+    ]
     single = [side + b"\0" + framed(body) for side, some in sides for body in some]
     return [*single, *(side + b"\5" + b"".join(map(framed, some[:6])) for side, some in sides)]
 

@@ -25,9 +25,9 @@ from typing import Any, NamedTuple
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Phase, Put, Query, Resource, Row, State, rows_of
+from rr_actors.registrar.model.store import Store
 from rr_actors.storage.opening import Durability, open_store
 from rr_actors.storage.sqlite_store import SqliteStore, segments_among
-from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness
 
 _NAME = "catalog.sqlite3"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import os
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,15 +18,17 @@ from fuzz.packed import framed, in_frames, samples
 from fuzz.target import Feed, Target, pieces
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.links.provider_link import THREADS as DIRECT
-from rr_actors.registrar.links.provider_link import Client
+from rr_actors.registrar.links.provider_link import ProviderLink
 from rr_actors.registrar.model.messages import Fetched, FetchedQuery, Gone, Load, Loaded, Message, Noticed, Unload
 from rr_actors.registrar.model.rows import Notice, State
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.system.system import System
 from rr_actors.wire.transport import Hello, Welcome
 from rr_actors.wire.unix_link import UnixLink, Wire
+from rr_actors.wire.unix_sockets import Peer
 
 _LIMIT_BYTES = 100_000
+_PEER = Peer(os.getpid(), os.getuid())
 _WIRE = Wire(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
 _ROLES = 3
 """A consumer's link, a direct line of one of its threads, and a provider's link."""
@@ -88,7 +91,7 @@ class _Shop:
         connection = _Connection()
         hello = Hello(DIRECT if role == 1 else "registrar", "provider", _MISTAKEN, number)
         links: set[UnixLink] = set()
-        link = UnixLink(links, cast("Any", connection), _WIRE, hello, Welcome(number), _MISTAKEN)
+        link = UnixLink(links, cast("Any", connection), _WIRE, hello, Welcome(number), _PEER, _MISTAKEN)
         first = self._attach(role, link, hello)
         for piece in pieces(stream, seed):
             link.data_received(piece)
@@ -110,7 +113,7 @@ class _Shop:
         provider = _actor_of(self.provider)
         if role == 2:
             app = _actor_of(self.app)
-            client = app.clients[_MISTAKEN] = Client(app, _MISTAKEN)
+            client = app.clients[_MISTAKEN] = ProviderLink(app, _MISTAKEN)
             link.attach(lambda _link: client)
             client.link = link
             client._number, client._reconciled = 7, bool(hello.epoch & 1)  # pyright: ignore[reportPrivateUsage]
@@ -119,7 +122,7 @@ class _Shop:
             link.attach(provider.consumers.attach)
             return None
         hello = Hello("registrar", "provider", _MISTAKEN, hello.epoch)
-        first = UnixLink(set(), cast("Any", _Connection()), _WIRE, hello, Welcome(1), _MISTAKEN)
+        first = UnixLink(set(), cast("Any", _Connection()), _WIRE, hello, Welcome(1), _PEER, _MISTAKEN)
         first.attach(provider.consumers.attach)
         link.attach(provider.consumers.attach_direct)
         return first

@@ -11,9 +11,10 @@ from fuzz.packed import framed, in_frames, samples
 from fuzz.target import Target, pieces
 from rr_actors.actors.remote import protocol
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable
-from rr_actors.registrar.model.messages import Failure, Message, error_of, failure_of
+from rr_actors.base.values.failure import Failure, error_of, failure_of
+from rr_actors.registrar.links import remote_calls
+from rr_actors.registrar.model.messages import Message
 from rr_actors.supervision import control_channel
-from rr_actors.system.hosting import remote_calls
 from rr_actors.wire import frames, handshake
 from rr_actors.wire.frames import GOODBYE, FrameReader
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake

@@ -12,6 +12,12 @@ import sys as _sys
 if _sys.platform != "linux":
     raise ImportError(f"rr_actors needs Linux, this is {_sys.platform}: run it in a Linux container or virtual machine")
 
+if getattr(_sys, "frozen", False) and _sys.argv[1:2] == ["--rr-actors-fork-server"]:
+    from rr_actors.supervision.frozen import become_fork_server
+
+    become_fork_server()
+
+from rr_actors.base import __version__ as __version__
 from rr_actors.runtime.garbage import left_alone as _left_alone
 
 with _left_alone():  # saves a tenth of the time: these objects stay until the process ends
@@ -47,8 +53,10 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
         NotForDynamic,
         NotFound,
         NotHolder,
+        NotRunning,
         NotSerializable,
         RegistrarDown,
+        ResourceLost,
         RestartIntensityExceeded,
         RrError,
         StartFailed,
@@ -62,6 +70,7 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
         UsageError,
     )
     from rr_actors.base.values.codecs import codec
+    from rr_actors.hosting.streams import Publisher, Stream, StreamFrame, StreamReader
     from rr_actors.registrar.declarations import Declared, server
     from rr_actors.registrar.engine.progress import Progress
     from rr_actors.registrar.engine.server import Current, current
@@ -87,8 +96,6 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
     from rr_actors.system.recording.recordings import Recording, read_recording
     from rr_actors.system.recording.traces import Trace
     from rr_actors.system.system import System
-
-__version__ = "0.1.0"
 
 __all__ = [
     "IGNORE",
@@ -139,9 +146,11 @@ __all__ = [
     "NotForDynamic",
     "NotFound",
     "NotHolder",
+    "NotRunning",
     "NotSerializable",
     "Progress",
     "ProgressEvent",
+    "Publisher",
     "Queries",
     "Query",
     "Recording",
@@ -150,11 +159,15 @@ __all__ = [
     "RegistrarDown",
     "ResourceEvent",
     "ResourceInfo",
+    "ResourceLost",
     "RestartIntensityExceeded",
     "RrError",
     "StartFailed",
     "State",
     "Status",
+    "Stream",
+    "StreamFrame",
+    "StreamReader",
     "SupervisionError",
     "Supervisor",
     "SupervisorRef",

@@ -20,7 +20,8 @@ import pytest
 from hypothesis import settings
 
 import rr_actors as rr
-from rr_actors.runtime import interpreter
+from rr_actors.base.reporting import log
+from rr_actors.runtime import interpreter, thread_rules
 from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, serve
 
 _MARK = "RR_ACTORS_TESTS"
@@ -133,6 +134,17 @@ def short_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(interpreter, "_SIGNALS", handlers)
 
 
+_handler: Any = pytest.LogCaptureFixture.handler
+
+
+def _after_writing(caplog: pytest.LogCaptureFixture) -> Any:
+    log.flush()  # a loop gives its log records to a thread, which writes them
+    return _handler.__get__(caplog)
+
+
+pytest.LogCaptureFixture.handler = property(_after_writing)  # type: ignore[method-assign]
+
+
 @pytest.fixture(autouse=True)
 def _nothing_is_left(request: pytest.FixtureRequest) -> Iterator[None]:
     """No process, thread, open socket or socket file outlives a test."""
@@ -151,6 +163,16 @@ def _nothing_is_left(request: pytest.FixtureRequest) -> Iterator[None]:
         eventually(lambda: not left(), _LEAK_LIMIT_S)
     except AssertionError:
         pytest.fail("left behind: " + "; ".join(left()))
+
+
+@pytest.fixture(autouse=True)
+def _threads_keep_to_the_rules() -> Iterator[None]:
+    """No call of the test process breaks a rule of thread_rules.py; the package may have caught the error."""
+    assert thread_rules.CHECKED
+    yield
+    broken = thread_rules.broken.copy()
+    thread_rules.broken.clear()
+    assert broken == []
 
 
 Start = Callable[..., "rr.System"]

@@ -16,6 +16,7 @@ from rr_actors.actors.remote.peer import Call, Line
 from rr_actors.actors.remote.protocol import Answered, Ask, Letter
 from rr_actors.base import pickling
 from rr_actors.runtime.time_limits import left_until
+from rr_actors.wire.segments import Segments
 from support_refs import Home
 
 
@@ -125,6 +126,7 @@ class FakeExchange:
         self._exchange = exchange
         self.limits: list[float | None] = []
         self.was_cut = threading.Event()
+        self.parcels = Segments(0).parcels(0)
 
     def exchange(self, message: Any, deadline: float) -> Any:
         self.limits.append(left_until(deadline))

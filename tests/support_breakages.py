@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.config import SystemConfig
-from rr_actors.registrar.core import holding, reconciliation, recovery, releasing, status_delivery, unloading
+from rr_actors.registrar.core import holding, notices, reconciliation, recovery, releasing, status_delivery, unloading
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import Reconcile
 from rr_actors.registrar.model.effects import Reply
@@ -221,7 +221,7 @@ def _parts_are_kept() -> None:
 
 def _statuses_are_swallowed() -> None:
     def broken(decision: Decision, held: Any, notice: Any, provider: str, repeated: bool) -> None:
-        status_delivery._acknowledge(decision, provider, notice.id)
+        notices.acknowledge(decision, provider, notice.id)
 
     replace(status_delivery._hear, broken)
 

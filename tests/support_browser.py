@@ -129,7 +129,7 @@ class Tab:
     def _note(self, url: str) -> None:
         self.asked.append(url)
         parts = urlsplit(url)
-        if parts.scheme not in ("data", "blob") and parts.hostname not in ("127.0.0.1", "localhost"):
+        if parts.scheme not in ("data", "blob", "file") and parts.hostname not in ("127.0.0.1", "localhost"):
             self.outside.append(url)
 
     def _complaint(self, message: ConsoleMessage) -> None:

@@ -464,7 +464,177 @@ REFUSED_BEFORE_A_LEFT_LINE: list[Step] = [
 ]
 
 
+# What an application had loaded before a crash was held again, though it was closed since, while its provider was away.
+HELD_AGAIN_AFTER_A_CLOSING: list[Step] = [
+    ("load", "q10", "bpp", "r2", "s0", b"q", True),
+    ("serve", "r2"),
+    ("dial", "bpp", "r2"),
+    ("net", "bpp", "r2", 0),
+    ("wake", "r2", 1000000),
+    ("net", "bpp", "r2", 1),
+    ("crash", "bpp", "down"),
+    ("up", "bpp"),
+    ("serve", "bpp"),
+    ("close", "bpp"),
+]
+
+# An unload by the link was refused. Then the provider read the same on the line that its thread had left, unloaded the
+# resource after all, and said so to the line alone.
+REFUSED_AND_TRIED_AGAIN_BY_A_LEFT_LINE: list[Step] = [
+    ("register", "r0", "s0"),
+    ("register", "r0", "s1"),
+    ("serve", "r0"),
+    ("load", "q2", "r0", "r0", "s1", b"q", True),
+    ("dial", "r0", "r0"),
+    ("load", "q4", "app", "r0", "s0", b"p", True),
+    ("tire", "r0", "q2", "error"),
+    ("net", "r0", "r0", 0),
+    ("net", "r0", "r0", 1),
+    ("load", "q7", "r0", "r0", "s1", b"p", True),
+    ("net", "r0", "r0", 0),
+    ("line", "q7", 0, "", "", ""),
+    ("net", "r0", "r0", 1),
+    ("call", "r0", "load", "q7", 1, "ok"),
+    ("join", "j6", "r0", "s1", b"p", ""),
+    ("owe", "r0", "j6", ""),
+    ("tire", "r0", "q7", ""),
+    ("net", "r0", "r0", 0),
+    ("late", "r0", "j6", ""),
+    ("join", "j11", "r0", "s1", b"p", ""),
+    ("owe", "r0", "j11", ""),
+    ("late", "r0", "j11", ""),
+    ("net", "r0", "r0", 0),
+    ("net", "r0", "r0", 0),
+    ("line", "j6", 0, "", "", ""),
+    ("call", "r0", "unload", "q7", 1, "raise"),
+    ("load", "q15", "app", "r0", "s0", b"p", True),
+    ("line", "j11", 0, "error", "", ""),
+    ("tire", "app", "q15", ""),
+]
+
+# A query got another priority after its consumer had asked over a new link what the provider has, and before the
+# answer: that said that both have the same, which was so when the question was sent.
+GIVEN_A_PRIORITY_BEFORE_THE_LIST: list[Step] = [
+    ("serve", "r1"),
+    ("register", "r1", "s0"),
+    ("load", "q1", "app", "r1", "s0", b"q", True),
+    ("wake", "app", 1),
+    ("dial", "app", "r1"),
+    ("net", "app", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "app", "r1", 1),
+    ("wake", "app", 1000000),
+    ("net", "app", "r1", 0),
+    ("wake", "r1", 1),
+    ("generation", ("r0", "r1")),
+    ("up", "r1"),
+    ("register", "r1", "s0"),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "load", "q1", 2, "tell", ""),
+    ("up", "app"),
+    ("serve", "r1"),
+    ("dial", "app", "r1"),
+    ("net", "app", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "app", "r1", 1),
+    ("wake", "app", 1000000),
+    ("rank", "app", "q1", 9),
+    ("wake", "app", 1),
+    ("crash", "app", "stopped"),
+    ("up", "app"),
+    ("net", "app", "r1", 0),
+    ("dial", "app", "r1"),
+    ("rank", "app", "q1", 0),
+]
+
+# A registrar was closed whose load was at a provider that was away: the next run has to release it there.
+CLOSED_WITHOUT_A_LINK: list[Step] = [
+    ("load", "q3", "r2", "r3", "s0", b"p", True, 0),
+    ("wake", "r2", 1000000),
+    ("serve", "r3"),
+    ("register", "r3", "s0"),
+    ("wake", "r3", 1000000),
+    ("dial", "r2", "r3"),
+    ("net", "r2", "r3", 0),
+    ("wake", "r3", 1),
+    ("net", "r2", "r3", 1),
+    ("wake", "r2", 1000000),
+    ("crash", "r2", "stopped"),
+    ("up", "r2"),
+    ("serve", "r2"),
+    ("close", "r2"),
+    ("closing", "r2", True),
+]
+
+# A provider was deleted that was to hear of a release: it may be started again, and then has the query still.
+OWED_AT_A_PROVIDER_THAT_IS_DELETED: list[Step] = [
+    ("serve", "r0"),
+    ("load", "q2", "app", "r0", "s1", b"q", False),
+    ("wake", "app", 1000000),
+    ("dial", "app", "r0"),
+    ("net", "app", "r0", 0),
+    ("register", "r0", "s1"),
+    ("net", "app", "r0", 1),
+    ("wake", "app", 1000000),
+    ("net", "app", "r0", 0),
+    ("call", "r0", "load", "q2", 1, "ok"),
+    ("net", "app", "r0", 1),
+    ("wake", "app", 1000000),
+    ("owe", "app", "q2", ""),
+    ("crash", "r0", "stopped"),
+    ("delete", "r0"),
+]
+
+# A holder that was releasing its query passed over a status, which filled the window; so the word that the query was
+# taken away waited behind that, and the release was owed until the next link.
+TAKEN_AWAY_BEHIND_WHAT_IS_PASSED_OVER: list[Step] = [
+    ("serve", "r0"),
+    ("register", "r0", "s0"),
+    ("load", "q1", "r0", "r0", "s0", b"p", True),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("net", "r0", "r0", 1),
+    ("load", "q8", "r0", "r0", "s0", b"q", True),
+    ("line", "q8", 0, "", "", ""),
+    ("call", "r0", "load", "q8", 1, "ok"),
+    ("line", "q8", 1, "", "", ""),
+    ("save", "r0"),
+    ("owe", "r0", "q8", "after"),
+    ("up", "r0"),
+    ("serve", "r0"),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("net", "r0", "r0", 1),
+    ("net", "r0", "r0", 0),
+    ("own", "r0", "status", "q8", "FATAL"),
+    ("register", "r0", "s0"),
+    ("call", "r0", "unload", "q8", 2, "raise"),
+    ("own", "r0", "force", "q8"),
+]
+
+# The owner unloaded by force what could not be unloaded, and then the whole server, which was not registered any more.
+CLEARED_WHILE_IT_IS_UNLOADED_BY_FORCE: list[Step] = [
+    ("serve", "r0"),
+    ("register", "r0", "s0"),
+    ("load", "q3", "bpp", "r0", "s0", b"p", True),
+    ("wake", "bpp", 1000000),
+    ("dial", "bpp", "r0"),
+    ("net", "bpp", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("net", "bpp", "r0", 1),
+    ("wake", "bpp", 1),
+    ("load", "q7", "bpp", "r0", "s0", b"p", True, 4),
+    ("line", "q7", 0, "", "", ""),
+    ("own", "r0", "unregister", "s0"),
+    ("call", "r0", "load", "q7", 1, "ok"),
+    ("wake", "r0", 1000000),
+    ("call", "r0", "unload", "q7", 1, "raise"),
+    ("own", "r0", "force", "q7"),
+    ("own", "r0", "unregister", "s0"),
+]
+
 DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
+    "queries from before a closing held again": (562949953423105, HELD_AGAIN_AFTER_A_CLOSING),
     "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
     "what was decided for a link sent over the next, to the same run": (
         6044783824402,
@@ -478,6 +648,7 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "a release that is owed, and no link any more": (8418496889417, LINK_LOST_WHILE_LETTING_GO),
     "an unload answered by the line alone": (6993024521295, ASKED_BY_LINK_BEFORE_A_LEFT_LINE),
     "an unload refused, and listed as held, before a line that was left": (6044783824402, REFUSED_BEFORE_A_LEFT_LINE),
+    "an unload refused, and done by a line that was left": (316500168835581, REFUSED_AND_TRIED_AGAIN_BY_A_LEFT_LINE),
     "an unload on a line that was left, and by the link": (2199023255949, UNLOADED_BY_BOTH_WAYS),
     "let go by line, and an older row written over that": (2199023255949, OWED_BEFORE_HELD_WAS_WRITTEN),
     "an update that waits taken for the first row": (2199023255949, OWED_BEFORE_AN_UPDATE_WAS_WRITTEN),
@@ -486,4 +657,9 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
         LISTED_BEFORE_IT_WAS_LOADED_BY_LINE,
     ),
     "what is from before a crash let go by line": (7628463471197, LISTED_BEFORE_IT_WAS_LET_GO),
+    "a priority given between two links lost": (1125899906843199, GIVEN_A_PRIORITY_BEFORE_THE_LIST),
+    "providers that were away forgotten at the closing": (1125899906843174, CLOSED_WITHOUT_A_LINK),
+    "taken away behind a status that is passed over": (281796104698359, TAKEN_AWAY_BEHIND_WHAT_IS_PASSED_OVER),
+    "cleared while it is unloaded by force": (2124356231658425, CLEARED_WHILE_IT_IS_UNLOADED_BY_FORCE),
+    "queries of a provider that is gone forgotten": (1125899906842699, OWED_AT_A_PROVIDER_THAT_IS_DELETED),
 }

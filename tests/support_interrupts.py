@@ -607,12 +607,12 @@ class Run:
         for scene in wanted:
             faulthandler.dump_traceback_later(3 * LIMIT_S, exit=True)
             passed: list[int] = []
-            for _ in range(3):  # the first time caches are filled, and any time it may have to wait for long
+            for _ in range(4):  # the first time caches are filled, and any time it may have to wait for long
                 scene.before(world)
                 passed.append(interrupted(lambda scene=scene: scene.act(world), sys.maxsize).points)
                 self._settle(scene, world)
             files = files or Counter(_kinds_of_descriptors())
-            for points in self._chosen(scene.name, sorted(passed)[1], self._together):
+            for points in self._chosen(scene.name, min(passed), self._together):
                 self._try(scene, world, points)
         faulthandler.dump_traceback_later(LIMIT_S, exit=True)
         gc.collect()

@@ -9,11 +9,13 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import CatalogError
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
     callback_runs,
-    digests,
     holding,
     loading,
+    notices,
+    priorities,
     reconciliation,
     recovery,
     releasing,
@@ -23,11 +25,21 @@ from rr_actors.registrar.core import (
 )
 from rr_actors.registrar.core import decide as deciding
 from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved
-from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
+from rr_actors.registrar.model.commands import (
+    Command,
+    EndClosing,
+    Got,
+    PeerGone,
+    Release,
+    ReleaseOverdue,
+    Revoke,
+    SetPriority,
+)
 from rr_actors.registrar.model.effects import Request, UnloadResolved
-from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
-from rr_actors.registrar.model.rows import Change, Held, Hold, Phase, Put, Resource, is_own
+from rr_actors.registrar.model.messages import Load, Loaded, Unload
+from rr_actors.registrar.model.rows import Change, Held, Hold, Notice, Phase, Put, Resource, is_own
 from simulation import sim_registrar
 from simulation.sim_links import TO_PROVIDER, SimLine, SimLink
 from simulation.sim_process import SimShell
@@ -294,7 +306,7 @@ def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
     def hasty(decision: Decision, provider: str, message: Any) -> None:
         noticed(decision, provider, message)
         if message.notice.id in decision.catalog.hearing:
-            status_delivery._acknowledge(decision, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
+            notices.acknowledge(decision, provider, message.notice.id)
 
     _in_tables(patch, noticed, hasty)
     return SimRegistrar
@@ -520,6 +532,18 @@ def keeps_what_is_owed(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def leaves_what_is_passed_over(patch: Patch) -> type[SimRegistrar]:
+    """A query that is being released is taken away, and what its holder passes over stays before the word of that."""
+
+    def drop(decision: Decision, origin: str, query_id: str) -> None:
+        if query_id not in decision.catalog.queries:
+            original(decision, origin, query_id)
+
+    original: Any = unloading.drop_notices
+    patch(unloading, "drop_notices", drop)
+    return SimRegistrar
+
+
 def tells_holders_first(patch: Patch) -> type[SimRegistrar]:
     """What the owner says goes to the holders at once, and to its own server as well."""
     start_status: Any = status_changes.start_status
@@ -588,13 +612,186 @@ def forgets_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def sends_no_more(patch: Patch) -> type[SimRegistrar]:
+    """Statuses that wait until older ones are handled are not sent then."""
+    patch(notices, "_send_more", lambda decision, query_id: None)
+    return SimRegistrar
+
+
+def sends_all_over_a_new_link(patch: Patch) -> type[SimRegistrar]:
+    """A new link brings all statuses at once."""
+
+    def send_all(decision: Decision, origin: str) -> None:
+        for id in list(decision.catalog.notices_to.get(origin, ())):
+            notices._send_notice(decision, decision.catalog.notices[id])  # pyright: ignore[reportPrivateUsage]
+
+    patch(reconciliation, "send_notices_to", send_all)
+    return SimRegistrar
+
+
 def keeps_what_was_replaced(patch: Patch) -> type[SimRegistrar]:
     """A part that was replaced is not released."""
     patch(status_changes, "_release", lambda decision, resource_id, ids: None)
     return SimRegistrar
 
 
+def forgets_who_was_away(patch: Patch) -> type[SimRegistrar]:
+    """At its closing a registrar forgets also the providers that it has not reached since it was opened."""
+
+    def end_closing(decision: Decision, command: EndClosing) -> None:
+        original(decision, command)
+        for peer in list(decision.catalog.peers.values()):
+            if peer.id not in decision.catalog.outbound:
+                decision.drop(peer)
+
+    original = reconciliation.end_closing
+    _in_tables(patch, original, end_closing)
+    return SimRegistrar
+
+
+def holds_again_after_closing(patch: Patch) -> type[SimRegistrar]:
+    """What a provider has from before a closing is held again."""
+    patch(Catalog, "last_number", lambda self: 0)
+    return SimRegistrar
+
+
+def forgets_what_is_gone(patch: Patch) -> type[SimRegistrar]:
+    """What a provider had that is gone for good is not owed to it, though it may come back."""
+
+    def peer_gone(decision: Decision, command: PeerGone) -> None:
+        original(decision, _replace(command, empty=command.final))
+
+    original = reconciliation.peer_gone
+    _in_tables(patch, original, peer_gone)
+    return SimRegistrar
+
+
+def keeps_priorities(patch: Patch) -> type[SimRegistrar]:
+    """The parts of a resource keep their priority when the holder leaves for whose sake they had it."""
+    patch(notices, "touch", lambda decision, resource_id: None)
+    return SimRegistrar
+
+
+def writes_priorities_later(patch: Patch) -> type[SimRegistrar]:
+    """A priority is written a moment after it is acknowledged."""
+
+    def set_priority(decision: Decision, command: SetPriority) -> None:
+        count = len(decision.changes)
+        original(decision, command)
+        for change in decision.changes[count:]:
+            assert isinstance(change, Put)
+            decision.later["held", change.row.id] = change
+        del decision.changes[count:]
+
+    original = priorities.set_priority
+    _in_tables(patch, original, set_priority)
+    return SimRegistrar
+
+
+def tells_priorities_once(patch: Patch) -> type[SimRegistrar]:
+    """A priority that was lost with its link is not sent again."""
+    patch(reconciliation, "tell", lambda decision, held: None)
+    return SimRegistrar
+
+
+def forgets_priorities_between_links(patch: Patch) -> type[SimRegistrar]:
+    """A priority that changes between the question what a provider has and its answer is not sent."""
+
+    def forget(decision: Decision, provider: str) -> None:
+        for id in list(decision.catalog.unsent):
+            decision.forget(decision.catalog.unsent, id)
+
+    patch(reconciliation, "tell_unsent", forget)
+    return SimRegistrar
+
+
+def compares_no_priorities(patch: Patch) -> type[SimRegistrar]:
+    """The digests of two lists say nothing of priorities."""
+    patch(digests, "_priority", lambda row: 0)
+    patch(digests, "_FACTS", (*map(attrgetter, ("id", "resource_id", "response", "state")), lambda row: 0))
+    return SimRegistrar
+
+
+def believes_what_was_overtaken(patch: Patch) -> type[SimRegistrar]:
+    """A priority that comes a second time, after a newer one, is left as it is."""
+    _in_tables(patch, priorities.reprioritised, lambda decision, message: None)
+    return SimRegistrar
+
+
+def overlooks_loads_in_flight(patch: Patch) -> type[SimRegistrar]:
+    """A part keeps the priority that its whole had when it was asked for."""
+    patch(holding, "follow", lambda decision, held: None)
+    return SimRegistrar
+
+
+def lets_revoked_parts_go(patch: Patch) -> type[SimRegistrar]:
+    """A whole that does not deal with the revocation of a part lets the part go, and stays loaded."""
+    plain = status_delivery.pass_revocation_on
+
+    def pass_on(decision: Decision, resource: Resource, notice: Notice, *, handled: bool) -> None:
+        plain(decision, resource, notice, handled=True)
+
+    patch(status_delivery, "pass_revocation_on", pass_on)
+    return SimRegistrar
+
+
+def overlooks_revocations(patch: Patch) -> type[SimRegistrar]:
+    """The revocation of a part is acknowledged, and its whole stays as it is."""
+    patch(status_delivery, "pass_revocation_on", lambda decision, resource, notice, *, handled: None)
+    return SimRegistrar
+
+
+def unloads_what_is_revoked(patch: Patch) -> type[SimRegistrar]:
+    """A revoked resource is unloaded without waiting for its holders."""
+    plain = status_changes.revoke
+
+    def revoke(decision: Decision, command: Revoke) -> None:
+        plain(decision, command)
+        resource = decision.catalog.find(command.target)
+        if resource is not None and resource.id in decision.catalog.revocations and resource.phase is Phase.LOADED:
+            unloading.begin_unload(decision, resource)
+
+    patch(deciding, "_COMMANDS", {**deciding._COMMANDS, Revoke: revoke})  # pyright: ignore[reportPrivateUsage]
+    return SimRegistrar
+
+
+def loses_a_pause_in_a_crash(patch: Patch) -> type[SimRegistrar]:
+    """A pause or a resumption that a crash has interrupted does not run again."""
+    patch(recovery, "_rest_again", lambda decision, resource, event: None)
+    return SimRegistrar
+
+
+def leaves_what_is_needed_paused(patch: Patch) -> type[SimRegistrar]:
+    """A paused resource is not resumed when it is needed."""
+    balance = unloading.balance
+
+    def leave(decision: Decision, resource_id: str) -> None:
+        resource = decision.catalog.resources.get(resource_id)
+        if resource is None or resource.phase is not Phase.PAUSED:
+            balance(decision, resource_id)
+
+    patch(unloading, "balance", leave)
+    return SimRegistrar
+
+
+def never_pauses_what_is_on_standby(patch: Patch) -> type[SimRegistrar]:
+    """Only what nobody holds is paused."""
+    balance = unloading.balance
+
+    def overlook(decision: Decision, resource_id: str) -> None:
+        resource = decision.catalog.resources.get(resource_id)
+        if resource is None or resource.phase is not Phase.LOADED or resource_id not in decision.catalog.holders:
+            balance(decision, resource_id)
+
+    patch(unloading, "balance", overlook)
+    patch(loading, "balance", overlook)
+    return SimRegistrar
+
+
 MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
+    "a pause lost in a crash": loses_a_pause_in_a_crash,
+    "what is needed left paused": leaves_what_is_needed_paused,
+    "what is on standby never paused": never_pauses_what_is_on_standby,
     "reply before commit": _in_place(AnswersFirst),
     "no undo of what could not be committed": _in_place(NoUndo),
     "owed releases forgotten in a crash": _in_place(ForgetsWhatItOwes),
@@ -608,6 +805,8 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "lost without a word": loses_silently,
     "notice acknowledged before it was dealt with": acknowledges_at_once,
     "notice heard again when sent again": hears_twice,
+    "statuses that wait not sent": sends_no_more,
+    "all statuses sent over a new link": sends_all_over_a_new_link,
     "status not passed on": keeps_to_itself,
     "the holders told before the own server": tells_holders_first,
     "the own server's status forgotten in a crash": forgets_its_own_server,
@@ -638,18 +837,33 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
     "a request sent over any link to the same run": sends_to_the_same_run,
+    "priority not lowered when a holder leaves": keeps_priorities,
+    "a priority acknowledged and lost in a crash": writes_priorities_later,
+    "a priority lost with its link": tells_priorities_once,
+    "lists compared without their priorities": compares_no_priorities,
+    "a priority that is overtaken by an older one": believes_what_was_overtaken,
+    "a priority that overtakes the load of a part": overlooks_loads_in_flight,
+    "a revoked part let go, and its whole left as it is": lets_revoked_parts_go,
+    "a revocation acknowledged, and not passed on": overlooks_revocations,
+    "a revoked resource unloaded before what depends on it": unloads_what_is_revoked,
 }
 
 # Those that chance meets too seldom, and what is broken in the one world made for each (test_simulation.py has it).
 DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
+    "queries from before a closing held again": (holds_again_after_closing, "known to nobody"),
     "what was decided for a link sent over the next": (sends_over_the_next_link, "links"),
     "what was decided for a link sent over the next, to the same run": (sends_to_the_same_run, "links"),
     "a load told to be held that was given up": (_in_place(TellsWhoHasGivenUp), "acknowledged"),
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
+    "taken away behind a status that is passed over": (leaves_what_is_passed_over, "stuck"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
     "no dedupe of query ids": (no_dedupe, "disagree"),
     "an update that waits taken for the first row": (takes_unsaved_for_new, "false loss"),
     "answered by line while the link was down, and not remembered": (forgets_what_came_meanwhile, "false loss"),
     "an unload answered by the line alone": (_in_place(AnswersLinesAlone), "stuck"),
+    "an unload refused, and done by a line that was left": (_in_place(AnswersLinesAlone), "check"),
     "what is from before a crash let go by line": (owes_what_it_had, "false loss"),
+    "a priority given between two links lost": (forgets_priorities_between_links, "priorities"),
+    "providers that were away forgotten at the closing": (forgets_who_was_away, "check"),
+    "queries of a provider that is gone forgotten": (forgets_what_is_gone, "acknowledged"),
 }

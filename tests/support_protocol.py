@@ -20,13 +20,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core.decide import Item, decide
+from rr_actors.registrar.core.holding import pending
+from rr_actors.registrar.core.releasing import forgetting, owing
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model import messages as m
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server, key_of
-from rr_actors.registrar.model.messages import Failure
-from rr_actors.registrar.model.rows import Drop, Held, Notice, Peer, Put, Query, Resource, State, content_of
+from rr_actors.registrar.model.rows import (
+    STANDBY,
+    CallbackRun,
+    Drop,
+    Held,
+    Notice,
+    Peer,
+    Put,
+    Query,
+    Resource,
+    State,
+    content_of,
+)
 
 
 class Side:
@@ -175,6 +189,10 @@ class Script:
                 self.say(name, f"returns from {ticket}: {end_text(failure)}")
             case e.Happened():
                 pass
+            case e.Died(runs, given_up):
+                self.say(name, f"says that its last process died in {'; '.join(runs)}")
+                for text in given_up:
+                    self.say(name, f"says: {text}")
             case _:
                 raise TypeError(f"no effect: {effect}")
 
@@ -202,23 +220,33 @@ def row_text(row: Any) -> str:
             state = f", {row.state.name}" if row.state is not State.OK else ""
             return f"resource {row.id} of {row.server}: {row.phase.value}{attempt}{state}"
         case Query():
-            return f"query {row.id} of {row.origin} on {row.resource_id}"
+            return f"query {row.id} of {row.origin} on {row.resource_id}{priority_text(row.priority)}"
         case Held():
             parent = f" for {row.parent}" if row.parent else ""
             state = f", {row.state.name}" if row.state is not State.OK else ""
-            return f"held {row.id} at {row.registrar}/{row.server}{parent}: {row.hold.value}{state}"
+            priority = priority_text(row.priority)
+            return f"held {row.id} at {row.registrar}/{row.server}{parent}: {row.hold.value}{state}{priority}"
         case Notice():
             whose = f"query {row.query_id}" if row.query_id else "its own server"
             return f"notice for {whose}: {status_text(row)}"
         case Peer():
-            return f"peer {row.id}"
+            return f"peer {row.id}" + (", with all queries so far released" if row.released else "")
+        case CallbackRun():
+            begun = ", begun" if row.begun else ""
+            return f"run {row.id}: {row.deaths} deaths{begun}"
         case _:
             return f"{type(row).__name__} {row.id}"
+
+
+def priority_text(priority: int) -> str:
+    """A priority in words; that of most is not said."""
+    return f", priority {'standby' if priority == STANDBY else priority}" if priority else ""
 
 
 def drop_text(change: Drop, verb: str = "saves that") -> str:
     """A row that is gone, in words."""
     one = {"resources": "resource", "queries": "query", "held": "held", "notices": "notice", "peers": "peer"}
+    one["callback_runs"] = "run"
     return f"{verb} {one[change.table]} {change.id} is gone"
 
 
@@ -238,7 +266,8 @@ def message_text(message: Any) -> str:
     name = type(message).__name__
     match message:
         case m.Load():
-            return f"{name} {message.query_id} {message.server} {message.request.decode()}"
+            text = f"{name} {message.query_id} {message.server} {message.request.decode()}"
+            return text + priority_text(message.priority)
         case m.Loaded():
             return f"{name} {message.query_id} {message.response.decode()}"
         case m.LoadRefused() | m.UnloadRefused():
@@ -256,6 +285,8 @@ def message_text(message: Any) -> str:
             return f"{name} {message.query_id}: does it wait for {message.waiter}?"
         case m.Gone():
             return f"{name} {message.origin}"
+        case m.Reprioritise() | m.Reprioritised():
+            return f"{name} {message.query_id}{priority_text(message.priority) or ', priority 0'}"
         case _:
             raise TypeError(f"no message: {message}")
 
@@ -274,17 +305,47 @@ def _begins(script: Script, name: str, server: str, options: str) -> None:
         recovery=given.pop("recovery", "keep"),
         has_status=given.pop("status", "") == "yes",
         has_recover=given.pop("recover", "") == "yes",
+        recover_timeout_s=float(given.pop("limit")) if "limit" in given else None,
     )
     if given:
         raise ValueError(f"unknown options: {given}")
     script.post(name, c.Register(spec, script.event()))
 
 
-def _loads(script: Script, name: str, query: str, provider: str, server: str, request: str, parent: str | None) -> None:
+def _loads(
+    script: Script,
+    name: str,
+    query: str,
+    provider: str,
+    server: str,
+    request: str,
+    parent: str | None,
+    priority: str | None,
+) -> None:
     script.side(provider)
     script.asked += 1
     number = script.side(name).catalog.since + script.asked
-    script.post(name, c.Ask(query, provider, server, request.encode(), parent or "", number))
+    given = (int(priority or 0), priority is not None)
+    script.post(name, c.Ask(query, provider, server, request.encode(), parent or "", number, *given))
+
+
+def _gives(script: Script, name: str, id: str, priority: str) -> None:
+    value = STANDBY if priority == "standby" else int(priority)
+    script.post(name, c.SetPriority(id, value, "set_priority"))
+
+
+def _loads_directly(script: Script, name: str, query: str, provider: str, server: str, request: str) -> None:
+    script.asked += 1
+    catalog = script.side(name).catalog
+    asked = pending(c.Ask(query, provider, server, request.encode(), "", catalog.since + script.asked))
+    catalog.in_flight[query] = asked
+    load = m.Load(query, server, asked.request, name, "", 0, asked.seq)
+    script.waiting.append((provider, (load, name)))
+
+
+def _finds_gone(script: Script, name: str, other: str) -> None:
+    failure = Failure("RegistrarDown", "gone for good")
+    script.post(name, c.PeerGone(other, failure, final=True, event=script.event()))
 
 
 def _load_ends(script: Script, name: str, id: str, how: str, text: str) -> None:
@@ -365,12 +426,34 @@ def _gone(script: Script, name: str) -> None:
     for other in list(script.sides):
         if other != name:
             script.waiting.append((other, (m.Gone(name), name)))
-            script.post(other, c.PeerGone(name, Failure("RegistrarDown", "gone for good"), True, script.event()))
+            failure = Failure("RegistrarDown", "gone for good")
+            script.post(other, c.PeerGone(name, failure, final=True, event=script.event(), empty=True))
+
+
+def _begins_to_close(script: Script, name: str) -> None:
+    script.post(name, c.BeginClosing(Failure("RegistrarDown", f"{name} is being closed")))
+
+
+def _deleted(script: Script, name: str) -> None:
+    _killed(script, name)
+    side = script.side(name)
+    content = content_of(side.disk.values())
+    side.commit(owing(content, side.epoch))
+    script.say(name, "is given up: all that it holds is owed, and what it serves is to be unloaded")
+    for other in list(script.sides):
+        if other != name:
+            script.waiting.append((other, (m.Gone(name), name)))
+            _finds_gone(script, other, name)
+    side.commit(forgetting(content_of(side.disk.values()), name, ()))
 
 
 STEPS: dict[str, Callable[..., None]] = {
     rf"{R} registers (?P<server>\w+)(?P<options>.*)": _begins,
-    rf"{R} loads (?P<query>\w+) = (?P<provider>\w+)/(?P<server>\w+) (?P<request>\w+)(?: for (?P<parent>\w+))?": _loads,
+    rf"{R} loads (?P<query>\w+) = (?P<provider>\w+)/(?P<server>\w+) (?P<request>\w+)(?: for (?P<parent>\w+))?"
+    r"(?: with priority (?P<priority>-?\d+))?": _loads,
+    rf"{R} gives (?P<id>\w+) the priority (?P<priority>-?\d+|standby)": _gives,
+    rf"a thread of {R} loads (?P<query>\w+) = (?P<provider>\w+)/(?P<server>\w+) (?P<request>\w+)": _loads_directly,
+    rf"the connection of {R} for (?P<id>\w+) breaks": lambda script, name, id: script.post(name, c.SendAgain(id)),
     rf"{R} unloads (?P<id>\w+)": lambda script, name, id: script.post(name, c.Release(id)),
     rf"{R}: the load callback of (?P<id>\S+) (?P<how>returns|raises) (?P<text>.+)": _load_ends,
     rf"{R}: the unload callback of (?P<id>\S+) (?P<how>returns|raises)(?: (?P<text>.+))?": _unload_ends,
@@ -379,8 +462,8 @@ STEPS: dict[str, Callable[..., None]] = {
     rf"{R}: the listeners of (?P<id>\w+) (?P<verb>handle|have heard) it": _heard,
     rf"{R} reports (?P<id>\w+) (?P<state>[A-Z]+) (?P<text>.+)": _says,
     rf"{R} updates (?P<id>\w+) to (?P<text>.+)": _updates,
-    rf"{R} unloads (?P<id>\w+) by force": lambda script, name, id: script.post(
-        name, c.ForceUnload(id, script.event(), "force_unload")
+    rf"{R} unloads (?P<id>\S+) by force": lambda script, name, id: script.post(
+        name, c.ForceUnload(id, script.event(), "force_unload", clears=True)
     ),
     rf"{R} unregisters (?P<server>\w+)": lambda script, name, server: script.post(
         name, c.Unregister(server, script.event(), "unregister_server")
@@ -392,6 +475,10 @@ STEPS: dict[str, Callable[..., None]] = {
     rf"{R} is killed": _killed,
     rf"{R} is respawned": _respawned,
     rf"{R} is gone for good": _gone,
+    rf"{R} is deleted": _deleted,
+    rf"{R} finds that (?P<other>\w+) is gone for good": _finds_gone,
+    rf"{R} begins to close": _begins_to_close,
+    rf"{R} has closed": lambda script, name: script.post(name, c.EndClosing()),
 }
 
 

@@ -22,7 +22,7 @@ from rr_actors.actors.remote import hub
 from rr_actors.actors.remote.hub import ActorHub, set_hub
 from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.runtime.event_loop import acquire, release
-from rr_actors.wire.name_service import Directory, StateDir, Status, actor_key, open_state_dir
+from rr_actors.wire.name_service import Directory, Presence, StateDir, actor_key, open_state_dir
 from rr_actors.wire.unix_transport import UnixTransport
 from support import TEST_PATHS
 
@@ -190,7 +190,7 @@ class Home:
         other.send_signal(signal.SIGKILL)
         other.wait(10)
 
-    def mark(self, path: str, status: Status) -> None:
+    def mark(self, path: str, status: Presence) -> None:
         """What a supervisor does."""
         self.directory.mark(actor_key(path), status)
 

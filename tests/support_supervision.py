@@ -20,14 +20,16 @@ import pykka
 from rr_actors.actors.actor import IGNORE, Actor, ExitReport
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.base.config import SystemConfig
+from rr_actors.hosting.process_node import SystemInfo
 from rr_actors.registrar.declarations import server
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import event_loop
+from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.hosted import Hosted, prepare
 from rr_actors.supervision.name_entries import Entries
 from rr_actors.supervision.supervisor import Child, SupervisorRef, target_of
-from rr_actors.system.hosting.hosted import Hosted, prepare
-from rr_actors.system.hosting.node import Node, SystemInfo
 from rr_actors.wire.name_service import StateDir, open_state_dir
 from support import eventually
 
@@ -58,7 +60,7 @@ class Tree:
         self.dispatcher.run(self._start(info), 60)
 
     async def _start(self, info: SystemInfo) -> None:
-        self.node = Node(info, on_event=self.events.append)
+        self.node = Node(info, on_event=self.events.append, open_catalog=open_catalog, remove_unneeded=remove_catalogs)
         await self.node.start()
         spec = as_child_spec(self.spec)
         Entries(self.node.directory).announce(spec, "root")

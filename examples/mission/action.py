@@ -17,6 +17,7 @@ from mission.record import Record, Sample
 from mission.sabotage import Saboteur, Strike, answers, child_pid, replaced
 from mission.wire import Subscriber
 from rr_actors.managers import Components, LoadComponent, LoadRobot, Programs, Ready, Robots, RunProgram
+from rr_actors.system.recording.timelines import timeline_of
 
 HERE = Path(__file__).parent
 ROUTE_M = sum(distance(a, b) for a, b in itertools.pairwise(ROUTE))
@@ -53,8 +54,10 @@ def run(plan: Plan, directory: Path, view: View) -> Record:
     config = rr.SystemConfig(preload=("rr_actors.managers",))  # imported once, before the managers are forked
     with rr.System(managers(recovery=plan.recovery), state_dir=directory / "state", config=config) as system:
         mission = Mission(plan, directory, system, record, view)
-        with mission.loaded():
-            mission.drive()
+        with system.record() as recording:
+            with mission.loaded():
+                mission.drive()
+            record.timeline = timeline_of(recording.entries(), f"the mission, {plan.title}")
         record.resources_left = count_resources(system)
     return record
 

@@ -1,4 +1,4 @@
-"""The two figures of the thesis: the path with the faults marked, and distance over time."""
+"""The two figures of the thesis, the path with the faults marked and distance over time; and a timeline of each run."""
 
 from __future__ import annotations
 
@@ -17,14 +17,18 @@ _LINES = (("lightgreen", 7.0), ("tab:blue", 3.0), ("tab:red", 1.5))  # thinner a
 
 
 def draw(records: Sequence[Record], directory: Path) -> list[Path]:
-    """Write path.png and distance.png into the directory; return where they are."""
+    """Write path.png, distance.png and each run's timeline into the directory; return where they are."""
     directory.mkdir(parents=True, exist_ok=True)
     drawings = {"path.png": _draw_path, "distance.png": _draw_distance}
     for name, drawing in drawings.items():
         figure = Figure(figsize=(8, 6), layout="constrained")
         drawing(figure.subplots(), records)
         figure.savefig(directory / name, dpi=120)
-    return [directory / name for name in drawings]
+    timelines = {record.title: record.timeline.svg() for record in records if record.timeline is not None}
+    pictures = {f"timeline-{title.replace(' ', '-')}.svg": picture for title, picture in timelines.items()}
+    for name, picture in pictures.items():
+        (directory / name).write_text(picture)
+    return [directory / name for name in (*drawings, *pictures)]
 
 
 def _draw_path(axes: Axes, records: Sequence[Record]) -> None:

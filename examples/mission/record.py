@@ -6,6 +6,8 @@ import itertools
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from rr_actors.system.recording.timelines import Timeline
+
 STANDING_MPS = 0.02
 
 
@@ -44,6 +46,7 @@ class Record:
     time_s: float = 0.0  # until it arrived, or stood for good
     resources_left: int | None = None
     processes_left: int | None = None
+    timeline: Timeline | None = None  # of the managers' lives
 
     @property
     def arrived(self) -> bool:

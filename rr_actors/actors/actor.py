@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
+import queue
 import threading
 import uuid
 from collections.abc import Callable, Coroutine
@@ -29,27 +29,40 @@ from rr_actors.actors.monitors import Monitor, begin, take
 from rr_actors.actors.refs import ActorRef
 from rr_actors.actors.remote.hub import running, urn_of_path
 from rr_actors.actors.remote.proxy import as_answer
-from rr_actors.base.errors import Unavailable, shortened, text_of
+from rr_actors.base.checks import check_for_actor
+from rr_actors.base.errors import Unavailable, UsageError, shortened, text_of
+from rr_actors.base.reporting.log import Log
 from rr_actors.runtime.callback_errors import log_raised, raised_by
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.user_loop import is_coroutine
-from rr_actors.supervision.core.child_calls import check_for_actor
 
 __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit"]
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 MAILBOX_LIMIT = 100_000
 BATCH = 256
 """How many messages an actor on the loop handles before other callbacks have their turn."""
 
 
+NOT_FROZEN = "a class whose attributes can be set, as an actor's must be (@dataclass, without frozen=True)"
+
+
+def is_frozen(cls: type) -> bool:
+    """Return whether the class is a frozen dataclass or attrs class."""
+    parameters: Any = getattr(cls, "__dataclass_params__", None)
+    return (parameters is not None and parameters.frozen) or getattr(
+        cls.__setattr__, "__name__", ""
+    ) == "_frozen_setattrs"
+
+
 class BaseActor(pykka.Actor):
     """The base of both actor types: life, mailbox, exit report. Pykka documents how actors behave."""
 
     mailbox_limit: ClassVar[int] = MAILBOX_LIMIT
-    """How many messages may wait; the sender of one more gets MailboxFull."""
+    """How many messages may wait; the sender of one more gets MailboxFull. Default: 100,000. Lower it, in the class, to
+    hear earlier that the actor is too slow."""
 
     _lives_on_loop: ClassVar[bool] = False
     """Whether its handlers run on the framework's loop, and not in worker threads."""
@@ -71,6 +84,8 @@ class BaseActor(pykka.Actor):
 
     def __new__(cls, *_args: Any, **_kwargs: Any) -> Self:
         # In __new__, and not in __init__: so a subclass's __init__ need not call this one.
+        if is_frozen(cls):
+            raise UsageError(f"{cls.__qualname__}: expected {NOT_FROZEN}, got a frozen class")
         self = super().__new__(cls)
         birth = exit_reports.take()
         self.actor_urn = uuid.uuid4().urn if birth.path is None else urn_of_path(birth.path)
@@ -235,7 +250,10 @@ class BaseActor(pykka.Actor):
             raise
 
     async def _live(self) -> None:
-        if await self._begin():
+        envelope: PykkaEnvelope[Any] | None = None
+        try:
+            if not await self._begin():
+                return
             handled = 0
             while not self.actor_stopped.is_set():
                 envelope = self._mailbox.next()
@@ -248,7 +266,20 @@ class BaseActor(pykka.Actor):
                 if handled == BATCH:
                     handled = 0
                     await PAUSE
-            await self._end()
+        except GeneratorExit:  # the life is dropped, with its process
+            raise
+        except BaseException as error:  # nobody would take the next message: end, for the supervisor to restart it
+            self._break_off(error, self._started if envelope is None else envelope.reply_to)
+        await self._end()
+
+    def _break_off(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
+        """End this actor, as a turn of it has ended by an error that was not expected there."""
+        self._vanish()
+        self._note_failure(error)
+        if reply is not None:
+            text = f"{self._target.name} ended, as its turn raised {raised_by(error).text}"
+            with contextlib.suppress(queue.Full):  # it is answered already
+                fail(reply, Ended(text, self._target.name))
 
     async def _begin(self) -> bool:
         doing = Activity(self._target, ())
@@ -271,7 +302,9 @@ class BaseActor(pykka.Actor):
         self._vanish()
         self._on_exit = None
         if failure is not None:
-            self._report = abnormal(raised_by(failure))
+            raised = raised_by(failure)
+            self._report = abnormal(raised)
+            failure = failure if isinstance(failure, Exception) else raised.error
         await self._end()
         if failure is None:
             self._started.set(IGNORE)
@@ -293,7 +326,7 @@ class BaseActor(pykka.Actor):
             if type(message) is Packed:
                 try:
                     message = message.open()
-                except Exception as error:  # an error of the sender, not of this actor
+                except BaseException as error:  # an error of the sender, not of this actor
                     self._not_opened(message, error, reply)
                     return
             if is_stop(message):
@@ -317,10 +350,10 @@ class BaseActor(pykka.Actor):
         elif reply is None:
             await self._fail(failure)
         else:
-            logger.info("Exception returned from %s to caller:", self, exc_info=failure)
             fail(reply, failure)
+            logger.info("Exception returned from %s to caller:", self, exc_info=failure)
 
-    def _not_opened(self, packed: Packed, error: Exception, reply: pykka.Future[Any] | None) -> None:
+    def _not_opened(self, packed: Packed, error: BaseException, reply: pykka.Future[Any] | None) -> None:
         if reply is None:
             logger.error("a message for %s cannot be opened here, and is dropped", self, exc_info=error)
             why = f"cannot be opened: {shortened(text_of(error))}"
@@ -346,7 +379,8 @@ class BaseActor(pykka.Actor):
     async def _leave(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
         """End this actor, and no other, after SystemExit or the like in a handler."""
         if reply is not None:
-            dead = Ended(f"{self._target.name} ended while it handled the message: {error!r}", self._target.name)
+            text = f"{self._target.name} ended while it handled the message: {raised_by(error).text}"
+            dead = Ended(text, self._target.name)
             dead.__cause__ = error
             reply.set_exception((Ended, dead, None))
         if isinstance(error, SystemExit) and not error.code:

@@ -7,7 +7,6 @@ and Await, and does not know in which thread it is resumed.
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable, Coroutine, Generator
 from contextvars import Context
 from typing import Any, cast
@@ -16,11 +15,12 @@ import msgspec
 
 from rr_actors.actors.messaging.mailbox import Mailbox
 from rr_actors.base.errors import Unavailable
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.user_loop import start_task
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 RETRY_S = 0.1
 """How long a life that can go on waits if the machine gives no thread for it."""

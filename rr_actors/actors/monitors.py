@@ -16,6 +16,7 @@ from rr_actors.actors.messaging import death_watch
 from rr_actors.actors.messaging.exit_reports import Down
 from rr_actors.actors.refs import DistantRef, local_of, ref_in, watch
 from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
@@ -23,7 +24,7 @@ from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.user_loop import is_coroutine
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 _numbers = itertools.count(1)
 

@@ -146,6 +146,7 @@ class ActorRef(pykka.ActorRef[A]):
             time_limit(timeout, "timeout")
             event_loop.check_may_block(f"stopping {self._target.name}")
             ask_cycles.check_ring(self._target)
+            ask_cycles.check_end(self._target.urn, f"stop() of {self._target.name}")
         self._stop(reply, reason, final=final)
         return reply.get(timeout=timeout) if block else reply
 
@@ -228,21 +229,24 @@ class ActorRef(pykka.ActorRef[A]):
 
 
 class DistantReply(Reply[Any]):
-    """The reply of an actor that may be respawned: if it dies first, its entry in the directory decides the error.
+    """The reply of an actor that may be respawned: if it dies first, its entry in the directory decides the error."""
 
-    For map() and join(), Pykka calls the class without arguments; such a future itself waits for no actor.
-    """
-
-    def __init__(self, where: Whereabouts | None = None) -> None:
-        super().__init__(None if where is None else where.target)
+    def __init__(self, where: Whereabouts) -> None:
+        super().__init__(where.target)
         self._where = where
 
     def set_exception(self, exc_info: ExcInfo | BaseException | None = None) -> None:
         """Set the exception that get() raises; for a dead actor, the error from the directory."""
         error = error_of(exc_info)
-        if self._where is not None and has_ended(error, self._where.target.name):
+        if has_ended(error, self._where.target.name):
             error = _as_directory_says(self._where, error)
         super().set_exception(error)
+
+    def overdue(self, timeout_s: float | None) -> pykka.Timeout:
+        """Return the error for a caller that has waited in vain; it says if a signal has stopped the process."""
+        process = hub(self._where.path)
+        why = "" if process is None else process.paused(self._where)
+        return pykka.Timeout(f"{super().overdue(timeout_s)}{why}")
 
 
 def _as_directory_says(where: Whereabouts, dead: BaseException) -> BaseException:
@@ -414,7 +418,9 @@ class DistantRef(ActorRef[A]):
         try:
             return reply.get(timeout=limit_s)
         except pykka.Timeout:
-            raise pykka.Timeout(f"no reply after {limit_s} seconds: the {what} of {self._target.name}") from None
+            why = self._hub().paused(self._where)
+            text = f"no reply after {limit_s} seconds: the {what} of {self._target.name}{why}"
+            raise pykka.Timeout(text) from None
 
     def _local(self) -> pykka.ActorRef[A] | None:
         process = hub(self.path)
@@ -468,6 +474,29 @@ def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[A
     if path is None and (local := running.get(target.urn)) is not None:
         return local
     return DistantRef(Whereabouts(target, path, address))
+
+
+class Registered(dict[pykka.ActorRef[Any], None]):
+    """The list of running actors in Pykka's registry, with its operations on a list that take a look-up here.
+
+    A list compares the actor that ends with each that was started before it.
+    """
+
+    def append(self, ref: pykka.ActorRef[Any]) -> None:
+        """Add a reference after the others."""
+        self[ref] = None
+
+    def remove(self, ref: pykka.ActorRef[Any]) -> None:
+        """Remove a reference that is in it."""
+        del self[ref]
+
+    def __getitem__(self, part: slice) -> list[pykka.ActorRef[Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return list(self)[part]
+
+
+with pykka.ActorRegistry._actor_refs_lock:  # pyright: ignore[reportPrivateUsage]
+    _registry: Any = pykka.ActorRegistry
+    _registry._actor_refs = Registered.fromkeys(_registry._actor_refs)
 
 
 def local_of(ref: pykka.ActorRef[Any]) -> pykka.ActorRef[Any] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import threading
 import time
 from typing import Any
@@ -13,10 +12,11 @@ from pykka import ActorDeadError
 
 from rr_actors.actors.refs import ref_in
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
+from rr_actors.base.reporting.log import Log
 from rr_actors.runtime.event_loop import acquire, release
 from rr_actors.runtime.time_limits import time_limit
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 
 class Timer:

@@ -10,7 +10,19 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeGuard, cast
 
-from rr_actors.base.errors import InvalidName, InvalidSpec, RrError, UsageError, exact_text, is_a, shown, text_of
+from msgspec import Struct
+
+from rr_actors.base.errors import (
+    InvalidName,
+    InvalidSpec,
+    NotFound,
+    RrError,
+    UsageError,
+    exact_text,
+    is_a,
+    shown,
+    text_of,
+)
 from rr_actors.base.names import NAME_RULE, check_name
 
 # Checks of specification fields: each failure is an InvalidSpec with the field, the expected and the actual value.
@@ -73,12 +85,12 @@ def check_flag(value: object, who: str, field: str) -> None:
         raise invalid(who, field, "True or False", value)
 
 
-def check_id(value: object, who: str) -> None:
+def check_id(value: object, who: str, field: str = "id") -> None:
     """Check that the value can be a child's id, by the rules of names.check_name()."""
     try:
-        check_name(value, "id")
+        check_name(value, field)
     except InvalidName as error:
-        raise invalid(who, "id", NAME_RULE, value) from error
+        raise invalid(who, field, NAME_RULE, value) from error
 
 
 def path_text(path: object) -> str:
@@ -155,3 +167,20 @@ def missing_library(library: str, what: str, extra: str, instead: str = "") -> U
     install = f"pip install 'rr-actors[{extra}]' (in a checkout: '.[{extra}]'){instead}"
     text = f"{what} needs the library {library}, which is not installed. Install it with: {install}"
     return UsageError(text, library=library, extra=extra)
+
+
+# A check of messages. SupervisorCall is here, since actors, which lie below supervision, have to refuse it.
+
+
+class SupervisorCall(Struct, frozen=True):
+    """A message that only a supervisor understands. Handlers of other actors never get it."""
+
+
+class NoSupervisor(NotFound):
+    """The call went to an actor that is no supervisor."""
+
+
+def check_for_actor(message: object, actor: object) -> None:
+    """Raise NoSupervisor if a message to `actor`, which is no supervisor, is a call for one."""
+    if isinstance(message, SupervisorCall):
+        raise NoSupervisor(f"it is no supervisor, but a child of class {type(actor).__qualname__}")

@@ -38,16 +38,22 @@ class RegistrarConfig:
     """The configuration of one registrar and its catalog (the first five attributes are the thesis's properties).
 
     Attributes:
-        name: the registrar's name, for a configuration read from a file.
+        name: the registrar's name. Default: "untitled", which every name replaces. Set it in a file, so that no other
+            registrar uses the file.
         location: the directory of the catalog; a relative one is below the system's state_dir, and "~" is the user's
-            home. Default: the name.
-        save_interval_s: the seconds between two saves, with save_on_modify off.
-        save_on_modify: write each change before it is acknowledged. Off: a crash loses the changes since the last save.
+            home. Default: None, the name. Set it to keep a catalog on another disk.
+        save_interval_s: the seconds between two saves, with save_on_modify off. Default: 60.0. Lower it to lose less at
+            a crash.
+        save_on_modify: write each change before it is acknowledged. Default: True. Turn it off where speed matters
+            more: a crash then loses the changes since the last save.
         erase_on_destruct: remove the catalog when the registrar is closed for good, and owes no release to a provider
-            that is down.
-        durability: what a change survives. "process": SIGKILL. "power": a power cut (fsync before the answer).
-            "none": nothing, for benchmarks.
-        on_damage: "refuse" a damaged or foreign catalog, or rename it and start empty ("aside").
+            that is down. Default: False. Turn it on for a registrar that runs once, such as a script's.
+        durability: what a change survives. "process": SIGKILL. "power": a power cut (fsync before the answer). "none":
+            nothing, for benchmarks. Default: "process". Set "power" where power may fail while resources outlive it.
+        on_damage: "refuse" a damaged or foreign catalog, or rename it and start empty ("aside"). Default: "refuse". Set
+            "aside" where nobody is there to repair it, and a start matters more than what was held.
+        max_priority: the highest priority that a load of this registrar may have; the parts of its resources inherit no
+            higher one. Default: 1000, as for all. Lower it for a registrar whose loads must not come before others.
 
     Raises:
         ConfigError: a value is of the wrong type or out of range. `.key`, `.expected`, `.got`
@@ -60,6 +66,7 @@ class RegistrarConfig:
     erase_on_destruct: bool = False
     durability: Durability = "process"
     on_damage: OnDamage = "refuse"
+    max_priority: int = 1000
 
     def __post_init__(self) -> None:
         _check_fields(self, _REGISTRAR_RULES)
@@ -94,25 +101,41 @@ class SystemConfig:
     """Limits and defaults of a system, the same in all its processes.
 
     Attributes:
-        frame_limit_bytes: the size of the largest message between processes. The sender refuses a larger one.
+        frame_limit_bytes: the size of the largest message on the connection between two processes. The sender refuses
+            a larger one. Values of 64 KiB and more that actors send go through shared memory instead, and have no such
+            limit. Default: 16,777,216. Raise it where there is no shared memory.
+        segments_limit_bytes: the shared memory that one process may use for the large values that it sends. Default:
+            None, a quarter of the machine's memory. Lower it if others need the memory; 0: use none.
         mailbox_limit: the loads that one registrar may have in flight before MailboxFull. An actor's class has its own.
-        ask_timeout_s: seconds that an `ask` without a timeout waits for its answer.
-        start_timeout_s: seconds that a child has until its on_start has returned.
-        stop_timeout_s: seconds that a `System.stop` without a timeout takes before it kills.
-        workers_limit: the callbacks that may run at once in one process. Each has a thread.
+            Default: 100,000. Lower it to hear earlier that a provider is too slow.
+        ask_timeout_s: seconds that an `ask` without a timeout waits for its answer. Default: 30.0. Raise it if handlers
+            take longer.
+        start_timeout_s: seconds that a child has until its on_start has returned. Default: 30.0. Raise it for slow
+            imports or devices; for one child, use ChildSpec.start_timeout_s.
+        stop_timeout_s: seconds that a `System.stop` without a timeout takes before it kills. Default: 10.0. Lower it
+            below the patience of your service manager; raise it for slow unload callbacks.
+        workers_limit: the callbacks that may run at once in one process. Each has a thread. Default: 4096. Lower it
+            where threads are scarce; more callbacks wait then.
         preload: modules that the fork server imports once for all children. What they register with atexit then runs
-            when the fork server ends, not in each child.
+            when the fork server ends, not in each child. Default: (), none. Name those that take long to import.
         logging: whether records that child processes log reach the application's loggers of the same names. A child
             whose code configures handlers of its own, say by logging.basicConfig, keeps its records in any case.
+            Default: True. Turn it off if each process has a log of its own.
+        durability: the durability of registrars that `registrars` does not name. Default: "process". Set "power" where
+            power may fail.
         console: whether other processes of this user can look at the system and drive it, as the command rr-actors.
-        durability: the durability of registrars that `registrars` does not name.
-        registrars: other configurations, by the registrar's name.
+            Default: True. Turn it off if nobody but the application may.
+        clients_limit: the clients (rr.connect) and consoles that may be connected at once, however many connections
+            each has. Default: 128. Raise it for a larger pool of workers.
+        registrars: other configurations, by the registrar's name. Default: {}, none. Name a registrar that differs from
+            the others.
 
     Raises:
         ConfigError: a value is of the wrong type or out of range. `.key`, `.expected`, `.got`
     """
 
     frame_limit_bytes: int = 16 * 2**20
+    segments_limit_bytes: int | None = None
     mailbox_limit: int = 100_000
     ask_timeout_s: float = 30.0
     start_timeout_s: float = 30.0
@@ -122,6 +145,7 @@ class SystemConfig:
     logging: bool = True
     durability: Durability = "process"
     console: bool = True
+    clients_limit: int = 128
     registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
 
     def __post_init__(self) -> None:
@@ -202,6 +226,10 @@ _SECONDS = _Rule("a number of seconds greater than 0", lambda value: is_number(v
 _COUNT = _Rule(
     "a whole number greater than 0", lambda value: isinstance(value, int) and value is not True and value > 0
 )
+_SIZE = _Rule(
+    "a whole number from 0, or none",
+    lambda value: value is None or (isinstance(value, int) and value is not True and value is not False and value >= 0),
+)
 _BOOL = _Rule("true or false", lambda value: isinstance(value, bool))
 _DURABILITY = _one_of("process", "power", "none")
 
@@ -213,9 +241,14 @@ _REGISTRAR_RULES: dict[str, _Rule] = {
     "erase_on_destruct": _BOOL,
     "durability": _DURABILITY,
     "on_damage": _one_of("refuse", "aside"),
+    "max_priority": _Rule(
+        "a whole number from 0 to 1000",
+        lambda value: isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 1000,
+    ),
 }
 _SYSTEM_RULES: dict[str, _Rule] = {
     "frame_limit_bytes": _COUNT,
+    "segments_limit_bytes": _SIZE,
     "mailbox_limit": _COUNT,
     "ask_timeout_s": _SECONDS,
     "start_timeout_s": _SECONDS,
@@ -225,6 +258,7 @@ _SYSTEM_RULES: dict[str, _Rule] = {
     "logging": _BOOL,
     "durability": _DURABILITY,
     "console": _BOOL,
+    "clients_limit": _COUNT,
     "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),
 }
 

@@ -6,15 +6,16 @@
     ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
     │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
     │                       NotFound ChildRunning ChildRestarting NotForDynamic TooManyChildren
-    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring);  LoadTimeout
+    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring), OverCapacity;  LoadTimeout
     ├─ UnloadFailed(.trace)
-    ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull
+    ├─ ResourceLost
+    ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull NotRunning
     ├─ CatalogError         CatalogLocked CatalogDamaged CatalogVersion
     └─ SupervisionError     StartFailed RestartIntensityExceeded
 
 The names, paths and limits in an error's text are its attributes too: ``raise UnknownServer("...", server="a/b")`` has
 ``.server == "a/b"``. Errors can be pickled, and travel between registrars as an
-:class:`rr_actors.registrar.model.messages.Failure`.
+:class:`rr_actors.base.values.failure.Failure`.
 """
 
 from __future__ import annotations
@@ -45,7 +46,11 @@ class Frame(msgspec.Struct, frozen=True):
 
 
 class RrError(Exception):
-    """Base of every error of this package. Keyword arguments become attributes."""
+    """Base of every error of this package. Keyword arguments become attributes.
+
+    Attributes:
+        details: the keyword arguments.
+    """
 
     def __init__(self, message: str = "", **details: Any) -> None:
         super().__init__(message)
@@ -61,11 +66,30 @@ class RrError(Exception):
         return (_rebuild, (type(self), self.message, self.details))
 
 
+class Described(Exception):
+    """An error of a user's class, with its text and its trace, which were made where they may take long.
+
+    Attributes:
+        error: the error itself. Do not examine it on a loop.
+        text: the error, as "ValueError: no such device".
+        trace: its traceback, as Python prints it.
+    """
+
+    def __init__(self, error: BaseException, text: str, trace: str) -> None:
+        super().__init__(text)
+        self.error, self.text, self.trace = error, text, trace
+
+
 def text_of(error: BaseException) -> str:
-    """Return class and text, "ValueError: no such device"; the class alone if the error's own str() raises."""
+    """Return class and text, "ValueError: no such device", for people and in a form that can be sent and stored.
+
+    It is the class alone if the error's own str() raises.
+    """
+    if is_a(error, Described):
+        return error.text
     name = name_of_class(type(error))
     try:
-        return f"{name}: {error}"
+        return readable(f"{name}: {error}")
     except BaseException as reason:
         return f"{name} (its text is not known: its str() raised {name_of_class(type(reason))})"
 
@@ -92,6 +116,22 @@ def exact_text(text: str) -> str:
     return text if type(text) is str else str.__str__(text)
 
 
+_LONGEST_TEXT = 10_000
+_FEW = 5
+
+
+def readable(text: str, limit: int = _LONGEST_TEXT) -> str:
+    """Return a text for people in a form that can be sent and stored; half a character becomes its code.
+
+    File names may have such half characters. A very long text is cut: otherwise a frame could be too long, and would
+    never be sent.
+    """
+    text = exact_text(text)
+    if len(text) > limit:
+        text = f"{text[: limit - 50]} ... ({len(text) - limit + 50} characters more)"
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()
+
+
 TEXT_LIMIT = 300
 """The most characters of a value or an id that messages show."""
 
@@ -113,6 +153,13 @@ def shown(value: object) -> str:
 def shortened(text: str) -> str:
     """Return the beginning of a user's text, such as an id, for a message: at most TEXT_LIMIT characters."""
     return text if len(text) <= TEXT_LIMIT else f"{text[: TEXT_LIMIT - 1]}…"
+
+
+def few(texts: Iterable[str]) -> str:
+    """Return a list of texts for a message: the first five, and how many more there are."""
+    known = list(texts)
+    more = f" and {len(known) - _FEW} more" if len(known) > _FEW else ""
+    return ", ".join(known[:_FEW]) + more
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
@@ -277,6 +324,18 @@ class CircularDependency(LoadFailed):
     ring: tuple[str, ...] = ()
 
 
+class OverCapacity(LoadFailed):
+    """A pool of rr_actors.managers.Budgets has no room for a share, and none can be made in its time.
+
+    `.pool`, `.asked`, `.free`; `.holders`: the registrars that hold the pool's shares.
+    """
+
+    pool: str
+    asked: float
+    free: float
+    holders: tuple[str, ...] = ()
+
+
 class LoadTimeout(LoadError, TimeoutError):
     """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`, the provider's `.status`"""
 
@@ -292,8 +351,19 @@ class UnloadFailed(RrError):
     trace: tuple[Frame, ...] = ()
 
 
+class ResourceLost(RrError):
+    """The resource of a stream that is read was lost, or its provider took it away. `.query_id`, `.resource_id`"""
+
+    query_id: str
+    resource_id: str
+
+
 class Unavailable(RrError):
     """The other side cannot answer now."""
+
+
+class NotRunning(Unavailable):
+    """No running system was reached, or the system has ended, or the client of it is closed."""
 
 
 class RegistrarDown(Unavailable):
@@ -344,9 +414,13 @@ class SupervisionError(RrError):
 
 
 class StartFailed(SupervisionError):
-    """A child did not become ready; the children started before it are stopped again. `.id`, `__cause__`"""
+    """A child did not become ready; the children started before it are stopped again. `.id`, `__cause__`
+
+    `.wanted`: what was wanting, "EMFILE: ..."; "" if the start failed for another reason.
+    """
 
     id: str
+    wanted: str = ""
 
 
 class RestartIntensityExceeded(SupervisionError):

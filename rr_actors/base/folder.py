@@ -16,6 +16,10 @@ import weakref
 from pathlib import Path
 from typing import Self
 
+import msgspec
+
+from rr_actors.base.errors import CatalogError
+
 _KINDS = (
     (stat.S_ISLNK, "a symbolic link"),
     (stat.S_ISDIR, "a directory"),
@@ -65,6 +69,34 @@ class NotAFile(OSError):
         self.got = got
 
 
+class Place(msgspec.Struct, frozen=True):
+    """The path of a directory in use, and what the kernel calls that directory."""
+
+    path: str
+    device: int
+    inode: int
+
+    def is_there(self) -> bool:
+        """Return whether the path still leads to the directory. One system call."""
+        try:
+            found = os.stat(self.path)
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except OSError:  # this process may not look any more: that does not say that the directory is gone
+            return True
+        return (found.st_dev, found.st_ino) == (self.device, self.inode)
+
+    def check(self) -> None:
+        """Raise CatalogError if the path does not lead to the directory any more."""
+        if not self.is_there():
+            raise CatalogError(
+                f"{self.path}: the directory in use is not there any more: it was removed or renamed, or something is"
+                " mounted over it; nothing is written. Put it back, or stop the system",
+                path=self.path,
+                wanted=f"directory: {self.path} is not in its place",
+            )
+
+
 class Folder:
     """A directory that is held open by a descriptor of its own. Usable from any thread.
 
@@ -93,6 +125,29 @@ class Folder:
         real = os.path.realpath(path)
         fd = os.open(real, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         return cls(Path(real), fd, os.fstat(fd).st_uid if to_read else os.geteuid())
+
+    @classmethod
+    def below(cls, top: str | os.PathLike[str], path: Path) -> Self:
+        """Open the directory at a path below `top`. A link in the place of `top` is followed, a link below it is not.
+
+        Raises:
+            NotAFile: a link is in the place of a directory.
+        """
+        folder = cls.at(top)
+        for name in path.relative_to(top).parts:
+            with folder:
+                inner = folder.path / name
+                if os.path.islink(inner):
+                    raise NotAFile(inner, "a symbolic link")
+                flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+                folder = cls(inner, os.open(name, flags, dir_fd=folder.fd), folder.owner)
+        return folder
+
+    @property
+    def place(self) -> Place:
+        """Where the directory is."""
+        found = os.fstat(self.fd)
+        return Place(str(self.path), found.st_dev, found.st_ino)
 
     def close(self) -> None:
         """Close the descriptor. A second call does nothing."""

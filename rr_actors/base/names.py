@@ -11,6 +11,7 @@ import itertools
 import os
 import re
 import time
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
@@ -92,3 +93,37 @@ def _renew() -> None:
 
 _renew()
 os.register_at_fork(after_in_child=_renew)
+
+
+# -- as people read them ----------------------------------------------------------------------------------------------
+
+NAME_WIDTH = 60
+"""The most characters of a resource's name in a sentence or a line."""
+_SHORT_ID = 8
+
+
+def named(server: str, request: str, width: int = NAME_WIDTH) -> str:
+    """Return a resource's name, its server and its request, shortened in the middle: cameras/camera "/dev/video7"."""
+    return in_short(f"{server} {request}".rstrip(), width)
+
+
+def in_short(text: str, width: int) -> str:
+    """Return a text of at most `width` characters: its beginning and its end."""
+    if len(text) <= width:
+        return text
+    ahead = width // 2
+    return f"{text[:ahead]}…{text[len(text) - (width - 1 - ahead) :]}"
+
+
+def short_id(id: str) -> str:
+    """Return the end of an id, which every command takes. Ids begin with their time, so their ends tell them apart."""
+    return id[-_SHORT_ID:]
+
+
+def short_ids(ids: Iterable[str]) -> dict[str, str]:
+    """Return the short form of each of these ids, as long as it has to be to be unique among them."""
+    known = dict.fromkeys(ids)
+    length = _SHORT_ID
+    while len({id[-length:] for id in known}) < len(known):
+        length += 1
+    return {id: id[-length:] for id in known}

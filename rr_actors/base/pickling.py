@@ -1,19 +1,22 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for bytes that a process of the same system sent: loading runs code. This module does ten things that cloudpickle
-does not do:
+Only for bytes that a process of the same system sent: loading runs code. This module does eleven things that
+cloudpickle does not do:
 
 - msgspec leaves a cache on dataclasses and similar classes, which cannot be pickled; the cache is left out.
 - A class that returns to its own process is not changed there. cloudpickle would set it back to its state when it was
   sent, with methods that see a copy of its module's variables.
 - A class of a script's `__main__` from an earlier run becomes the script's present class of that name, if that has the
   same fields: catalogs keep types.
+- In a child process, what arrives of a script's `__main__` is found there by its name, too: pickle and
+  multiprocessing look for it there (adopt_main).
 - A msgspec Struct gets its fields when its class is made, so the fields travel with the class's name and bases.
 - Annotations that are text ("from __future__ import annotations"), or contain text (`list["Node"]`), mean names of
   `__main__`, which the other process does not have; they travel as the types that they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
-- A class that travels by value takes its codec along (rr.codec()).
+- A class that travels by value takes its codec along (rr.codec()). A child gets those of `__main__` that nothing of its
+  own names, too.
 - Code keeps the name of its file, so tracebacks, debuggers, profilers and coverage find its lines. cloudpickle 3.1.3
   and later leave the name out, to give equal functions equal bytes.
 - An exception travels in parts, so it arrives even if its class cannot make it again from its `args`.
@@ -32,15 +35,15 @@ import sys
 import types
 import typing
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn, cast
 
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
-from rr_actors.base import exception_parts
 from rr_actors.base.errors import NotSerializable, shown, text_of
-from rr_actors.base.values.codecs import codec, codec_of
+from rr_actors.base.reporting import exception_parts
+from rr_actors.base.values.codecs import codec, codec_of, types_of_main
 
 CUT_OFF = (EOFError, pickle.UnpicklingError)
 """The errors that the reader of a value gets if only the beginning of its bytes arrived."""
@@ -48,9 +51,35 @@ CUT_OFF = (EOFError, pickle.UnpicklingError)
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
 
-_NEEDLES = (b"__main__", b"multiprocessing.connection", b"asyncio.locks", b"asyncio.queues")
-"""A pickle that contains one of these is made again by cloudpickle, which is slower and handles more objects. Three are
-the modules of objects that plain pickle accepts, although they cannot leave their process."""
+_MAIN = b"__main__"
+_CONNECTION = b"multiprocessing.connection"
+_LOCKS = b"asyncio.locks"
+_QUEUES = b"asyncio.queues"
+"""A pickle that contains one of these four is made again by cloudpickle, which is slower and handles more objects.
+Three are the modules of objects that plain pickle accepts, although they cannot leave their process."""
+
+
+LARGE_BYTES = 64 * 1024
+"""How long a buffer, or a whole pickle, is at least that goes through shared memory."""
+
+
+Bytes = bytes | bytearray | memoryview
+
+
+class Large(msgspec.Struct, frozen=True, eq=False):
+    """A large value: the parts of its pickle, and the buffers that the pickle does not contain.
+
+    Long parts and buffers are the value's own memory, so use them before the value changes.
+    """
+
+    value: object
+    what: str
+    parts: Sequence[Bytes]
+    buffers: Sequence[memoryview]
+
+    def whole(self) -> bytes:
+        """Return a pickle that contains the buffers."""
+        return dumps(self.value, self.what) if self.buffers else b"".join(self.parts)
 
 
 def dumps(value: object, what: str = "value") -> bytes:
@@ -63,16 +92,110 @@ def dumps(value: object, what: str = "value") -> bytes:
         if isinstance(value, BaseException) and exception_parts.has_parts(value):
             return _dumps_by_value(value)
         blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
-        if not any(needle in blob for needle in _NEEDLES) and not cloudpickle.list_registry_pickle_by_value():
+        if isinstance(value, BaseException) and len(blob) > exception_parts.PART_LIMIT_BYTES:
+            return _dumps_by_value(value)
+        if _is_plain(blob):
             return blob
     except Exception:
         pass  # cloudpickle handles more objects, and otherwise raises the error to report
+    return _dumps_more(value, what)
+
+
+_were_large = False
+
+
+def dumps_large(value: object, what: str) -> bytes | Large:
+    """Return what `dumps` returns, but a Large for a value of at least LARGE_BYTES. Raises the errors of dumps()."""
+    if not _were_large:  # this way is the fastest, but copies long bytes and text
+        try:
+            blob = pickle.dumps(value, _PROTOCOL, buffer_callback=_stays)
+            if len(blob) < LARGE_BYTES and _is_plain(blob) and not isinstance(value, BaseException):
+                return blob
+        except Exception:
+            pass  # as above, or _LongBuffer
+    return dumps(value, what) if isinstance(value, BaseException) else _dumps_parts(value, what)
+
+
+def _dumps_parts(value: object, what: str) -> bytes | Large:
+    global _were_large
+    buffers: list[memoryview] = []
+    keep = _keeper(buffers)
     try:
-        return _dumps_by_value(value)
+        parts: list[Bytes] = []
+        pickle.Pickler(_Parts(parts.append), _PROTOCOL, buffer_callback=keep).dump(value)
+        _were_large = sum(map(len, parts)) >= LARGE_BYTES
+        if all(_is_plain(part) for part in parts if len(part) < LARGE_BYTES or part[:1] in (_PROTO, _FRAME)):
+            return Large(value, what, parts, buffers) if _were_large or buffers else b"".join(parts)
+    except Exception:
+        pass  # as above
+    buffers.clear()
+    blob = _dumps_more(value, what, keep)
+    return Large(value, what, (blob,), buffers) if buffers or len(blob) >= LARGE_BYTES else blob
+
+
+class _Parts:
+    """A file for a pickler, which writes long bytes and text to it as they are, and all else in frames."""
+
+    def __init__(self, write: Callable[[Bytes], object]) -> None:
+        self.write = write
+
+
+_PROTO, _FRAME = b"\x80", b"\x95"  # a part of a pickle that contains names begins with one of these, or is short
+
+
+class _LongBuffer(Exception):
+    """A buffer is to be left out of the pickle."""
+
+
+def dumps_around(value: object, what: str) -> Large:
+    """Return a value that pickle can handle, an array say, as its pickle and its buffers, however short these are."""
+    buffers = list[memoryview]()
+    blob = pickle.dumps(value, _PROTOCOL, buffer_callback=lambda buffer: buffers.append(buffer.raw()))
+    return Large(value, what, (blob,), buffers)
+
+
+def _stays(buffer: pickle.PickleBuffer) -> bool:
+    """Return that a short buffer becomes a part of the pickle; raise _LongBuffer for another."""
+    with memoryview(buffer) as memory:
+        if memory.nbytes < LARGE_BYTES or not memory.contiguous:
+            return True
+    raise _LongBuffer
+
+
+def _keeper(buffers: list[memoryview]) -> Callable[[pickle.PickleBuffer], bool]:
+    def keep(buffer: pickle.PickleBuffer) -> bool:
+        try:
+            return _stays(buffer)
+        except _LongBuffer:
+            buffers.append(buffer.raw())
+            return False
+
+    return keep
+
+
+def raw(value: Any) -> memoryview:
+    """Return the memory of an object with a buffer, as bytes."""
+    return pickle.PickleBuffer(value).raw()
+
+
+def _is_plain(blob: Bytes) -> bool:
+    """Return whether nothing in a pickle, or a part of it, goes by value."""
+    return not (
+        _MAIN in blob
+        or _CONNECTION in blob
+        or _LOCKS in blob
+        or _QUEUES in blob
+        or cloudpickle.list_registry_pickle_by_value()
+    )
+
+
+def _dumps_more(value: object, what: str, keep: Callable[[pickle.PickleBuffer], bool] | None = None) -> bytes:
+    try:
+        return _dumps_by_value(value, keep=keep)
     except Exception:
         pass  # perhaps the type of an annotation is the reason: try again, and leave annotations as text
     try:
-        return _dumps_by_value(value, resolve=False)
+        return _dumps_by_value(value, resolve=False, keep=keep)
     except Exception as error:
         _refuse(value, what, error)
 
@@ -89,6 +212,20 @@ def loads(blob: bytes) -> Any:
     return pickle.loads(blob)
 
 
+def loads_large(blob: memoryview, buffers: Sequence[memoryview]) -> Any:
+    """Return the value of a Large, from its pickle and its buffers. Raises the errors of loads()."""
+    return pickle.loads(blob, buffers=buffers)
+
+
+def classes_with_codecs() -> list[bytes]:
+    """Return the classes of `__main__` that have a codec, each as bytes, but for those that cannot be pickled."""
+    blobs: list[bytes] = []
+    for cls in types_of_main():
+        with contextlib.suppress(NotSerializable):
+            blobs.append(dumps(cls))
+    return blobs
+
+
 def modules_of(value: object, what: str = "value") -> set[str]:
     """Return the names of the modules that `loads` would import for the bytes that `dumps` makes of this value."""
     pickler = _ModulesPickler(io.BytesIO(), _PROTOCOL)
@@ -100,9 +237,11 @@ def modules_of(value: object, what: str = "value") -> set[str]:
     return pickler.modules
 
 
-def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
+def _dumps_by_value(
+    value: object, *, resolve: bool = True, keep: Callable[[pickle.PickleBuffer], bool] | None = None
+) -> bytes:
     with io.BytesIO() as file:
-        pickler = _Pickler(file, _PROTOCOL)
+        pickler = _Pickler(file, _PROTOCOL, buffer_callback=keep)
         pickler.resolve = resolve
         pickler.dump(value)
         return file.getvalue()
@@ -139,6 +278,8 @@ class _Pickler(_CloudPickler):
         if isinstance(obj, types.FunctionType):
             if self.resolve:
                 _resolve(reduced[2][1], obj.__globals__, lambda: inspect.getclosurevars(obj).nonlocals)
+            if obj.__module__ == "__main__" and obj.__qualname__.isidentifier():
+                return (*reduced[:2], (reduced[5], reduced[2]), None, None, _set_main_function_state)
         elif isinstance(obj, type):
             module = sys.modules.get(obj.__module__)
             if self.resolve and module is not None:
@@ -197,7 +338,7 @@ def _own_or_made(make: Callable[..., type], arguments: tuple[Any, ...], name: st
         own: Any = sys.modules.get("__main__")
         for part in name.split("."):
             own = getattr(own, part, None)
-        if isinstance(own, type) and own.__module__ == "__main__" and _fields(own) == fields:
+        if isinstance(own, type) and own.__module__ == "__main__" and _fields(own) == fields and own not in _arrived:
             _at_home.add(own)
             return own
     return make(*arguments)
@@ -215,9 +356,51 @@ def _set_class_state(cls: type, state: tuple[Any, ...]) -> None:
     if cls in _at_home:
         return
     _arrived.add(cls)
+    _name_in_main(cls)
     state[0](cls, state[1])
     if len(state) > 2 and state[2] is not None:  # older catalogs have two parts
         codec(cls, *state[2])
+
+
+# -- the names of __main__ in a child --------------------------------------------------------------------------------
+
+_adopts = False
+
+
+def adopt_main() -> None:
+    """Give what arrives of another process's `__main__` its name in this one's, which has no script of its own.
+
+    A callback may then use multiprocessing, a ProcessPoolExecutor or a library that pickles: pickle takes a class or
+    function by its name in a module, and refuses one that is not there. The script is not run again.
+    """
+    global _adopts
+    _adopts = True
+
+
+def of_main_by_value(_pickler: object, obj: Any) -> Any:
+    """Reduce a class or function of `__main__` to bytes that carry its code, for a worker process of a callback.
+
+    Like `reducer_override` of a pickler. The worker, too, gives what arrives its name in its `__main__`.
+    """
+    if isinstance(obj, type | types.FunctionType) and obj.__module__ == "__main__":
+        return _adopted, (_dumps_by_value(obj),)
+    return NotImplemented
+
+
+def _adopted(blob: bytes) -> Any:
+    adopt_main()
+    return loads(blob)
+
+
+def _name_in_main(what: Any) -> None:
+    if _adopts and what.__module__ == "__main__" and what.__qualname__.isidentifier():
+        setattr(sys.modules["__main__"], what.__qualname__, what)
+
+
+def _set_main_function_state(function: types.FunctionType, state: tuple[Any, Any]) -> None:
+    set_state, values = state
+    set_state(function, values)
+    _name_in_main(function)
 
 
 # -- annotations ---------------------------------------------------------------------------------------------------

@@ -1,4 +1,7 @@
-"""Scarcity: whether an error means that the machine has no more descriptors, memory, threads or room on disk."""
+"""Scarcity: whether an error means a want of something outside that may end again.
+
+Descriptors, memory, processes, threads and room on disk can be wanting, and a catalog that another process holds.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,15 @@ import errno
 from collections.abc import Iterator
 from typing import cast
 
+from rr_actors.base.errors import CatalogLocked, Described, RrError
+
 _WANTED = {
     errno.EMFILE: "EMFILE: the process has as many descriptors open as it may (ulimit -n)",
     errno.ENFILE: "ENFILE: the machine has as many files open as it may (fs.file-max)",
     errno.ENOMEM: "ENOMEM: there is no memory left for it",
     errno.EAGAIN: "EAGAIN: no more processes or threads can be made (ulimit -u, or the control group's limit)",
-    errno.ENOSPC: "ENOSPC: the disk is full",
+    errno.ENOBUFS: "ENOBUFS: the kernel has no memory left for it",
+    errno.ENOSPC: "ENOSPC: the disk is full, or has no inode left",
     errno.EDQUOT: "EDQUOT: the user's share of the disk is full",
 }
 
@@ -21,7 +27,7 @@ NO_THREAD = _WANTED[errno.EAGAIN]
 
 
 def wanted_by(error: BaseException) -> str:
-    """Name the resource that the machine lacked, "EMFILE: ..."; "" if the error has another reason."""
+    """Name what was wanting, "EMFILE: ..."; "" if the error has another reason."""
     return next((wanted for cause in _causes(error) if (wanted := _wanted(cause))), "")
 
 
@@ -32,6 +38,10 @@ def _wanted(error: BaseException) -> str:
         return _WANTED[errno.ENOMEM]
     if isinstance(error, RuntimeError) and "can't start new thread" in error.args:
         return _WANTED[errno.EAGAIN]
+    if isinstance(error, CatalogLocked):
+        return "LOCKED: another process has the catalog"
+    if isinstance(error, RrError):  # it has come from another process, without its causes
+        return error.details.get("wanted", "")
     return ""
 
 
@@ -44,6 +54,9 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
         if found is None or id(found) in seen:
             continue
         seen.add(id(found))
+        if isinstance(found, Described):
+            rest.append(found.error)
+            continue
         yield found
         rest += [found.__cause__, None if found.__suppress_context__ else found.__context__]
         if isinstance(found, BaseExceptionGroup):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
+
+from rr_actors.base.reporting.log import Log
 
 
 class Steps:
@@ -49,7 +50,7 @@ class Steps:
         if error is not None:
             raise error
 
-    def report(self, logger: logging.Logger, text: str) -> None:
+    def report(self, logger: Log, text: str) -> None:
         """Log the errors of the steps, if no caller could handle them; raise an interruption."""
         for error in self._errors:
             logger.error("%s: %s", text, "; ".join(error.__notes__), exc_info=error)

@@ -1,6 +1,7 @@
 """TOML: the one place that reads it. Every fault is a ConfigError, also a fault that the standard library accepts.
 
-The errors for wrong keys and values are made here, too, for files and for arguments. The end reads supervision trees.
+The errors for wrong keys and values are made here, too, for files and for arguments. read_typed() makes a msgspec
+Struct of a file. The end reads supervision trees.
 
 msgspec imports the standard library's reader when the first file is read: most programs read none.
 """
@@ -11,15 +12,17 @@ import dataclasses
 import functools
 import importlib
 import os
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, get_args, get_origin
 
 import msgspec
 
 from rr_actors.base.checks import path_text
 from rr_actors.base.errors import ConfigError, InvalidSpec, did_you_mean, shortened, shown
 
+_T = TypeVar("_T")
 _INTEGERS = range(-(2**63), 2**63)  # the range that TOML requires of a reader
 
 
@@ -43,8 +46,13 @@ def check_keys(table: Collection[str], known: Collection[str], file: str, prefix
     """
     for key in table:
         if key not in known:
-            said = f"an unknown key{did_you_mean(key, known)}"
-            raise wrong(file, prefix + key, f"one of {', '.join(known)}", key, said=said)
+            raise unknown_key(key, known, file, prefix)
+
+
+def unknown_key(key: str, known: Collection[str], file: str, prefix: str = "") -> ConfigError:
+    """Return the error for a key that the table at `prefix` cannot have."""
+    said = f"an unknown key{did_you_mean(key, known)}"
+    return wrong(file, prefix + key, f"one of {', '.join(known)}", key, said=said)
 
 
 def file_name(path: object) -> str:
@@ -105,6 +113,63 @@ def _check_integers(value: object) -> None:
         raise ValueError("a whole number that does not fit into 64 bits")
 
 
+# -- tables with a type ----------------------------------------------------------------------------------------------
+
+_FIELD = re.compile(r"Object (contains unknown|missing required) field `(.+)`\Z", re.DOTALL)
+_STEP = re.compile(r"\[(\d+)\]|\.?([^.\[\]]+)")
+
+
+def read_typed(file: str, kind: type[_T]) -> _T:
+    """Return the content of a TOML file as a `kind`, a msgspec Struct.
+
+    Raises:
+        ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or of the wrong type. `.file`,
+            `.key`, `.expected`, `.got`
+    """
+    table = read_toml(file)
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        raise _wrong_at(table, kind, file, str(error)) from error
+
+
+def _wrong_at(table: dict[str, Any], kind: Any, file: str, said: str) -> ConfigError:
+    """Return the error for msgspec's text, such as "Expected `int`, got `str` - at `$.component[0].reliability`"."""
+    problem, _, place = said.removesuffix("`").partition(" - at `$")
+    key = place.removeprefix(".")
+    in_toml = problem.removeprefix("Expected ").replace("`object`", "a table").replace("`array`", "a list")
+    expected, _, got = in_toml.partition(", got ")
+    if "[...]" in key:  # msgspec does not say which key of a mapping, so its value is not known
+        return wrong(file, key, expected, got, said=got)
+    value: Any = table
+    for index, name in _STEP.findall(key):
+        value = value[int(index) if index else name]
+        kind = _kind_below(kind, name)
+    field = _FIELD.match(problem if place else said)
+    if field is None:
+        return wrong(file, key, expected, value)
+    if field[1] == "missing required":
+        return wrong(file, key, f"the key {field[2]}", value, said="none")
+    known = [one.encode_name for one in msgspec.structs.fields(_struct_in(kind))]
+    return unknown_key(field[2], known, file, f"{key}." if key else "")
+
+
+def _kind_below(kind: Any, name: str) -> Any:
+    """Return the type of a field of a Struct, or of the items of a list or mapping."""
+    struct = _struct_in(kind)
+    if struct is None:
+        return get_args(kind)[-1]
+    return next(one.type for one in msgspec.structs.fields(struct) if one.encode_name == name)
+
+
+def _struct_in(kind: Any) -> Any:
+    """Return the Struct that a type is, or allows beside None; None for a list or a mapping."""
+    if get_origin(kind) in (list, dict):
+        return None
+    kinds = [one for one in (kind, *get_args(kind)) if isinstance(one, type)]
+    return next((one for one in kinds if issubclass(one, msgspec.Struct)), None)
+
+
 # -- supervision trees -----------------------------------------------------------------------------------------------
 #
 # A table with `children` is a Supervisor, one with `actor` a ChildSpec::
@@ -129,7 +194,6 @@ def _check_integers(value: object) -> None:
 # Every other key is a field of the same name of ChildSpec, Supervisor or Backoff.
 
 FilePath = str | os.PathLike[str]
-_T = TypeVar("_T")
 _ACTOR = "actor_class_or_manager"  # ChildSpec's field for the key `actor`
 
 
@@ -188,7 +252,7 @@ class _Reader:
         try:
             module, _, path_in_it = name.partition(":")
             found = functools.reduce(getattr, path_in_it.split("."), cast(object, importlib.import_module(module)))
-        except Exception as error:  # importing runs the module: it may raise anything
+        except (Exception, SystemExit) as error:  # importing runs the module: it may raise anything
             said = shortened(f"{shown(name)} ({type(error).__name__}: {error})")
             raise wrong(self.file, key, expected, name, said=said) from error
         if not isinstance(found, type):

@@ -18,9 +18,9 @@ The registry is a TOML file::
 from __future__ import annotations
 
 import functools
-import logging
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -28,18 +28,19 @@ import msgspec
 
 from rr_actors.base.errors import LoadFailed, RrError
 from rr_actors.base.names import new_id
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.toml import read_typed
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
-from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all, read_description
+from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
-from rr_actors.registrar.registrar import Registrar
 
-logger = logging.getLogger("rr_actors.managers.components")
+logger = Log("rr_actors.managers.components")
 
 _LOAD_MARGIN_S = 20.0  # added to the program's own limit: its manager may be restarting after a crash
 
@@ -86,6 +87,12 @@ class Component(msgspec.Struct, frozen=True):
     parameters: dict[str, str]
 
 
+Made = Callable[[Query], Component]
+"""Makes the response of the query of a component's program."""
+Run = Callable[[RunProgram, Made, float], Component]
+"""Runs a program within a time limit in seconds, and returns the component that it is."""
+
+
 class NoComponent(LoadFailed):
     """The registry has no component of the type, or none of them could be loaded."""
 
@@ -113,35 +120,33 @@ class Components(Manager):
     @server("component")
     def load_component(self, request: LoadComponent) -> Component:
         """Run the most reliable component of the type whose program can be run."""
-        _, component = self._load_best(request)
-        return component
+        return self._run_best(request, self._load)
 
     @load_component.status
     def component_status(self, request: LoadComponent, status: Status) -> None:
-        """Lower the reliability of a component whose program has ended, and run the next best component.
+        """Lower the reliability of a component whose program has ended, and put the next best one in its place.
 
-        Every step may be repeated after a crash. The failure counts once, and a program that an interrupted run
-        loaded is shared. The programs that are not needed are released in the end.
+        A crash may repeat this. The failure counts once, so the same component is chosen again.
         """
         if status.state is not State.FATAL or not self._replace:
             return
-        resource_id = current().resource_id
-        if status.resource_id == resource_id:
+        if status.resource_id == current().resource_id:
             return  # a status of the component itself: its holders hear it
-        parts = {part.id: part for part in self.registrar.children(resource_id)}
-        if status.query_id in parts:
-            self._lower(self._component_of(request, parts[status.query_id].request), status.resource_id)
-            try:
-                replacement, component = self._load_best(request)
-                why = f"{component.name} takes the place of one that failed: {status.message}"
-                self.registrar.update_response(resource_id, component, why)
-            except RrError as error:
-                logger.warning("%s: nothing takes the place of one that failed: %s", request.type, error)
-                return
-            logger.warning("%s: %s", request.type, why)
-            leftover = [part for part in self.registrar.children(resource_id) if part.id != replacement.id]
-            release(self.registrar, leftover)  # the failed program, and the programs that interrupted runs loaded
-        status.handled()
+        part = next(
+            (part for part in self.registrar.children(current().resource_id) if part.id == status.query_id), None
+        )
+        if part is None:
+            status.handled()  # a run before the crash has replaced it already
+            return
+        self._lower(self._component_of(request, part.request), status.resource_id)
+        try:
+            component = self._run_best(request, functools.partial(self._swap, status))
+        except RrError as error:
+            logger.warning("%s: nothing takes the place of one that failed: %s", request.type, error)
+        else:
+            logger.warning(
+                "%s: %s takes the place of one that failed: %s", request.type, component.name, status.message
+            )
 
     # -- choosing --------------------------------------------------------------------------------------------------
 
@@ -164,7 +169,13 @@ class Components(Manager):
             with self._lock:
                 self._reliabilities.lower(component.name, component.reliability, failure_id)
 
-    def _load_best(self, request: LoadComponent) -> tuple[Query, Component]:
+    def _load(self, program: RunProgram, made: Made, timeout_s: float) -> Component:
+        return made(self.registrar.load(self._programs, program, timeout_s=timeout_s))
+
+    def _swap(self, status: Status, program: RunProgram, made: Made, timeout_s: float) -> Component:
+        return made(self.registrar.replace_part(status, program, self._programs, response=made, timeout_s=timeout_s))
+
+    def _run_best(self, request: LoadComponent, run: Run) -> Component:
         """Run the first candidate that can be run, and lower the reliability of those that cannot.
 
         Raises:
@@ -173,13 +184,12 @@ class Components(Manager):
         failures: list[str] = []
         for candidate in self.candidates(request.type):
             program, parameters = self._filled(candidate, request)
+            made = functools.partial(_component, candidate, parameters)
             try:
-                query = self.registrar.load(self._programs, program, timeout_s=program.ready.timeout_s + _LOAD_MARGIN_S)
+                return run(program, made, program.ready.timeout_s + _LOAD_MARGIN_S)
             except LoadFailed as error:
                 failures.append(f"{candidate.name}: {error}")
                 self._lower(candidate, new_id())
-                continue
-            return query, Component(candidate.name, candidate.type, query.response.pid, parameters)
         if failures:
             raise NoComponent(f"no component of type {request.type!r} could be loaded:\n" + "\n".join(failures))
         known = ", ".join(sorted({component.type for component in self._registry})) or "none"
@@ -215,13 +225,8 @@ class Components(Manager):
         ), parameters
 
 
-def release(registrar: Registrar, parts: list[Query]) -> None:
-    """Unload parts that are not needed any more; log a failure, as that part is unloaded with the resource."""
-    for part in parts:
-        try:
-            registrar.unload(part)
-        except RrError as error:
-            logger.warning("%s: not released: %s", part, error)
+def _component(description: ComponentDescription, parameters: dict[str, str], query: Query) -> Component:
+    return Component(description.name, description.type, query.response.pid, parameters)
 
 
 def read_registry(path: Path) -> list[ComponentDescription]:
@@ -230,6 +235,6 @@ def read_registry(path: Path) -> list[ComponentDescription]:
     Raises:
         ConfigError: the registry cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
-    components = read_description(path, RegistryFile).component
+    components = read_typed(str(path), RegistryFile).component
     check_unique(path, "component", [component.name for component in components])
     return components

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import select
 import selectors
@@ -12,9 +11,10 @@ import socket
 import threading
 from collections.abc import Callable
 
+from rr_actors.base.reporting.log import Log
 from rr_actors.managers.shim import start_ticks
 
-logger = logging.getLogger("rr_actors.managers.exit_watcher")
+logger = Log("rr_actors.managers.exit_watcher")
 
 
 class ProcessHandle:

@@ -11,6 +11,7 @@ Linux: uses pidfds, /proc, and a subreaper.
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import json
 import os
 import signal
@@ -18,19 +19,25 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import psutil
 
 from rr_actors.base.errors import RrError
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.process_marks import VARIABLE, kill_allocation
 from rr_actors.managers.program_directory import Home, shim_of
+from rr_actors.managers.program_usage import ProgramUsage
+from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.process import signal_name
 
 TAIL_LINES = 10
 _SHIM = str(Path(__file__).with_name("shim.py"))
 _POLL_S = 0.005  # between two looks whether a program is ready
+LONGEST_S = 2e6  # 23 days: nearly the longest time that poll() can wait
 _SHIM_LIMIT_S = 5.0  # for a shim's step that usually takes milliseconds
 
 
@@ -61,7 +68,7 @@ class Exit:
         elif self.code is not None:
             how = f"exited with code {self.code}"
         else:
-            how = "was killed together with the process that watched over it"
+            how = "has ended unseen: the process that watched over it was killed, or could not write (a full disk?)"
         return f"{how}; last output:\n" + "\n".join(f"  {line}" for line in self.output) if self.output else how
 
 
@@ -75,7 +82,7 @@ class Order:
     directory: str
     ready_line: str | None = None  # a regular expression that a line of the output must contain
     stop_signal: int = signal.SIGTERM
-    grace_s: float = 5.0
+    grace_s: float = 5.0  # at most LONGEST_S
 
 
 class ExternalPrograms:
@@ -85,19 +92,20 @@ class ExternalPrograms:
     """
 
     def __init__(self, directory: Path, on_exit: Callable[[str, Exit], None]) -> None:
-        """Work below `directory`, and make it if it does not exist.
+        """Work below `directory`, which is made for the first program if it does not exist.
 
         Raises:
             ProgramFailed: this Python has no pidfds.
         """
         if not hasattr(os, "pidfd_open"):
             raise ProgramFailed("external programs need pidfds: Linux 5.3 or later, and a Python that was built for it")
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._directory = directory
         self._on_exit = on_exit
         self._watcher = ExitWatcher()
         self._lock = threading.Lock()
         self._watched: dict[str, ProcessHandle] = {}
+        self._usages: dict[str, ProgramUsage] = {}
+        self._gives_up = False
 
     def start(
         self,
@@ -157,6 +165,7 @@ class ExternalPrograms:
         """
         with self._lock:
             watched = self._watched.pop(key, None)
+            self._usages.pop(key, None)
         if watched is not None:
             self._watcher.forget(watched)
         home = self._home(key)
@@ -174,8 +183,52 @@ class ExternalPrograms:
             held = f"its shim holds {home.path}/lock and does not react"
             raise ProgramFailed(f"the program of {home.path} cannot be ended: {held}")
 
-    def close(self) -> None:
-        """Stop watching the programs. They run on, and can be attached to again."""
+    def pause(self, key: str) -> None:
+        """Stop a program and its process group where they are, until resume(), or stop(), which ends them.
+
+        Raises:
+            ProgramFailed: the program has ended.
+        """
+        self._signal(key, signal.SIGSTOP)
+
+    def resume(self, key: str) -> None:
+        """Let a paused program go on; one that is not paused does so in any case. Raises as pause() does."""
+        self._signal(key, signal.SIGCONT)
+
+    def _signal(self, key: str, number: int) -> None:
+        try:
+            program = ProcessHandle(*self._home(key).state()["program"])
+        except (KeyError, ProcessLookupError):
+            raise ProgramFailed("the program has ended") from None
+        with contextlib.closing(program), contextlib.suppress(ProcessLookupError):
+            os.killpg(program.pid, number)
+
+    def usage(self, key: str) -> dict[str, float]:
+        """Return what a running program uses, with all that it has started, as ProgramUsage.now() does.
+
+        Raises:
+            ProgramFailed: the program has ended.
+        """
+        state = self._home(key).state()
+        shim = shim_of(state)
+        if shim is None or "program" not in state:
+            raise ProgramFailed("the program has ended")
+        running = _running(state)
+        with contextlib.closing(shim):
+            known = self._usages.get(key)
+            if known is None or known.pid != running.pid:
+                known = self._usages[key] = ProgramUsage(shim.pid, *running)
+            try:
+                return known.now()
+            except psutil.Error:
+                raise ProgramFailed("the program has ended") from None
+
+    def close(self, *, final: bool = False) -> None:
+        """Stop watching the programs. They run on, and can be attached to again.
+
+        `final`: nobody will; the starts that have not returned yet end their programs, and fail.
+        """
+        self._gives_up = final
         self._watcher.close()
         with self._lock:
             self._watched.clear()
@@ -193,12 +246,13 @@ class ExternalPrograms:
 
     def _spawn(self, home: Home, order: Order, allocation: str) -> ProcessHandle:
         """Start a shim; the watcher reaps it when it ends."""
+        executable = interpreter.python(f"external program {order.command!r}")
         order_end, written = os.pipe()  # both close-on-exec
         message = {**asdict(order), "environment": {**order.environment, VARIABLE: allocation}}
         try:
             pid = os.posix_spawn(
-                sys.executable,
-                [sys.executable, "-I", "-S", _SHIM, str(home.path)],
+                executable,
+                [executable, "-I", "-S", _SHIM, str(home.path)],
                 os.environ,
                 file_actions=[
                     (os.POSIX_SPAWN_DUP2, order_end, 0),
@@ -234,19 +288,28 @@ class ExternalPrograms:
         spawned: ProcessHandle | None,
     ) -> Running:
         deadline = time.monotonic() + timeout_s
+        asked: Future[bool] | None = None
         while True:
             state = home.state()
             if state:
                 self._check_alive(home, command, state)
             elif (spawned is None or spawned.wait(0)) and not (home.is_held() or home.state()):
                 raise ProgramFailed(f"cannot start {command!r}: its shim ended ({sys.executable} {_SHIM})")
-            if state.get("ready") and ready(_running(state)) and self._watch(home.key, state):
-                if spawned is not None and spawned.pid != state["shim"][0]:
-                    spawned.send_signal(signal.SIGKILL)  # not needed: an interrupted start's shim has the lock
-                return _running(state)
+            if state.get("ready") and asked is None:
+                asked = _ask(ready, _running(state))
+                wait((asked,), _POLL_S)
+            if asked is not None and asked.done():
+                if asked.result() and self._watch(home.key, state):
+                    if spawned is not None and spawned.pid != state["shim"][0]:
+                        spawned.send_signal(signal.SIGKILL)  # not needed: an interrupted start's shim has the lock
+                    return _running(state)
+                asked = None
+            if self._gives_up:
+                raise ProgramFailed(f"{command!r} was not ready yet, and its manager is being stopped")
             if time.monotonic() > deadline:
                 output = "\n".join(f"  {line}" for line in home.output(TAIL_LINES)) or "  (none)"
-                raise ProgramFailed(f"{command!r} was not ready within {timeout_s:g} s; its output:\n{output}")
+                hangs = "" if asked is None else " (the check whether it is ready has not returned)"
+                raise ProgramFailed(f"{command!r} was not ready within {timeout_s:g} s{hangs}; its output:\n{output}")
             time.sleep(_POLL_S)
 
     def _check_alive(self, home: Home, command: str, state: dict[str, Any]) -> None:
@@ -303,6 +366,20 @@ class ExternalPrograms:
             if not shim.wait(state["grace_s"] + _SHIM_LIMIT_S):
                 shim.send_signal(signal.SIGKILL)
                 shim.wait(_SHIM_LIMIT_S)
+
+
+def _ask(ready: Callable[[Running], bool], running: Running) -> Future[bool]:
+    """Call ready(running) in a thread of its own, in the caller's context: it may be a user's probe, and hang."""
+    answer: Future[bool] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(ready(running))
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=contextvars.copy_context().run, args=(run,), name="rr-ready", daemon=True).start()
+    return answer
 
 
 def _running(state: dict[str, Any]) -> Running:

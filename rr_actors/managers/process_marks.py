@@ -1,4 +1,4 @@
-"""Find the processes of an allocation by a variable in their environment. The only user of psutil.
+"""Find the processes of an allocation by a variable in their environment.
 
 A program gets ``RR_ALLOCATION=<resource id>.<attempt>``, and every process that it starts inherits the variable. So
 the processes of a resource can be found even when no process that knew of them has survived.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import logging
 import os
 import shutil
 from collections.abc import Generator
@@ -14,10 +13,11 @@ from typing import Any, NotRequired, TypedDict, cast
 import msgspec
 
 from rr_actors.base.folder import Folder
+from rr_actors.base.reporting.log import Log
 from rr_actors.managers.exit_watcher import ProcessHandle
 from rr_actors.managers.process_marks import kill_allocation
 
-logger = logging.getLogger("rr_actors.managers.program_directory")
+logger = Log("rr_actors.managers.program_directory")
 
 _LINE_LIMIT = 500  # characters
 
@@ -52,7 +52,11 @@ class Home:
 
     def make(self) -> None:
         """Make the directory, with a lock file that no process holds."""
-        self.path.mkdir(mode=0o700)
+        while True:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with contextlib.suppress(FileNotFoundError):  # the end of the last other program has removed the parent
+                self.path.mkdir(mode=0o700)
+                break
         (self.path / "lock").touch(mode=0o600)
 
     def remove(self) -> None:

@@ -6,9 +6,9 @@ when its last holder releases it. It outlives a crash of its manager, and the ma
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
-import logging
 import os
 import re
 import signal
@@ -17,19 +17,21 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec.structs import replace
 
-from rr_actors.base.errors import InvalidRequest, RrError, shown
-from rr_actors.managers.external_programs import Exit, ExternalPrograms, Order, Running
+from rr_actors.base.errors import InvalidRequest, RrError, shown, text_of
+from rr_actors.base.reporting.log import Log
+from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.server import current
+from rr_actors.registrar.engine.server import ServerSpec, checked_pauses, checked_spec, current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State
 
-logger = logging.getLogger("rr_actors.managers.programs")
+logger = Log("rr_actors.managers.programs")
 
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
 Probe = Callable[[int], bool]
@@ -48,7 +50,7 @@ class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         file: a file that was written since the program started.
         port: a TCP port that accepts a connection, on `host`.
         probe: the name of a function that gets the program's pid and returns whether it is ready. The manager was
-            given it by that name, or the name is "package.module:function".
+            given it by that name, or the name is "package.module:function". It runs in a thread of its own.
         timeout_s: seconds to become ready. After that the program is ended and the load fails.
     """
 
@@ -70,7 +72,7 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         directory: its working directory; a relative path begins at the manager's. Default: the manager's.
         ready: the conditions under which it is ready.
         stop_signal: the signal that asks its whole process group to end.
-        grace_s: seconds until SIGKILL follows.
+        grace_s: seconds until SIGKILL follows; infinite: it does not.
         instance: a name that distinguishes requests that are otherwise the same: each name gets its own program.
     """
 
@@ -98,21 +100,33 @@ class Programs(Manager):
     Programs must stay in the foreground: a daemon that a program leaves is ended with it. Linux only.
     """
 
-    def __init__(self, directory: str | None = None, probes: Mapping[str, Probe] | None = None) -> None:
+    def __init__(
+        self,
+        directory: str | None = None,
+        probes: Mapping[str, Probe] | None = None,
+        *,
+        idle: Literal["unload", "pause"] = "unload",
+        linger_s: float = 0.0,
+        paused_s: float | None = None,
+    ) -> None:
         """Keep a directory for each program below `directory` (default: "programs" beside the registrar's catalog).
 
-        `probes` are functions that requests may name as their readiness.
+        Args:
+            probes: functions that requests may name as their readiness.
+            idle, linger_s, paused_s: what becomes of a program that nobody needs, as for register_server(). A paused
+                program is stopped by SIGSTOP, with its process group: it keeps its memory and takes no CPU.
         """
         self._directory = directory
         self._probes = dict(probes or {})
+        self._idleness = {"idle": idle, "linger_s": linger_s, "paused_s": paused_s}
         self._lock = threading.Lock()
         self._programs: ExternalPrograms | None = None
 
     def on_stop(self) -> None:
-        """Stop watching the programs. They run until their holders release them."""
-        self._external.close()
+        """Stop watching the programs. They run until their holders release them; a last stop ends those that start."""
+        self._external.close(final=self._final)
 
-    @server("program")
+    @server("program", idle="pause")
     def run_program(self, request: RunProgram) -> Program:
         """Start a program, or adopt one that an interrupted load has started."""
         me = current()
@@ -125,20 +139,47 @@ class Programs(Manager):
     def end_program(self, request: RunProgram, response: Program) -> None:
         """End the program and all its descendants."""
         self._external.stop(current().resource_id)
+        if self._directory is None:
+            with contextlib.suppress(OSError):  # others run
+                self._beside.rmdir()
 
     @run_program.recover
     def find_program(self, request: RunProgram, response: Program) -> Program:
         """Watch the program again if it still runs."""
         return Program(*self._external.attach(current().resource_id))
 
+    @run_program.usage
+    def program_usage(self, request: RunProgram, response: Program) -> dict[str, float]:
+        """Return "cpu_s", "cpu", "memory_bytes" and "threads" of the program and all its descendants."""
+        return self._external.usage(current().resource_id)
+
+    @run_program.pause
+    def pause_program(self, request: RunProgram, response: Program) -> None:
+        """Stop the program's process group where it is."""
+        self._external.pause(current().resource_id)
+
+    @run_program.resume
+    def resume_program(self, request: RunProgram, response: Program) -> None:
+        """Let it go on."""
+        self._external.resume(current().resource_id)
+
+    def _adapted(self, spec: ServerSpec) -> ServerSpec:
+        pauses = self._idleness["idle"] == "pause"
+        unused = {} if pauses else {"pause": None, "resume": None}
+        return checked_pauses(checked_spec(replace(spec, **self._idleness, **unused)))
+
     @property
     def _external(self) -> ExternalPrograms:
         """The external programs, made at first use: recover callbacks run before on_start, and in parallel."""
         with self._lock:
             if self._programs is None:
-                beside = self.registrar.directory / "programs"
-                self._programs = ExternalPrograms(Path(self._directory or beside).absolute(), self._program_ended)
+                directory = Path(self._directory or self._beside).absolute()
+                self._programs = ExternalPrograms(directory, self._program_ended)
             return self._programs
+
+    @property
+    def _beside(self) -> Path:
+        return self.registrar.directory / "programs"
 
     def _program_ended(self, resource_id: str, end: Exit) -> None:
         """Send the holders of a program that has ended unasked a FATAL status."""
@@ -168,14 +209,14 @@ def _order(request: RunProgram) -> Order:
         str(Path(request.directory or ".").absolute()),
         _checked_pattern(request.ready.line),
         _signal_number(request.stop_signal),
-        request.grace_s,
+        min(request.grace_s, LONGEST_S),
     )
 
 
 def _checked_pattern(line: str | None) -> str | None:
     try:
-        return line if line is None else re.compile(line).pattern
-    except re.error as error:
+        return line if line is None else re.compile(line.encode()).pattern.decode()
+    except (ValueError, re.error) as error:
         text = f"ready.line: expected a regular expression, got {shown(line)}: {error}"
         raise InvalidRequest(text, path="ready.line", expected="a regular expression") from None
 
@@ -225,7 +266,8 @@ def _import(name: str) -> Probe:
     module, _, function = name.partition(":")
     try:
         found: Any = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
-        text = f"ready.probe: expected a probe of the manager, or 'package.module:function', got {shown(name)}: {error}"
+    except (Exception, SystemExit) as error:  # importing runs the module: it may raise anything
+        got = f"{shown(name)}: {text_of(error)}"
+        text = f"ready.probe: expected a probe of the manager, or 'package.module:function', got {got}"
         raise InvalidRequest(text, path="ready.probe", expected="'package.module:function'") from error
     return found

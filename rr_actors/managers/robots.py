@@ -11,14 +11,15 @@ The descriptions are a TOML file. Each part names a type, and any component of t
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import msgspec
 
 from rr_actors.base.errors import LoadFailed, RrError
-from rr_actors.managers.components import Component, LoadComponent, release
-from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all, read_description
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.toml import read_typed
+from rr_actors.managers.components import Component, LoadComponent
+from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
@@ -26,7 +27,7 @@ from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 
-logger = logging.getLogger("rr_actors.managers.robots")
+logger = Log("rr_actors.managers.robots")
 
 _LOAD_LIMIT_S = 60.0
 
@@ -104,10 +105,7 @@ class Robots(Manager):
 
     @load_robot.status
     def robot_status(self, request: LoadRobot, status: Status) -> None:
-        """Pass a part's new component on (UPDATE), or load a failed part again and release the old one (FATAL).
-
-        This may be repeated after a crash. Parts that an interrupted run loaded are shared, and released in the end.
-        """
+        """Pass a part's new component on (UPDATE), or load a failed part again in its place (FATAL)."""
         if status.resource_id == current().resource_id:
             return  # a status of the robot itself: its holders hear it
         parts = self.registrar.children(current().resource_id)
@@ -128,21 +126,29 @@ class Robots(Manager):
     def _replace_part(self, request: LoadRobot, parts: list[Query], status: Status) -> None:
         failed = next((part for part in parts if part.id == status.query_id), None)
         if failed is None:
-            return  # a run before the crash has released it already
-        replacement = self._load(failed.request)
-        why = f"{replacement.response.name} takes the place of a part that failed: {status.message}"
-        logger.warning("%s: %s", request.name, why)
-        kept = [part for part in parts if part.request != failed.request]
-        self._update(request, [*kept, replacement], why)
-        release(self.registrar, [part for part in parts if part.request == failed.request])
+            return  # a run before the crash has replaced it already
+        others = [part for part in parts if part.request != failed.request]
+        spare = self.registrar.replace_part(
+            status,
+            failed.request,
+            response=lambda spare: self._assembled(request, self._in_order(request, [*others, spare])),
+            timeout_s=_LOAD_LIMIT_S,
+        )
+        name = spare.response.name
+        logger.warning("%s: %s takes the place of a part that failed: %s", request.name, name, status.message)
 
     def _update(self, request: LoadRobot, parts: list[Query], why: str) -> None:
         """Give the robot's holders its present parts as the new response."""
+        newest = self._in_order(request, parts)
+        if len(newest) == len(self._orders(request)):  # else it is still loading, and its first response will have them
+            self.registrar.update_response(current().resource_id, self._assembled(request, newest), why)
+
+    def _in_order(self, request: LoadRobot, parts: list[Query]) -> list[Query]:
+        """Return the newest part for each order, in the description's order."""
         newest: list[Query] = []
         for order in self._orders(request):
             newest += [part for part in parts if part.request == order][-1:]
-        if len(newest) == len(self._orders(request)):  # else it is still loading, and its first response will have them
-            self.registrar.update_response(current().resource_id, self._assembled(request, newest), why)
+        return newest
 
     def _load(self, order: LoadComponent) -> Query:
         return self.registrar.load(self._components, order, timeout_s=_LOAD_LIMIT_S)
@@ -180,6 +186,6 @@ def read_robots(path: Path) -> list[RobotDescription]:
     Raises:
         ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
-    robots = read_description(path, RobotFile).robot
+    robots = read_typed(str(path), RobotFile).robot
     check_unique(path, "robot", [robot.name for robot in robots])
     return robots

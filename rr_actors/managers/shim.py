@@ -66,9 +66,8 @@ def main(directory: str) -> int:
 
 
 def _outlive() -> None:
-    """Lift the limit that marks processes which end with the manager (rr_actors/runtime/processes/lifeline.py)."""
-    hard = resource.getrlimit(_RLIMIT_LOCKS)[1]
-    resource.setrlimit(_RLIMIT_LOCKS, (hard, hard))
+    """Replace the mark of processes that end with the manager (OUTLIVES in rr_actors/runtime/processes/lifeline.py)."""
+    resource.setrlimit(_RLIMIT_LOCKS, (0, resource.getrlimit(_RLIMIT_LOCKS)[1]))
 
 
 def _lock(directory: str) -> bool:
@@ -87,6 +86,10 @@ def _adopt_orphans() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
+class _Interrupted(Exception):
+    """A signal came during the search for the line that says ready."""
+
+
 class Shim:
     """One program, from its start to the end of its last descendant."""
 
@@ -103,6 +106,7 @@ class Shim:
         self._line = b""
         self._log_bytes = 0
         self._asked = False  # to stop
+        self._searching = False
         self._stop_at: float | None = None  # when the grace is over
         self._ended = False
         self._wakeup = self._catch_signals()
@@ -197,7 +201,13 @@ class Shim:
             return
         *lines, self._line = (self._line + data).split(b"\n")
         self._line = self._line[-LINE_LIMIT_BYTES:]
-        if any(self._pattern.search(line) for line in lines):
+        try:
+            self._searching = True
+            found = any(self._pattern.search(line) for line in lines)
+            self._searching = False
+        except _Interrupted:
+            return
+        if found:
             self._pattern = None
             self._state["ready"] = True
             self._save()
@@ -206,11 +216,15 @@ class Shim:
 
     def _asked_to_stop(self, number: int, frame: FrameType | None) -> None:
         self._asked = True
+        if self._searching:  # the user's pattern, which may take for ever: this breaks it off
+            self._searching = False
+            raise _Interrupted
 
     def _begin_stop(self) -> None:
         self._stop_at = time.monotonic() + self._order["grace_s"]
         self._state["stopped"] = True
         self._signal_group(self._order["stop_signal"])
+        self._signal_group(signal.SIGCONT)  # a paused program acts on no other signal
 
     def _reap(self) -> None:
         """Reap every child that has ended, and note the end of the program."""
@@ -276,11 +290,26 @@ def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> No
         os.dup2(output, 1)
         os.dup2(output, 2)
         os.chdir(order["directory"])
-        os.execvpe(order["command"], [order["command"], *order["arguments"]], order["environment"])
+        _execute(order["command"], order["arguments"], order["environment"])
     except BaseException as error:  # nothing may unwind into the shim's own loop
         os.write(failure, f"{type(error).__name__}: {error}".encode())
     finally:
         os._exit(127)
+
+
+def _execute(command: str, arguments: list[str], environment: dict[str, str]) -> None:
+    try:
+        os.execvpe(command, [command, *arguments], environment)
+    except FileNotFoundError:
+        import shutil  # here, since it takes ms
+
+        found = shutil.which(command, path=environment.get("PATH"))
+        if found is None:
+            raise
+        with open(found, "rb") as file:
+            first = file.readline(200).decode(errors="replace").removesuffix("\n")
+        what = f"its interpreter {first[2:]!r}" if first.startswith("#!") else "its loader"
+        raise FileNotFoundError(f"{found} is there, but not {what}") from None
 
 
 def _children() -> list[int]:

@@ -1,39 +1,16 @@
-"""Descriptions: read TOML files into typed values, and fill the templates in them with parameters."""
+"""Templates: fill the templates in the texts of a description with parameters."""
 
 from __future__ import annotations
 
-import re
 import string
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
-
-import msgspec
 
 from rr_actors.base.errors import ConfigError, shortened, shown
-from rr_actors.base.toml import read_toml
+from rr_actors.base.toml import wrong
 
-T = TypeVar("T")
 Parameter = str | int | float | bool
 Parameters = Mapping[str, Parameter]
-
-_EXPECTED = re.compile(r"Expected (?P<expected>.+?)(?:, got (?P<got>.+?))?(?: - at `\$\.?(?P<key>.*)`)?\Z")
-_AT = re.compile(r"(?P<what>.+?)(?: - at `\$\.?(?P<key>.*)`)?\Z")
-
-
-def read_description(path: str | Path, kind: type[T]) -> T:
-    """Read a TOML file as a `kind`, a msgspec Struct.
-
-    Raises:
-        ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or of the wrong type. `.file`,
-            `.key`, `.expected`, `.got`
-    """
-    file = str(path)
-    data = read_toml(file)
-    try:
-        return msgspec.convert(data, kind)
-    except msgspec.ValidationError as error:
-        raise _config_error(file, str(error)) from error
 
 
 def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
@@ -44,9 +21,8 @@ def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
     """
     for i, name in enumerate(names):
         if name in names[:i]:
-            key, expected = f"{table}[{i}].name", f"a name that no other {table} has"
-            text = f"{path}: {key}: expected {expected}, got {shown(name)} again"
-            raise ConfigError(text, file=str(path), key=key, expected=expected, got=name)
+            expected = f"a name that no other {table} has"
+            raise wrong(str(path), f"{table}[{i}].name", expected, name, said=f"{shown(name)} again")
 
 
 def fill(text: str, parameters: Parameters, where: str) -> str:
@@ -77,16 +53,3 @@ def fill_all(parameters: Parameters, given: Parameters, where: str) -> dict[str,
 def plain(value: Parameter) -> str:
     """Return a parameter as text; true and false as in TOML."""
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _config_error(file: str, message: str) -> ConfigError:
-    """Translate a message of msgspec: "Expected `int`, got `str` - at `$.component[0].reliability`"."""
-    expected = _EXPECTED.match(message)
-    if expected is not None:
-        found: dict[str, Any] = expected.groupdict()
-        text = f"{file}: {found['key'] or 'the whole file'}: expected {found['expected']}"
-        return ConfigError(text + (f", got {found['got']}" if found["got"] else ""), file=file, **found)
-    other = _AT.match(message)
-    key = (other and other["key"]) or None
-    what = other["what"] if other else message
-    return ConfigError(f"{file}: {key or 'the whole file'}: {what}", file=file, key=key, expected=what, got=None)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypedDict, TypeVar, cast
+
+import msgspec
 
 from rr_actors.base.checks import check_takes, examined, has_home, path_text
-from rr_actors.base.config import SystemConfig
+from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     ConfigError,
     InvalidName,
@@ -25,9 +28,16 @@ from rr_actors.base.errors import (
 from rr_actors.base.names import ServerId, check_name, parse_server
 from rr_actors.base.values.canonical import Codec
 from rr_actors.registrar.declarations import Declared, id_in
-from rr_actors.registrar.queries import Query, ResourceInfo
+from rr_actors.registrar.engine.node import Node
+from rr_actors.registrar.engine.server import Current, current_or_none
+from rr_actors.registrar.model.rows import HIGHEST, LOWEST
+from rr_actors.registrar.progress_hearers import ProgressWanted
+from rr_actors.registrar.queries import Query, ResourceInfo, StatusCallback
 from rr_actors.runtime.callback_errors import described
-from rr_actors.system.hosting.node import Node
+from rr_actors.runtime.event_loop import check_asyncio
+from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.user_loop import CallersLoop
+from rr_actors.runtime.workers import is_async
 
 # -- a registrar's -----------------------------------------------------------------------------------------------
 
@@ -57,7 +67,7 @@ def _meant(name: str, node: Node) -> str:
         return f"; {name!r} is a registrar, name its server, too: '{name}/...'"
     here = list(node.registrars.items())
     known = {f"{registrar}/{server}" for registrar, actor in here for server in actor.servers.names()}
-    known.update(*(list(actor.catalog.server_types) for _, actor in here))
+    known.update(*([id for id in list(actor.catalog.server_types) if "/" in id] for _, actor in here))
     named = [id for id in sorted(known) if id.endswith(f"/{name}")]
     if named:
         return f"; did you mean {' or '.join(map(repr, named))}?"
@@ -94,6 +104,14 @@ def status_callback(
     return ours
 
 
+def checked_callback(callback: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what status_callback() returns for the callback of on_status(), which must not be None."""
+    own = status_callback(callback, "on_status", "callback")
+    if own is None:
+        raise UsageError("on_status: callback: expected a callable, got None")
+    return own
+
+
 def target_id(target: object) -> str:
     """Return the id of a query or a resource; a text is an id already.
 
@@ -110,6 +128,126 @@ def target_id(target: object) -> str:
 def resource_target(target: object) -> str:
     """Return an id as target_id() does; for a query its resource's, valid also when the holder has left."""
     return target.resource_id if is_a(target, Query) else target_id(target)
+
+
+# -- the options of a load ---------------------------------------------------------------------------------------
+#
+# They are declared here once, for every method that loads and for every kind of registrar: as keywords, for type
+# checkers, and, with their defaults, as the fields of LoadOptions. checked() makes the fields of the keywords; it names
+# only those that it checks. The methods pass them all on.
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+Parent = Current | Query[Any] | ResourceInfo | str
+"""What load() takes as `parent`."""
+
+
+class GroupKeywords(TypedDict, total=False):
+    """The options of load_all()."""
+
+    on_status: StatusCallback | None
+    timeout_s: float | None
+    parent: Parent | None
+    priority: int | None
+
+
+class LoadKeywords(GroupKeywords, total=False):
+    """The options of load(), except `response_type` and `block`: these say what the call returns."""
+
+    progress: ProgressWanted
+
+
+class LoadOptions(msgspec.Struct, frozen=True):
+    """The options of one call, checked. Registrar.load() says what each means.
+
+    Attributes:
+        own: the caller gave the `priority`, so that a part does not inherit that of its whole.
+        codec: of the `response_type`; None: that of the server.
+        loop: the event loop that awaits the load and runs an async `on_status`; None: another one does.
+    """
+
+    on_status: StatusCallback | None = None
+    timeout_s: float | None = 30.0
+    parent: Parent | None = None
+    progress: ProgressWanted = False
+    priority: int | None = 0
+    own: bool = False
+    codec: Codec | None = None
+    loop: CallersLoop | None = None
+
+
+DEFAULTS = LoadOptions()
+"""The options of a call that gives none."""
+
+
+def checked(
+    called: str, given: GroupKeywords, response_type: Any = None, names: type[GroupKeywords] = LoadKeywords
+) -> LoadOptions:
+    """Return the options that a caller has given.
+
+    Args:
+        called: the method, for the text of errors.
+        names: the keywords that the method takes.
+
+    Raises:
+        TypeError: the method takes no such keyword.
+        UsageError, NotSerializable: the value of an option is wrong.
+    """
+    options = cast("LoadKeywords", given)  # this call's own dict
+    for name in options.keys() - names.__annotations__.keys():
+        raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}")
+    options["timeout_s"] = time_limit(options.get("timeout_s", DEFAULTS.timeout_s))
+    codec = None if response_type is None else codec_for(response_type)
+    on_status = options.get("on_status")
+    status_callback(on_status, called.removesuffix("_async"))
+    loop = None
+    if called.endswith("_async"):
+        check_asyncio(called)
+        if on_status is not None and is_async(on_status) and current_or_none() is None:
+            loop = CallersLoop()  # a callback of a server has a context that ends before the statuses come
+    if "priority" in options:
+        options["priority"] = checked_priority(options["priority"], called)
+    return LoadOptions(**options, own="priority" in options, codec=codec, loop=loop)
+
+
+def checked_priority(value: object, called: str) -> int | None:
+    """Return the priority that a caller gives; None for standby.
+
+    Raises:
+        UsageError: it is neither None nor a whole number from -1000 to 1000.
+    """
+    if value is None:
+        return None
+    if is_a(value, int) and not is_a(value, bool) and LOWEST <= (number := int(exact_number(value))) <= HIGHEST:
+        return number
+    expected = f"expected a whole number from {LOWEST} to {HIGHEST}, or None for standby"
+    raise UsageError(f"{called}: priority: {expected}, got {shown(value)} ({type(value).__name__})")
+
+
+def check_allowed(priority: int | None, config: RegistrarConfig) -> None:
+    """Raise UsageError if a registrar may not hold a query of this priority."""
+    if priority is not None and priority > config.max_priority:
+        limit = f"expected {config.max_priority} at most, as the max_priority of registrar {config.name!r} says"
+        raise UsageError(f"priority: {limit}, got {priority}")
+
+
+def shows(names: type[Mapping[str, Any]]) -> Callable[[F], F]:
+    """Have help() and completion show the keywords of a method, in place of its ``**options``."""
+
+    def show(method: F) -> F:
+        signature = inspect.signature(method)
+        parameters = list(signature.parameters.values())
+        options = parameters.pop()
+        assert options.kind is inspect.Parameter.VAR_KEYWORD
+        for name, annotation in names.__annotations__.items():
+            default, shown = getattr(DEFAULTS, name), getattr(annotation, "__forward_arg__", annotation)
+            parameters.append(
+                inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=shown)
+            )
+        method.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # as in inspect
+        return method
+
+    return show
 
 
 # -- a system's --------------------------------------------------------------------------------------------------

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from types import FunctionType
 from typing import Any, Generic, Literal, TypeVar, cast, overload
 
 from msgspec.structs import replace
 
-from rr_actors.base.checks import check_takes, examined
+from rr_actors.base.checks import examined
 from rr_actors.base.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
-from rr_actors.registrar.engine.server import ARGUMENTS, ServerSpec, checked_spec
-from rr_actors.wire.name_service import Directory, Status, registrar_key
+from rr_actors.registrar.engine.server import (
+    RECOVER_S,
+    ROLES,
+    ServerSpec,
+    checked_callback,
+    checked_pauses,
+    checked_spec,
+)
+from rr_actors.wire.name_service import Directory, Presence, registrar_key
 
 Request = TypeVar("Request")
 Returned = TypeVar("Returned")
@@ -30,7 +37,9 @@ class server:  # noqa: N801 - used as a decorator
         @load_camera.unload
         def close_camera(self, request: OpenCamera, response: Feed) -> None: ...
 
-    ``status`` and ``recover`` work in the same way. The options are those of Registrar.register_server().
+    ``status``, ``recover``, ``upgrade``, ``usage``, ``pause`` and ``resume`` work in the same way. A method with
+    several parameters, or none, takes the fields of the request, as ``def load_range(self, name: str, rate: float)``.
+    The options are those of Registrar.register_server().
     ``Cameras.load_camera`` then names the server in Registrar.load().
 
     Raises:
@@ -43,7 +52,10 @@ class server:  # noqa: N801 - used as a decorator
         *,
         linger_s: float = 0.0,
         load_timeout_s: float | None = None,
+        recover_timeout_s: float | None = RECOVER_S,
         recovery: Literal["keep", "reload", "lost"] | None = None,
+        idle: Literal["unload", "pause"] = "unload",
+        paused_s: float | None = None,
         request_type: Any = None,
         response_type: Any = None,
     ) -> None:
@@ -51,15 +63,35 @@ class server:  # noqa: N801 - used as a decorator
             meant = name.__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
         callbacks, types = (_nothing, None, None, None), (request_type, response_type)
-        self._spec = checked_spec(ServerSpec(name, *callbacks, *types, linger_s, load_timeout_s, recovery))
+        limits = linger_s, load_timeout_s, recovery, recover_timeout_s
+        self._spec = checked_spec(ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s))
 
+    # The first overload that fits is meant: two parameters, of which one may have a default; one; any number.
     @overload
-    def __call__(  # pyright: ignore[reportOverlappingOverload] - the first that fits is meant
+    def __call__(  # pyright: ignore[reportOverlappingOverload]
+        self, load: Callable[[Any, Any, Any], Coroutine[Any, Any, Response]]
+    ) -> Declared[Mapping[str, object], Coroutine[Any, Any, Response], Response]: ...
+    @overload
+    def __call__(  # pyright: ignore[reportOverlappingOverload]
+        self, load: Callable[[Any, Any, Any], Response]
+    ) -> Declared[Mapping[str, object], Response, Response]: ...
+    @overload
+    def __call__(  # pyright: ignore[reportOverlappingOverload]
         self, load: Callable[[Any, Request], Coroutine[Any, Any, Response]]
     ) -> Declared[Request, Coroutine[Any, Any, Response], Response]: ...
     @overload
-    def __call__(self, load: Callable[[Any, Request], Response]) -> Declared[Request, Response, Response]: ...
-    def __call__(self, load: Callable[[Any, Any], Any]) -> Declared[Any, Any, Any]:
+    def __call__(  # pyright: ignore[reportOverlappingOverload]
+        self, load: Callable[[Any, Request], Response]
+    ) -> Declared[Request, Response, Response]: ...
+    @overload
+    def __call__(  # pyright: ignore[reportOverlappingOverload]
+        self, load: Callable[..., Coroutine[Any, Any, Response]]
+    ) -> Declared[Mapping[str, object], Coroutine[Any, Any, Response], Response]: ...
+    @overload
+    def __call__(  # pyright: ignore[reportOverlappingOverload]
+        self, load: Callable[..., Response]
+    ) -> Declared[Mapping[str, object], Response, Response]: ...
+    def __call__(self, load: Callable[..., Any]) -> Declared[Any, Any, Any]:
         """Return the declaration of the server whose load callback is the decorated method.
 
         Raises:
@@ -108,6 +140,33 @@ class Declared(Generic[Request, Returned, Response]):
         """Declare a method as the recover callback: ``(self, request, response) -> response``."""
         return self._take("recover", callback)
 
+    def upgrade(self, callback: F) -> F:
+        """Declare a method as the migration of what an earlier version stored: ``(self, request, response)``.
+
+        It runs before the server is registered, for each resource that does not fit today's types. It gets plain data,
+        and returns today's request and response. `response` is None if the load callback has not returned.
+        """
+        return self._take("upgrade", callback)
+
+    def usage(self, callback: F) -> F:
+        """Declare a method that returns what a resource uses now: ``(self, request, response) -> dict[str, float]``.
+
+        Registrar.usage() runs it for each loaded resource. The names and units of the numbers are free; "cpu_s", "cpu",
+        "memory_bytes" and "threads" mean what they mean for a program (docs/programs.md).
+        """
+        return self._take("usage", callback)
+
+    def pause(self, callback: F) -> F:
+        """Declare a method that pauses an idle resource: ``(self, request, response)``. For idle="pause"."""
+        return self._take("pause", callback)
+
+    def resume(self, callback: F) -> F:
+        """Declare a method that resumes a paused resource: ``(self, request, response)``.
+
+        It may return a new response. If it raises, the resource is lost: its holders hear FATAL.
+        """
+        return self._take("resume", callback)
+
     def _take(self, role: str, callback: F) -> F:
         with examined(f"server {self.name!r}: {role}: a method to decorate"):
             if role in self._others:
@@ -117,7 +176,7 @@ class Declared(Generic[Request, Returned, Response]):
                 expected = f"a method of another name than {name!r}, the load callback, which it would replace"
                 text = f"server {self.name!r}: {role}: expected {expected}"
                 raise InvalidSpec(text, field=role, expected=expected, got=name)
-            check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
+            checked_callback(_without_self(callback), ROLES[role], self._spec.request_type, f"server {self.name!r}")
             self._others[role] = callback
             return callback
 
@@ -137,7 +196,7 @@ class Declared(Generic[Request, Returned, Response]):
     def _spec_for(self, manager: object) -> ServerSpec:
         """Return the spec of one manager's server. Its callbacks are bound; a subclass may override all but `load`."""
         roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
-        return checked_spec(replace(self._spec, load=functools.partial(self._load, manager), **roles))
+        return checked_pauses(checked_spec(replace(self._spec, load=functools.partial(self._load, manager), **roles)))
 
     def _id_in(self, directory: Directory) -> str:
         """Return "registrar/server". The registrar is that of the one child of the system that has the declaring class.
@@ -179,7 +238,7 @@ def class_names(cls: type) -> list[str]:
 
 def _is_alive(directory: Directory, registrar: str) -> bool:
     entry = directory.lookup(registrar_key(registrar))
-    return entry is not None and entry.status is not Status.GONE
+    return entry is not None and entry.status is not Presence.GONE
 
 
 def _bound(manager: object, callback: Callable[..., Any]) -> Callable[..., Any]:

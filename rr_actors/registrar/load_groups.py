@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import itertools
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, Self, cast
+from collections.abc import Callable, Generator, Iterable, Sequence
+from typing import Any, NamedTuple, Protocol, Self, cast
 
-import msgspec
-
-from rr_actors.actors.messaging.futures import Reply
+from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.base.errors import RrError, Unavailable, UnknownQuery, UsageError, shown
 from rr_actors.base.names import ServerId
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.loads import Loads, Unloads, with_notes
-from rr_actors.registrar.queries import Query, StatusCallback
-from rr_actors.runtime.shielding import Flag, shielded
+from rr_actors.registrar.arguments import LoadOptions
+from rr_actors.registrar.loads import Loading, Loads, Unloads, with_notes
+from rr_actors.registrar.queries import Query, begin_unload, patience_s, raise_or_note, unload_if_held_async
+from rr_actors.runtime.event_loop import check_asyncio
 
 
 class Queries(tuple[Query, ...]):
@@ -32,34 +32,68 @@ class Queries(tuple[Query, ...]):
         """Release all queries that are still held, newest first, and return when that is done.
 
         Args:
-            timeout_s: seconds to wait for each query, if its provider is down.
+            timeout_s: seconds to wait for a provider that is down. The queries after one whose provider is down are
+                released all at once.
 
         Raises:
             RrError: the first error that Query.unload() raised, after all have been tried; the others are its notes.
         """
         errors: list[RrError] = []
-        for query in reversed(self):
-            try:
-                query.unload_if_held(timeout_s=timeout_s)
-            except RrError as error:
-                errors.append(error)
+        left = list(self)
+        try:
+            while left and not _is_late(errors):
+                with _kept(errors):
+                    left.pop().unload_if_held(timeout_s=timeout_s)
+        finally:  # also if it is interrupted: the others go on by themselves
+            begun = [begin_unload(query, timeout_s) for query in reversed(left)]
+        for unloading in begun:
+            with _kept(errors), contextlib.suppress(UnknownQuery):  # it is released meanwhile
+                unloading.get()
         if errors:
             raise with_notes(errors)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self.unload()
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        try:
+            self.unload()
+        except RrError as refusal:
+            raise_or_note(refusal, error)
 
     async def __aenter__(self) -> Self:
+        check_asyncio("async with Queries")
         return self
 
-    async def __aexit__(self, *exc: object) -> None:
-        await asyncio.to_thread(self.unload)
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        errors: list[RrError] = []
+        left, timeout_s = list(self), patience_s(error)
+        try:
+            while left and not _is_late(errors):
+                with _kept(errors):
+                    await unload_if_held_async(left.pop(), timeout_s)
+        finally:  # also if it is cancelled: the others go on by themselves
+            begun = [begin_unload(query, timeout_s) for query in reversed(left)]
+        for unloading in begun:
+            with _kept(errors), contextlib.suppress(UnknownQuery):  # it is released meanwhile
+                await unloading
+        if errors:
+            raise_or_note(with_notes(errors), error)
 
 
-class Wanted(NamedTuple):
+@contextlib.contextmanager
+def _kept(errors: list[RrError]) -> Generator[None]:
+    try:
+        yield
+    except RrError as error:
+        errors.append(error)
+
+
+def _is_late(errors: Sequence[RrError]) -> bool:
+    return any(isinstance(error, Unavailable) for error in errors)
+
+
+class LoadWanted(NamedTuple):
     """One request of a group, checked and ready to be sent."""
 
     server: ServerId
@@ -67,20 +101,28 @@ class Wanted(NamedTuple):
     shown: str
 
 
-def wanted(requests: Iterable[tuple[str, Any]], target: Callable[[object], ServerId]) -> list[Wanted]:
+def wanted(
+    requests: Iterable[tuple[str, Any]], target: Callable[[object], ServerId], encode: Callable[[Any], bytes] = encode
+) -> list[LoadWanted]:
     """Return the requests of a group, checked and ready to be sent.
 
     Raises:
         UsageError, InvalidName, NotSerializable: one of them is no pair of a server and a request that can be sent.
     """
-    found: list[Wanted] = []
+    found: list[LoadWanted] = []
     for number, pair in enumerate(iterated(requests), 1):
         if not isinstance(pair, (tuple, list)) or len(cast("tuple[Any, ...]", pair)) != 2:
             expected = 'expected a pair ("registrar/server", request)'
             raise UsageError(f"load_all: request {number}: {expected}, got {shown(cast('object', pair))}")
         server, request = cast("tuple[Any, Any]", pair)
-        found.append(Wanted(target(server), encode(request), shown(request)))
+        found.append(LoadWanted(target(server), encode(request), shown(request)))
     return found
+
+
+def note_request(error: RrError, requests: Sequence[LoadWanted], place: int) -> None:
+    """Note on the error of a load which request of the group it was."""
+    server, _, request = requests[place]
+    error.add_note(f"load_all: request {place + 1} of {len(requests)}, {server} with {request}")
 
 
 def iterated(requests: Any) -> Iterable[Any]:
@@ -96,16 +138,47 @@ def iterated(requests: Any) -> Iterable[Any]:
         raise UsageError(text) from None
 
 
-class Group(msgspec.Struct):
-    """The loads of one load_all(): wait() or result() begins them all."""
+class GroupWays(Protocol):
+    """The ways to load all of several requests, or none."""
 
-    loads: Loads
-    unloads: Unloads
-    requests: Sequence[Wanted]
-    parent: str
-    on_status: StatusCallback | None
-    timeout_s: float | None
-    replies: list[Reply[Query]] = []
+    def wait(self) -> Queries:
+        """Load all requests, and return their queries when all are held."""
+        ...
+
+    async def awaited(self) -> Queries:
+        """Load all requests, awaited on any event loop. If it is cancelled, nothing stays held."""
+        ...
+
+
+class Group:
+    """The loads of one load_all(): begin() begins them all, and returns the future of their queries.
+
+    All changes to a group are made on the loop.
+    """
+
+    def __init__(
+        self, loads: Loads, unloads: Unloads, requests: Sequence[LoadWanted], parent: str, options: LoadOptions
+    ) -> None:
+        self._loads = loads
+        self._unloads = unloads
+        self._requests = requests
+        self._parent = parent
+        self._options = options
+        self._loadings: list[Loading] = []
+        self._loaded = 0
+        self._over = False
+        self._reply: Reply[Queries] = Reply()
+
+    def begin(self) -> Reply[Queries]:
+        """Begin all loads, and return a future, which is set when all are held, or when one has failed.
+
+        It has the error of the first load that failed. By then what was held is released.
+        """
+        calls = self._loads.calls
+        calls.check_open()
+        self._reply.withdraw = self._withdraw
+        calls.dispatcher.call(self._begin)
+        return self._reply
 
     def wait(self) -> Queries:
         """Load all requests, and return their queries when all are held.
@@ -113,88 +186,89 @@ class Group(msgspec.Struct):
         Raises:
             RrError: the error of the first load that failed; nothing is held.
         """
-        if not self.requests:
-            return Queries()
-        self.loads.calls.dispatcher.check_may_block(f"{self.loads.actor.name}.load_all()")
-        settled = Flag()
+        self._loads.calls.dispatcher.check_may_block(f"{self._loads.actor.name}.load_all()")
         try:
-            self._begin(settled.set)
-            settled.wait()
-            failed = self._failed()
-            if failed is None:
-                return Queries(reply.get() for reply in self.replies)
-            raise self._error(failed, shielded(self._undo))
+            return self.begin().get()
+        except RrError:
+            raise
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
-            self._undo()
+            self._withdraw()
             raise
 
-    async def result(self) -> Queries:
+    async def awaited(self) -> Queries:
         """Load all requests as wait() does, awaited on any event loop. If it is cancelled, nothing stays held."""
-        if not self.requests:
-            return Queries()
         loop = asyncio.get_running_loop()
-        settled = asyncio.Event()
-
-        def settle() -> None:
-            try:
-                loop.call_soon_threadsafe(settled.set)
-            except RuntimeError:  # the event loop is closed, with the task that waited
-                self._undo()
-
         try:
-            self._begin(settle)
-            await settled.wait()
-            failed = self._failed()
-            if failed is None:
-                return Queries(reply.get() for reply in self.replies)
-            raise await asyncio.to_thread(self._error, failed, self._undo())
+            reply = self.begin()
+            reply.when_set(lambda: self._withdraw() if loop.is_closed() else None)
+            return await reply
+        except RrError:
+            raise
         except BaseException:
-            self._undo()
+            self._withdraw()
             raise
 
-    def _begin(self, settled: Callable[[], object]) -> None:
-        """Begin all loads. `settled` is called when one has failed, and when all have ended."""
-        left = itertools.count(len(self.requests) - 1, -1)
+    def _withdraw(self) -> None:
+        """Release and withdraw all, as no caller waits any more."""
+        with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
+            self._loads.calls.dispatcher.call(self._undo)
 
-        def ended(reply: Reply[Query]) -> None:
-            if not next(left) or _error_of(reply) is not None:
-                settled()
+    def _begin(self) -> None:
+        try:
+            for server, request, _ in self._requests:
+                self._loadings.append(self._loads.begin(server, request, self._parent, self._options))
+        except RrError as error:  # the registrar has been closed just now
+            self._over = True
+            self._undo()
+            fail(self._reply, error)
+            return
+        for loading in self._loadings:
+            loading.when_set(functools.partial(self._ended, loading))
+        if not self._loadings:
+            self._reply.set(Queries())
 
-        for server, request, _ in self.requests:
-            self.replies.append(self.loads.future(server, request, self.parent, self.on_status, self.timeout_s))
-            self.replies[-1].add_done_callback(ended)
-
-    def _failed(self) -> tuple[int, RrError] | None:
-        """Return the place and error of the first load that failed, or None."""
-        errors = map(_error_of, self.replies)
-        return next(((place, error) for place, error in enumerate(errors) if error is not None), None)
+    def _ended(self, loading: Reply[Query]) -> None:
+        if self._over:
+            return
+        error = error_of_load(loading)
+        self._over = error is not None or loading.cancelled()
+        if error is not None:
+            place = next(place for place, other in enumerate(self._loadings) if other is loading)
+            note_request(error, self._requests, place)
+            self._fail_after([error], self._undo())
+            return
+        self._loaded += 1
+        if self._loaded == len(self._loadings):
+            self._over = True
+            self._reply.set(Queries(loading.query for loading in self._loadings))
 
     def _undo(self) -> list[Reply[None]]:
         """Release the held queries, newest first, and withdraw the other loads; return the futures of the releases."""
+        self._over = True
         undone: list[Reply[None]] = []
-        while self.replies:
-            reply = self.replies.pop()
-            if not reply.cancel() and _error_of(reply) is None:
-                with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
-                    undone.append(self.unloads.future(reply.get().id, self.timeout_s))
+        while self._loadings:
+            loading = self._loadings.pop()
+            if not loading.cancel() and error_of_load(loading) is None:
+                undone.append(self._unloads.begin(loading.query.id, self._options.timeout_s))
         return undone
 
-    def _error(self, failed: tuple[int, RrError], undone: Sequence[Reply[None]]) -> RrError:
-        """Return the error, with notes that name its request and what was not released. Wait for all of `undone`."""
-        place, error = failed
-        server, _, request = self.requests[place]
-        error.add_note(f"load_all: request {place + 1} of {len(self.requests)}, {server} with {request}")
-        errors = [error]
-        for reply in undone:
-            try:
-                reply.get()
-            except UnknownQuery:
-                continue  # the provider has released the query meanwhile
-            except RrError as refusal:
+    def _fail_after(self, errors: list[RrError], undone: Sequence[Reply[None]]) -> None:
+        """Set the first error when all of `undone` have ended, with notes of what was not released."""
+        left = itertools.count(len(undone) - 1, -1)
+
+        def ended(released: Reply[None]) -> None:
+            refusal = released.exception()
+            if isinstance(refusal, RrError) and not isinstance(refusal, UnknownQuery):  # else it is released meanwhile
                 errors.append(refusal)
-        return with_notes(errors)
+            if not next(left):
+                fail(self._reply, with_notes(errors))
+
+        for released in undone:
+            released.when_set(functools.partial(ended, released))
+        if not undone:
+            fail(self._reply, with_notes(errors))
 
 
-def _error_of(load: Reply[Query]) -> RrError | None:
+def error_of_load(load: Reply[Query]) -> RrError | None:
     """Return the error of a load that has failed; None if it is held, withdrawn, or still loading."""
     return cast("RrError | None", load.exception()) if load.done() and not load.cancelled() else None

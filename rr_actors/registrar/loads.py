@@ -1,47 +1,42 @@
 """Loads and unloads: how the calling thread sends each one, and how the result comes back.
 
-A caller waits in its thread, by a future, or by `await`. The registrar's actor sends the load or unload. For a thread
-that waits, the thread itself sends it, on a connection of its own (links/provider_link.py). No call waits on the loop.
+Every load that the loop sends is a Loading, the future of its query (Loads.begin). A thread waits for it, a task awaits
+it, a caller gets it with ``block=False``, and a group waits for several. A thread that waits sends the load itself if
+it can, on a connection of its own (links/provider_link.py), and then there is no Loading. No call waits on the loop.
 """
 
 from __future__ import annotations
 
-import asyncio
+import abc
 import contextlib
 import functools
-import threading
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
-import msgspec
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
 from rr_actors.base.names import ServerId, new_id
+from rr_actors.base.values.failure import Failure, error_of, failure_of
+from rr_actors.registrar.arguments import LoadOptions, check_allowed
 from rr_actors.registrar.engine.bulk_release import Releases
-from rr_actors.registrar.engine.monitor import is_deciding
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
+from rr_actors.registrar.engine.registrar_state import is_deciding
 from rr_actors.registrar.engine.server import Current, check_not_own, serving
+from rr_actors.registrar.links.provider_link import ProviderLink
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.messages import (
-    Failure,
-    Loaded,
-    LoadRefused,
-    Message,
-    Unload,
-    Unloaded,
-    UnloadRefused,
-    error_of,
-    failure_of,
-)
-from rr_actors.registrar.model.rows import Held, Hold, Resource
-from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers, on_this_loop
-from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
+from rr_actors.registrar.model.messages import Loaded, LoadRefused, Message, Unload, Unloaded, UnloadRefused
+from rr_actors.registrar.model.rows import STANDBY, Held, Hold, Resource
+from rr_actors.registrar.progress_hearers import Hearing, HearsHere, HearsInWorkers, HearsOnThisLoop, hearer_of
+from rr_actors.registrar.queries import Query, Views, loaded, loaded_directly
+from rr_actors.runtime.callback_errors import described
+from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until
-from rr_actors.wire.name_service import Status
+from rr_actors.wire.name_service import Presence
 from rr_actors.wire.transport import Exchange
+from rr_actors.wire.unix_sockets import paused
 
 T = TypeVar("T")
 
@@ -49,30 +44,6 @@ CALL_TIMEOUT_S = 30.0
 """Seconds for which a thread waits until the loop has answered a short call."""
 GRACE_S = 5.0
 """Seconds for which a thread waits, after a time limit, until the loop says how the call has ended."""
-
-
-class Wait:
-    """The wait of one thread until the loop has done one task."""
-
-    __slots__ = ("_lock", "done", "error", "value")
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._lock.acquire()
-        self.done = False
-        self.value: Any = None
-        self.error: BaseException | None = None
-
-    def ended(self, value: Any, error: Exception | None) -> None:
-        """Note how the task ended, and wake the thread that waits. On the loop."""
-        self.value = value
-        self.error = error
-        self.done = True
-        self._lock.release()
-
-    def done_within(self, timeout_s: float | None) -> bool:
-        """Wait at most `timeout_s` seconds, and return whether the task is done."""
-        return self._lock.acquire(timeout=-1 if timeout_s is None else max(0.0, timeout_s))
 
 
 class Calls:
@@ -105,22 +76,20 @@ class Calls:
         self.check_may_wait()
         if self.dispatcher.is_loop_thread():
             return fn(*args)
-        wait = Wait()
-        self.dispatcher.call(self._run_in_order, wait, fn, args)
-        if not wait.done_within(CALL_TIMEOUT_S):
+        reply: Reply[T] = Reply()
+        answered = Flag()  # and not reply.get(), which refuses to wait in a coroutine
+        self.dispatcher.call(self._run_in_order, reply, answered, fn, args)
+        if not answered.wait(CALL_TIMEOUT_S):
             raise Unavailable(f"registrar {self.actor.name!r}: its loop has not answered for {CALL_TIMEOUT_S:g} s")
-        if wait.error is not None:
-            raise wait.error
-        return wait.value
+        return reply.get()
 
-    def _run_in_order(self, wait: Wait, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    def _run_in_order(self, reply: Reply[T], answered: Flag, fn: Callable[..., T], args: tuple[Any, ...]) -> None:
         self.actor.monitor.decide_waiting()
         try:
-            value = fn(*args)
+            reply.set(fn(*args))
         except Exception as error:
-            wait.ended(None, error)
-        else:
-            wait.ended(value, None)
+            fail(reply, error)
+        answered.set()
 
     def start(self, begin: Callable[[Callable[[RrError | None], None]], None]) -> Reply[None]:
         """Have begin(done) called on the loop, and return a reply, which done(error) sets, or the registrar's close."""
@@ -175,18 +144,102 @@ def with_notes(errors: Sequence[RrError]) -> RrError:
     return errors[0]
 
 
+# -- in flight ---------------------------------------------------------------------------------------------------------
+
+
+class InFlight(Reply[T], abc.ABC):
+    """A load or an unload by the loop: the future of its end, and its time limit.
+
+    Attributes:
+        limit_s: seconds that it may take from the time when begin() is called; None: no limit.
+    """
+
+    limit_s: float | None
+    _limits: TimeLimits
+
+    def begin(self, start: Callable[..., object], *args: Any) -> None:
+        """Begin the time limit, and call `start`, which sends the load or unload. On the loop."""
+        if self.limit_s is not None:
+            self._limits.begin(self.limit_s, self.give_up)
+        start(*args)
+
+    def end(self, error: RrError | None, value: Any = None) -> None:
+        """End the time limit, and set the future. On the loop."""
+        if self.limit_s is not None:
+            self._limits.end(self.limit_s, self.give_up)
+        self.set(value) if error is None else fail(self, error)
+
+    @abc.abstractmethod
+    def give_up(self) -> None:
+        """Give it up, as its time is over. On the loop."""
+
+
+def exchanged(actor: RegistrarActor, client: ProviderLink, line: Exchange, message: Message, deadline: float) -> Any:
+    """Send a message on a connection of the calling thread, and return the answer. Record both if there is a recording.
+
+    Raises:
+        TimeoutError: no answer came in time. OSError: the connection broke, and the message may have arrived.
+        NotSerializable: the message is too long, and was not sent.
+    """
+    node = actor.node
+    if node.watched.level[0] <= 1:
+        return line.exchange(message, deadline)
+    actor.recorder.message("sent", actor.name, client.provider, message)
+    answer = line.exchange(message, deadline)
+    actor.recorder.message("received", actor.name, client.provider, answer)
+    return answer
+
+
 # -- loads -------------------------------------------------------------------------------------------------------------
 
-Ended = Callable[[Held | None, RrError | None], None]
+
+class LoadWays(Protocol):
+    """The ways to load with one registrar, of this process or another. From any thread."""
+
+    def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Reply[Query]:
+        """Begin a load, and return the future of its query at once. cancel() withdraws the load."""
+        ...
+
+    def wait(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
+        """Load a resource, and return its query when the resource is held."""
+        ...
+
+    async def awaited(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
+        """Load a resource, awaited on any event loop. Cancelled, the load is withdrawn."""
+        ...
 
 
-def _recorded(actor: RegistrarActor, line: Exchange, provider: str, message: Message, deadline: float) -> Any:
-    """Send a message and return the answer, as `line.exchange` does, and record both."""
-    recorder = actor.node.recorder
-    recorder.message("sent", actor.name, provider, message)
-    answer = line.exchange(message, deadline)
-    recorder.message("received", actor.name, provider, answer)
-    return answer
+class Loading(InFlight[Query]):
+    """A load by the loop: the future of its query. cancel() withdraws it, and so does an await that is cancelled."""
+
+    hearing: Hearing | None = None
+
+    def __init__(self, loads: Loads, query: Query, limit_s: float | None, timeout_s: float | None) -> None:
+        super().__init__()
+        self._loads, self._limits, self.query = loads, loads.limits, query
+        self.limit_s, self.timeout_s = limit_s, timeout_s  # the second as the caller gave it
+
+    def ended(self, held: Held | None, error: RrError | None) -> None:
+        """Note how the load has ended. On the loop."""
+        if error is None and held is not None:
+            loaded(self.query, held)
+        else:
+            self._loads.views.forget(self.query.id)
+        if self.hearing is not None:
+            self._loads.actor.listeners.forget(self.query.id)
+            self.hearing.ended()
+        self.end(error, self.query)
+
+    def unawaited(self) -> None:
+        """Withdraw the load, or release the query, which nobody has got."""
+        if not self.cancel():
+            self._loads.withdraw(self.query)
+
+    def give_up(self) -> None:
+        """Withdraw the load, as its time is over. On the loop."""
+        actor = self._loads.actor
+        if not actor.closed:
+            actor.post(c.GiveUp(self.query.id, _too_late(actor, self.query, self.timeout_s)))
 
 
 class Loads:
@@ -195,24 +248,31 @@ class Loads:
     def __init__(self, calls: Calls, views: Views) -> None:
         self.actor = calls.actor
         self.calls = calls
+        self.limits = calls.limits
         self.views = views
 
-    # -- three ways to wait --------------------------------------------------------------------------------------
+    def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Loading:
+        """Begin a load, and return the future of its query at once. A worker calls the hearer of its progress.
 
-    def wait(
-        self,
-        target: ServerId,
-        request: bytes,
-        parent: str,
-        on_status: StatusCallback | None,
-        timeout_s: float | None,
-        hearer: Hearer | None = None,
-        query_id: str = "",
-    ) -> Query:
-        """Load a resource, and return its query when the resource is held.
+        Raises:
+            RegistrarDown: the registrar is closed. UsageError: `progress` is no callable.
+        """
+        hearer = None if options.progress is False else hearer_of(options.progress, self.actor)
+        query = self.views.new(new_id(), target, request, parent, options.codec)
+        try:
+            self._listen(query, options)
+            hearing = None if hearer is None else HearsInWorkers(hearer, query.id)
+            return self._begin(query, request, options, hearing)
+        except RrError:
+            raise
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the future
+            self.withdraw(query)
+            raise
+
+    def wait(self, target: ServerId, request: bytes, parent: str, options: LoadOptions, query_id: str = "") -> Query:
+        """Load a resource, and return its query when the resource is held. This thread hears of the progress.
 
         Args:
-            hearer: called in this thread. With one, the loop sends the load.
             query_id: the id of a part that an interrupted run of a callback may have asked for already.
 
         Raises:
@@ -222,118 +282,91 @@ class Loads:
         if is_deciding() or not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
             self.calls.check_may_wait()
-        query = self.views.new(query_id or new_id(), target, request, parent)
+        hearer = None if options.progress is False else hearer_of(options.progress, self.actor)
+        query = self.views.new(query_id or new_id(), target, request, parent, options.codec)
         try:
-            self._listen(query, on_status)
+            self._listen(query, options)
             if hearer is not None:
-                self._wait_hearing(query, request, timeout_s, hearer)
-            elif query_id or not self._directly(query, request, timeout_s):
-                wait = Wait()
-                dispatcher.call(self._begin, query, self._ask(query, request), wait.ended)
-                self._await_end(wait, query, timeout_s, timeout_s)
+                self._wait_hearing(query, request, options, HearsHere(hearer))
+            elif query_id or not self._directly(query, request, options):
+                self._wait_for(self._begin(query, request, options))
         except RrError:
             raise
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
-            self._withdraw(query)
+            self.withdraw(query)
             raise
         return query
 
-    def _wait_hearing(self, query: Query, request: bytes, timeout_s: float | None, hearer: Hearer) -> None:
-        wait = HearingWait(hearer)
-        self.actor.listeners.add(query.id, wait.progressed)
-        try:
-            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), wait.ended)
-            self._await_end(wait, query, timeout_s, timeout_s)
-        finally:
-            self.actor.listeners.forget(query.id)
-            hearer.close()
-
-    def future(
-        self,
-        target: ServerId,
-        request: bytes,
-        parent: str,
-        on_status: StatusCallback | None,
-        timeout_s: float | None,
-        hearer: Hearer | None = None,
-    ) -> Reply[Query]:
-        """Begin a load, and return a future of its query at once. A worker calls `hearer`."""
-        future: Reply[Query] = Reply()
-        query = self.views.new(new_id(), target, request, parent)
-
-        def ended(_held: Held | None, error: RrError | None) -> None:
-            settle(future, error, query)
-            if hearer is not None:
-                self.actor.listeners.forget(query.id)
-                with contextlib.suppress(Unavailable):  # the registrar's workers have ended, and the bar with them
-                    self.actor.workers.serial(("progress", query.id), hearer.close)
-
-        try:
-            self._listen(query, on_status)
-            if hearer is not None:
-                self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
-            future.withdraw = functools.partial(self._withdraw, query)
-            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
-        except RrError:
-            raise
-        except BaseException:  # such as KeyboardInterrupt: the caller never gets the future
-            self._withdraw(query)
-            raise
-        return future
-
-    async def result(
-        self,
-        target: ServerId,
-        request: bytes,
-        parent: str,
-        on_status: StatusCallback | None,
-        timeout_s: float | None,
-        hearer: Hearer | None = None,
-    ) -> Query:
-        """Load a resource, awaited on any event loop, which calls `hearer`. If it is cancelled, the load is withdrawn.
+    async def awaited(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
+        """Load a resource, awaited on any event loop, which hears of the progress. Cancelled, the load is withdrawn.
 
         Raises:
             RrError: how the load ended.
         """
-        query = self.views.new(new_id(), target, request, parent)
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[RrError | None] = loop.create_future()  # asyncio logs an exception that nobody reads
-
-        def settle(error: RrError | None) -> None:
-            with contextlib.suppress(asyncio.InvalidStateError):  # cancelled, perhaps by a Ctrl-C just now
-                future.set_result(error)
-
-        def ended(_held: Held | None, error: RrError | None) -> None:
-            try:
-                loop.call_soon_threadsafe(settle, error)
-            except RuntimeError:  # the event loop is closed, with the task that waited
-                self._withdraw(query)
-
+        hearer = hearer_of(options.progress, self.actor)
+        query = self.views.new(new_id(), target, request, parent, options.codec)
         try:
-            self._listen(query, on_status)
-            if hearer is not None:
-                self.actor.listeners.add(query.id, on_this_loop(hearer))
-            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
-            if (error := await future) is not None:
-                raise error
+            self._listen(query, options)
+            return await self._begin(query, request, options, None if hearer is None else HearsOnThisLoop(hearer))
         except RrError:
             raise
         except BaseException:  # cancelled, or KeyboardInterrupt, which may come anywhere
-            self._withdraw(query)
+            self.withdraw(query)
             raise
         finally:
             if hearer is not None:
-                self.actor.listeners.forget(query.id)
                 hearer.close()
-        return query
 
-    def _listen(self, query: Query, on_status: StatusCallback | None) -> None:
+    def _listen(self, query: Query, options: LoadOptions) -> None:
         self.calls.check_open()
-        if on_status is not None:
-            self.views.listen(query.id, on_status)
+        if options.own:
+            check_allowed(options.priority, self.actor.config)
+        if options.on_status is not None:
+            self.views.listen(query.id, described(options.on_status, "load: on_status"), options.loop)
 
-    def _withdraw(self, query: Query) -> None:
+    def _begin(self, query: Query, request: bytes, options: LoadOptions, hearing: Hearing | None = None) -> Loading:
+        """Have the loop send a load."""
+        loading = Loading(self, query, options.timeout_s, options.timeout_s)
+        loading.withdraw = functools.partial(self.withdraw, query)
+        if hearing is not None:
+            loading.hearing = hearing
+            self.actor.listeners.add(query.id, hearing.progressed)
+        facts = query.id, query.registrar, query.server, request, query.parent, next(self.actor.sequence)
+        ask = c.Ask(*facts, _rank(options), options.own)
+        self.calls.dispatcher.call(loading.begin, self._ask, loading, ask)
+        return loading
+
+    def _ask(self, loading: Loading, ask: c.Ask) -> None:
+        self.views.add(loading.query)
+        self.actor.ask(ask, loading.ended)
+
+    def _wait_hearing(self, query: Query, request: bytes, options: LoadOptions, hearing: HearsHere) -> None:
+        limit_s = options.timeout_s
+        try:
+            loading = self._begin(query, request, options, hearing)
+            hearing.hear_within(None if limit_s is None else limit_s + GRACE_S)
+            self._end_of(loading, 0.0)
+        finally:
+            hearing.close()
+
+    def _wait_for(self, loading: Loading) -> None:
+        """Wait until a load has ended. The loop ends an overdue load; the thread waits a little longer for that."""
+        self._end_of(loading, None if loading.limit_s is None else loading.limit_s + GRACE_S)
+
+    def _end_of(self, loading: Loading, within_s: float | None) -> None:
+        """Return if the load has succeeded within this time.
+
+        Raises:
+            RrError: it has failed, or the loop does not say in time how it has ended.
+        """
+        try:
+            loading.get(timeout=within_s)
+        except pykka.Timeout:
+            raise error_of(_too_late(self.actor, loading.query, loading.timeout_s)) from None
+
+    def withdraw(self, query: Query) -> None:
         """Withdraw a load for which no caller waits any more, at any stage: asked for, loading, or held."""
+        self.views.forget(query.id)
         with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
             self.calls.dispatcher.call(self._withdraw_now, query)
 
@@ -344,49 +377,9 @@ class Loads:
             text = f"{server}: the load was cancelled, or its caller was interrupted"
             self.actor.post(c.GiveUp(query.id, Failure("LoadError", text, {"server": server}), unheard=True))
 
-    def _ask(self, query: Query, request: bytes) -> c.Ask:
-        """Return the command with which the loop asks for the load."""
-        seq = next(self.actor.sequence)
-        return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
-
-    def _begin(self, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
-        """Have the registrar's actor load the resource. On the loop.
-
-        Args:
-            ended: called when the load has ended.
-            timeout_s: seconds after which the load is withdrawn; None: the thread that waits does that.
-        """
-
-        def resolved(held: Held | None, error: RrError | None) -> None:
-            if error is None and held is not None:
-                loaded(query, held)
-            else:
-                self.views.forget(query.id)
-            if timeout_s is not None:
-                self.calls.limits.end(timeout_s, overdue)
-            ended(held, error)
-
-        def overdue() -> None:
-            if not self.actor.closed:
-                self.actor.post(c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
-
-        self.views.add(query)
-        if timeout_s is not None:
-            self.calls.limits.begin(timeout_s, overdue)
-        self.actor.ask(ask, resolved)
-
-    def _await_end(self, wait: Wait | HearingWait, query: Query, left_s: float | None, timeout_s: float | None) -> None:
-        if not wait.done_within(left_s):
-            self.calls.dispatcher.call(self.actor.post, c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
-            wait.done_within(GRACE_S)
-        if wait.error is not None:
-            raise wait.error
-        if not wait.done:
-            raise error_of(_too_late(self.actor, query, timeout_s))
-
     # -- directly ------------------------------------------------------------------------------------------------
 
-    def _directly(self, query: Query, request: bytes, timeout_s: float | None) -> bool:
+    def _directly(self, query: Query, request: bytes, options: LoadOptions) -> bool:
         """Load on a connection of this thread's own. Return False if the loop has to load instead.
 
         Raises:
@@ -404,20 +397,18 @@ class Loads:
                 over.append(error)
                 connections.cut(line)
 
+        timeout_s = options.timeout_s
         deadline = deadline_of(timeout_s)
         try:
             line = connections.take(timeout_s)
             if line is None:
                 return False
-            load = actor.begin_directly(query, request, ended)
+            load = actor.begin_directly(query, request, ended, _rank(options), options.own)
             if load is None:
                 connections.give_back(line)
                 return False
             self.views.add(query)
-            if actor.node.watched.level[0] <= 1:
-                answer = line.exchange(load, deadline)
-            else:
-                answer = _recorded(actor, line, query.registrar, load, deadline)
+            answer = exchanged(actor, client, line, load, deadline)
             connections.give_back(line)
         except TimeoutError:
             command = c.GiveUp(query.id, _too_late(actor, query, timeout_s), unheard=True)
@@ -429,18 +420,17 @@ class Loads:
             connections.drop_mine()
             raise
         else:
-            if type(answer) is Loaded and client.checksums.get(query.server, answer.types) != answer.types:
+            if type(answer) is Loaded and client.checksums.get(query.server, 0) != answer.types:
                 command = c.SendAgain(query.id)  # the link brings the types, and then the answer once more
             elif type(answer) is Loaded and actor.hold(answer):
-                loaded_directly(query, answer.resource_id, answer.response)
+                loaded_directly(query, answer.resource_id, answer.response, answer.state)
                 return True
             else:
-                command = self._not_held(query, answer)
+                command = self._not_held(query, answer, line.epoch)
         connections.drop_mine()
         if not over:
-            left_s = left_until(deadline)
             try:
-                self._go_on(query, command, left_s, timeout_s)
+                self._go_on(query, command, left_until(deadline), timeout_s)
             except RrError:
                 if not over:
                     raise
@@ -448,15 +438,18 @@ class Loads:
             raise over[0]
         return True
 
-    def _not_held(self, query: Query, answer: Loaded | LoadRefused) -> c.Command:
+    def _not_held(self, query: Query, answer: Loaded | LoadRefused, epoch: int) -> c.Command:
         """Return the loop's command after an answer that refuses the load, or that this thread could not store.
+
+        Args:
+            epoch: the provider's.
 
         Raises:
             RrError: the load was refused, and the loop does not know of it.
         """
         actor, id = self.actor, query.id
         if isinstance(answer, Loaded):
-            return c.Got(id, answer.resource_id, answer.response)
+            return c.Got(id, answer.resource_id, answer.response, answer.state, epoch)
         if not actor.forget_refused(id):
             # The loop may have sent the load again. It is withdrawn, on disk, before the caller hears the error.
             return c.GiveUp(id, answer.failure, unheard=True)
@@ -465,18 +458,20 @@ class Loads:
 
     def _go_on(self, query: Query, command: c.Command, left_s: float | None, timeout_s: float | None) -> None:
         """Have the registrar's actor go on with the load, or end it, and wait until the load has ended."""
-        wait = Wait()
+        loading = Loading(self, query, None if isinstance(command, c.GiveUp) else left_s, timeout_s)
+        self.calls.dispatcher.call(loading.begin, self.actor.go_on_loading, query.id, loading.ended, command)
+        if not isinstance(command, c.GiveUp):
+            self._wait_for(loading)
+            return
+        with contextlib.suppress(TimeoutError):
+            if (error := loading.exception(GRACE_S)) is not None:
+                raise error
+        raise error_of(command.failure)  # the disk is full: the loop withdraws the load later
 
-        def ended(held: Held | None, error: RrError | None) -> None:
-            if error is None and held is not None:
-                loaded(query, held)
-            wait.ended(held, error)
 
-        self.calls.dispatcher.call(self.actor.go_on_loading, query.id, ended, command)
-        if isinstance(command, c.GiveUp):
-            wait.done_within(GRACE_S)
-            raise wait.error or error_of(command.failure)  # the disk is full: the loop withdraws the load later
-        self._await_end(wait, query, left_s, timeout_s)
+def _rank(options: LoadOptions) -> int:
+    """Return a load's priority as rows have it."""
+    return STANDBY if options.priority is None else options.priority
 
 
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
@@ -487,59 +482,78 @@ def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> F
     return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
 
 
-def _doing(actor: RegistrarActor, provider: str, callback: str) -> tuple[Status, str]:
+def _doing(actor: RegistrarActor, provider: str, callback: str) -> tuple[Presence, str]:
     """Return the directory's status of a provider that has not answered, and words for the status.
 
     `callback` names the callbacks for which a provider that is up may keep the caller waiting.
     """
     entry = actor.node.find(provider)
     if entry is None:
-        return Status.GONE, _DOING[Status.GONE]
-    if entry.status is Status.UP:
-        return Status.UP, f"up, its {callback} has not returned yet"
+        return Presence.GONE, _DOING[Presence.GONE]
+    if entry.status is Presence.UP:
+        if why := paused(entry.address):
+            return Presence.UP, why
+        return Presence.UP, f"up, its {callback} has not returned yet, or what it returned is not on disk yet"
     return entry.status, f"{_DOING[entry.status]}{entry.because}"
 
 
 _DOING = {
-    Status.STARTING: "starting, or being started again",
-    Status.STOPPED: "stopped",
-    Status.GONE: "gone for good",
-    Status.DORMANT: "dormant: its process died, and nobody has opened it again",
+    Presence.STARTING: "starting, or being started again",
+    Presence.STOPPED: "stopped",
+    Presence.GONE: "gone for good",
+    Presence.DORMANT: "dormant: its process died, and nobody has opened it again",
 }
 
 
 # -- unloads -----------------------------------------------------------------------------------------------------------
 #
 # The registrar's actor releases a query; or a thread that waits does so, on a connection of its own. The thread writes
-# that the release is owed, asks the provider, and forgets the query (engine/monitor.py). If the provider is down, the
-# thread hears so when its time is up. The release stays owed, on disk, until the provider is back.
+# that the release is owed, asks the provider, and forgets the query (engine/direct_paths.py). If the provider is down,
+# the thread hears so when its time is up. The release stays owed, on disk, until the provider is back.
 
 
 Release = Callable[[str, UnloadWaiter], None]
 
 
-class _Unloading(msgspec.Struct):
-    """One unload by the loop: one object, as thousands may be in flight, and the garbage collector visits each."""
+class Unloading(InFlight[None]):
+    """An unload by the loop: the future of its end."""
 
-    unloads: Unloads
-    query_id: str
-    left_s: float | None
-    timeout_s: float | None
-    reply: Reply[None]
+    def __init__(self, unloads: Unloads, query_id: str, limit_s: float | None, timeout_s: float | None) -> None:
+        super().__init__()
+        self._unloads, self._limits, self.query_id = unloads, unloads.calls.limits, query_id
+        self.limit_s, self.timeout_s = limit_s, timeout_s  # the second as the caller gave it
 
-    def begin(self, release: Release) -> None:
-        """Begin the time limit, and release the query."""
-        if self.left_s is not None:
-            self.unloads.calls.limits.begin(self.left_s, self._overdue)
-        release(self.query_id, self._ended)
+    def give_up(self) -> None:
+        """Send its caller the error that the provider has not answered in time. On the loop."""
+        self._unloads.release_overdue(self.query_id, self.timeout_s)
 
-    def _ended(self, error: RrError | None) -> None:
-        if self.left_s is not None:
-            self.unloads.calls.limits.end(self.left_s, self._overdue)
-        settle(self.reply, error)
 
-    def _overdue(self) -> None:
-        self.unloads.release_overdue(self.query_id, self.timeout_s)
+class UnloadWays(Protocol):
+    """The ways to unload with one registrar, of this process or another. From any thread."""
+
+    def begin(self, query_id: str, timeout_s: float | None) -> Reply[None]:
+        """Begin to release a query, and return a future of its end at once."""
+        ...
+
+    def wait(self, query_id: str, timeout_s: float | None) -> None:
+        """Release a query, and return when that is done."""
+        ...
+
+    def force_begin(self, target: str, timeout_s: float | None) -> Reply[None]:
+        """Begin to unload a resource that the registrar serves, even if it is held."""
+        ...
+
+    def force_wait(self, target: str, timeout_s: float | None) -> None:
+        """Unload a resource that the registrar serves, even if it is held, and return when that is done."""
+        ...
+
+    def begin_all(self, server: ServerId | None, timeout_s: float | None) -> Reply[None]:
+        """Begin to release all queries at a server, or, for None, all that the registrar holds for itself."""
+        ...
+
+    def wait_all(self, server: ServerId | None, timeout_s: float | None) -> None:
+        """Release what begin_all() releases, and return when all have been tried."""
+        ...
 
 
 class Unloads:
@@ -557,20 +571,20 @@ class Unloads:
             RrError: how the unload ended.
         """
         if is_deciding():  # a finalizer, which the garbage collector runs: it cannot wait
-            self.future(query_id, timeout_s)
+            self.begin(query_id, timeout_s)
         elif not self._directly(query_id, timeout_s):
-            self._finish(self.release, query_id, timeout_s, timeout_s)
+            self._finish(self.begin(query_id, timeout_s))
 
-    def _finish(self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None) -> None:
-        reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(_Unloading(self, query_id, left_s, timeout_s, reply).begin, release)
-        self.calls.finish(reply, left_s, f"unloading {query_id}", GRACE_S)
-
-    def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
+    def begin(self, query_id: str, timeout_s: float | None) -> Unloading:
         """Begin to release a query, and return a future of its end at once."""
-        reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(_Unloading(self, query_id, timeout_s, timeout_s, reply).begin, self.release)
-        return reply
+        return self._begin(Unloading(self, query_id, timeout_s, timeout_s), self.release)
+
+    def _begin(self, unloading: Unloading, release: Release) -> Unloading:
+        self.calls.dispatcher.call(unloading.begin, release, unloading.query_id, unloading.end)
+        return unloading
+
+    def _finish(self, unloading: Unloading) -> None:
+        self.calls.finish(unloading, unloading.limit_s, f"unloading {unloading.query_id}", GRACE_S)
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
         """Unload a resource served here, even if it is held, and return when that is done.
@@ -578,17 +592,34 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
+        begin = functools.partial(self.force_begin, target, timeout_s)
+        self._end_of(target, "the forced unload", "with block=False it does not wait", begin, timeout_s)
+
+    def revoke(self, target: str, why: str, grace_s: float, timeout_s: float | None) -> None:
+        """Have all holders let a resource go that is served here, and return when it is unloaded.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+        grace_ms = round(grace_s * 1000)
+        start = functools.partial(self._actor.revoke, target, why, grace_ms)
+        begin = functools.partial(self.calls.start, start)
+        self._end_of(target, "the revocation", "another thread may make it", begin, timeout_s)
+
+    def _end_of(
+        self, target: str, called: str, instead: str, begin: Callable[[], Reply[None]], timeout_s: float | None
+    ) -> None:
         resource, is_served = self.calls.call(self._find, target)
 
         def is_of_it(me: Current) -> bool:
             return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
 
-        what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
-        check_not_own(what, is_of_it, "with block=False it does not wait")
+        what = f"registrar {self._actor.name!r}: {called} of {shortened(target)}"
+        check_not_own(what, is_of_it, instead)
         what = f"unloading {shortened(target)}"
         if resource is not None and not is_served:
             what += f", which waits for its server {self._actor.catalog.origin_of(resource)!r} to be registered again,"
-        self.calls.finish(self.force_future(target), timeout_s, what)
+        self.calls.finish(begin(), timeout_s, what)
 
     def _find(self, target: str) -> tuple[Resource | None, bool]:
         """Return a resource that is served here, and whether its server is registered. On the loop."""
@@ -597,22 +628,32 @@ class Unloads:
             resource = catalog.find(target)
             return resource, resource is not None and resource.server in catalog.servers
 
-    def force_future(self, target: str) -> Reply[None]:
-        """Begin to unload a resource served here, even if it is held, and return a future of its end at once."""
+    def force_begin(self, target: str, timeout_s: float | None) -> Reply[None]:
+        """Begin to unload a resource served here, even if it is held, and return a future of its end at once.
+
+        The future has no time limit.
+        """
         return self.calls.start(functools.partial(self._actor.force, target))
 
-    def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        """Release every held query that `wanted` accepts, newest first. The future is set when all have been tried."""
-        return self.calls.call(self._many_now, wanted, timeout_s)
+    def begin_all(self, server: ServerId | None, timeout_s: float | None) -> Reply[None]:
+        """Release every query at a server, or what is held for the registrar itself, newest first.
 
-    def at_server(self, server: ServerId, timeout_s: float | None) -> Reply[None]:
-        """Release every query that is held at a server, newest first. The future is set when all have been tried.
+        The future is set when all have been tried.
 
         Raises:
             UnknownServer: the registrar holds nothing at that server, and never did.
         """
-        self.calls.call(self._check_client, server)
-        return self.many(lambda held: (held.registrar, held.server) == server, timeout_s)
+
+        def is_wanted(held: Held) -> bool:
+            return not held.parent if server is None else (held.registrar, held.server) == server
+
+        if server is not None:
+            self.calls.call(self._check_client, server)
+        return self.calls.call(self._many_now, is_wanted, timeout_s)
+
+    def wait_all(self, server: ServerId | None, timeout_s: float | None) -> None:
+        """Release as begin_all() does, and return when all have been tried."""
+        self.begin_all(server, timeout_s).get()
 
     def _check_client(self, server: ServerId) -> None:
         if self._views.was_at(server):
@@ -648,10 +689,7 @@ class Unloads:
                 connections.give_back(line)
                 return False
             unload = Unload(query_id, actor.name)
-            if actor.node.watched.level[0] <= 1:
-                answer = line.exchange(unload, deadline)
-            else:
-                answer = _recorded(actor, line, client.provider, unload, deadline)
+            answer = exchanged(actor, client, line, unload, deadline)
             connections.give_back(line)
             if type(answer) is Unloaded and not actor.forget_released(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
@@ -665,10 +703,16 @@ class Unloads:
             self._views.forget(query_id)
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
-            left_s = left_until(deadline)
-            go_on = functools.partial(actor.go_on_unloading, refusal=refusal)
-            self._finish(go_on, query_id, left_s, timeout_s)
+            self.go_on(Unloading(self, query_id, left_until(deadline), timeout_s), refusal)
         return True
+
+    def go_on(self, unloading: Unloading, refusal: Failure | None) -> None:
+        """Have the loop go on with an unload that this thread has begun, and return when that is done.
+
+        Args:
+            refusal: the answer on the thread's connection; None: the connection broke, or has no answer yet.
+        """
+        self._finish(self._begin(unloading, functools.partial(self._actor.go_on_unloading, refusal=refusal)))
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
@@ -717,11 +761,12 @@ class Unloads:
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             pending = dict.fromkeys(mine)
             releases = Releases(self._actor, mine, ended)
+        self._views.forget_taken(wanted)
         if not mine:
             reply.set()
         elif timeout_s is not None and pending:
             self.calls.limits.begin(timeout_s, overdue)
-            reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
+            reply.when_set(lambda: self.calls.limits.end(timeout_s, overdue))
         return reply
 
 

@@ -11,11 +11,11 @@ from rr_actors.base import pickling
 from rr_actors.base.errors import NameTaken, StartFailed, UsageError
 from rr_actors.registrar.arguments import check_text
 from rr_actors.registrar.declarations import Declared, spec_for
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
-from rr_actors.registrar.engine.server import current, serving
+from rr_actors.registrar.engine.server import ServerSpec, current, serving
 from rr_actors.registrar.registrar import Registrar, register_spec
-from rr_actors.system.hosting.node import Node
-from rr_actors.wire.name_service import Status
+from rr_actors.wire.name_service import Presence
 
 
 class _NotYet:
@@ -34,8 +34,9 @@ class Manager(Actor):
     """An actor that serves resources, or uses those of others, or both, through `self.registrar`.
 
     Subclass it, declare servers with ``@rr.server``, and put it into a ChildSpec: its child id is its registrar's name.
-    A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers, whose
-    recover callbacks run. ``on_start`` runs, with ``self.registrar.queries()`` restored. Other registrars connect.
+    A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers: their
+    recover callbacks begin, and the manager waits for them, though not for long. ``on_start`` runs, with
+    ``self.registrar.queries()`` restored. Other registrars connect.
     """
 
     registrar: Registrar = cast("Registrar", _NotYet())
@@ -71,9 +72,10 @@ class Manager(Actor):
         node: Node = place.node
         self._node = node
         actor = await node.open_registrar(place.id, node.config.registrar(place.id))
-        self.registrar = Registrar(actor)
+        self.registrar = Registrar(node, actor)
         self._served = actor
         actor.on_failure = self._registrar_failed
+        actor.path = place.path
         place.abandoned = functools.partial(self._close_registrar, None)
         try:
             await node.dispatcher.workers.run(self._register_servers, actor)
@@ -86,12 +88,16 @@ class Manager(Actor):
         """Register the declared and the stored servers. In a worker: reading types and unpickling run users' code."""
         declared = self._declared_servers()
         for declaration in declared.values():
-            register_spec(self.registrar, spec_for(declaration, self))
+            register_spec(self.registrar, self._adapted(spec_for(declaration, self)))
         with actor.enter():
             stored_servers = list(actor.whole().stored_servers.values())
         for stored in stored_servers:
             if stored.id not in declared:
                 register_spec(self.registrar, pickling.loads(stored.blob), restored=True)
+
+    def _adapted(self, spec: ServerSpec) -> ServerSpec:
+        """Return a declared server as this instance registers it; a ready-made manager's arguments may change it."""
+        return spec
 
     @classmethod
     def _declared_servers(cls) -> dict[str, Declared[Any, Any, Any]]:
@@ -121,11 +127,11 @@ class Manager(Actor):
     async def _after_stop(self, final: bool) -> None:
         if final and self._is_mine():
             await self._node.wind_down(self.registrar.name, self._node.config.stop_timeout_s)
-            self._close_registrar(Status.GONE)
+            self._close_registrar(Presence.GONE)
         else:
             self._close_registrar(None)
 
-    def _close_registrar(self, status: Status | None) -> None:
+    def _close_registrar(self, status: Presence | None) -> None:
         if self._is_mine():
             self._node.close_registrar(self.registrar.name, status)
 
@@ -151,7 +157,7 @@ def ref(id: str) -> ActorRef[Any]:
         UsageError: this code does not run in a callback.
     """
     where = check_text(id, "rr.ref: expected a child's id or path")
-    node: Node = serving(current()).node
+    node = serving(current()).node
     return node.ref(where, node.path)
 
 

@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 
-from rr_actors.base.values.canonical import shown_plain
+from rr_actors.base.names import named
+from rr_actors.base.values.canonical import json_of, shown_plain, text_of_value
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.messages import readable
-from rr_actors.registrar.model.rows import Held, Phase, Resource
+from rr_actors.registrar.model.rows import Held, Hold, Phase, Resource, priority_of
 
 HOLDERS_SHOWN = 20
 """How many holders, and how many dependencies, a resource's row lists at most. It also has their total numbers."""
-_CELL = 400  # characters of a request or response
-_PREFIX = 4  # characters that a search for the beginning of an id needs
+_PART = 4  # characters that a search for the beginning or end of an id needs
 _FOUND = 20
 
 _VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
@@ -35,21 +36,32 @@ _Found = TypeVar("_Found")
 class Wanted(msgspec.Struct, frozen=True):
     """The page to return: `limit` rows from number `offset` on, of the rows that contain the text `match`.
 
-    Responses are not searched. With "id", the rows of the resource and the query with this id or beginning of an id.
+    Responses are not searched. With "id", the rows of the resource and the query with this id, or with
+    this beginning or end of an id. With "servers", all servers with their counts.
     """
 
-    what: Literal["resources", "queries", "id"]
+    what: Literal["resources", "queries", "id", "servers"]
     match: str = ""
     offset: int = 0
     limit: int = 100
 
 
-class Holder(msgspec.Struct, frozen=True):
-    """A query on a resource, with its holder, and the holder's resource that depends on it; "" for none."""
+def priority_text(priority: int | None) -> str:
+    """Return the text for a priority: "5", or "standby"."""
+    return "standby" if priority is None else str(priority)
+
+
+class Holder(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A query on a resource, with its holder, and the holder's resource that depends on it; "" for none.
+
+    `unheard`: how many statuses the holder has not dealt with. `priority`: None for standby.
+    """
 
     query_id: str
     origin: str
     parent: str
+    unheard: int = 0
+    priority: int | None = 0
 
 
 class ResourceRow(msgspec.Struct, frozen=True):
@@ -58,10 +70,13 @@ class ResourceRow(msgspec.Struct, frozen=True):
     Attributes:
         server: "registrar/server".
         request, response: as JSON, cut if it is long. What JSON does not have is shown as in Python.
-        phase: "queued", "loading", "loaded", "unloading" or "unload_failed".
-        state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening").
+        phase: "queued", "loading", "loaded", "unloading", "unload_failed", "pausing", "paused" or "resuming".
+        state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening");
+            if it could not be unloaded, the reason.
         holders: the first 20 queries on it; `holder_count`: how many there are.
         parts: the ids of the first 20 queries that it depends on; `part_count`: how many there are.
+        priority: the highest of its holders; None: all have it on standby, or nobody holds it.
+        revoked: its holders are letting it go, because its owner has revoked it, or one of its parts is revoked.
     """
 
     id: str
@@ -76,11 +91,28 @@ class ResourceRow(msgspec.Struct, frozen=True):
     holder_count: int
     parts: list[str]
     part_count: int
+    priority: int | None = 0
+    revoked: bool = False
+
+    @property
+    def name(self) -> str:
+        """Its server and its request, shortened for people."""
+        return named(self.server, self.request)
 
     @property
     def condition(self) -> str:
         """The state of the last status while the resource is loaded, else its phase."""
         return self.state if self.phase == "loaded" else self.phase
+
+    @property
+    def needed(self) -> str:
+        """The priority as a text: "5", or "standby"; "" if nobody holds it."""
+        return priority_text(self.priority) if self.holder_count else ""
+
+    @property
+    def held_by(self) -> str:
+        """The names of the first holders, each once."""
+        return ", ".join(dict.fromkeys(holder.origin for holder in self.holders))
 
 
 class QueryRow(msgspec.Struct, frozen=True):
@@ -91,6 +123,7 @@ class QueryRow(msgspec.Struct, frozen=True):
         server: "registrar/server".
         parent: the origin's resource that depends on it; "" for none.
         hold: "pending" (asked for), "held", or "owed" (released, and its provider does not know yet).
+        priority: None for standby.
     """
 
     id: str
@@ -101,6 +134,26 @@ class QueryRow(msgspec.Struct, frozen=True):
     request: str
     hold: str
     state: str
+    priority: int | None = 0
+
+    @property
+    def name(self) -> str:
+        """The name of the resource that it is on."""
+        return named(self.server, self.request)
+
+
+class ServerRow(msgspec.Struct, frozen=True):
+    """A server with its resources counted; or a registrar, for what it holds itself.
+
+    Attributes:
+        server: "registrar/server"; for what a registrar holds itself, "registrar".
+        states: how many resources are in each state (ResourceRow.condition).
+        holds: how many queries they hold at each "registrar/server".
+    """
+
+    server: str
+    states: dict[str, int] = {}
+    holds: dict[str, int] = {}
 
 
 class Page(msgspec.Struct, frozen=True):
@@ -109,6 +162,7 @@ class Page(msgspec.Struct, frozen=True):
     total: int
     resources: list[ResourceRow] = []
     queries: list[QueryRow] = []
+    servers: list[ServerRow] = []
 
 
 def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
@@ -128,6 +182,26 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
             resources, queries = _of_id(actor, wanted.match)
             rows = _resource_rows(actor, resources)
             return Page(len(resources) + len(queries), rows, [_query_row(actor.name, row) for row in queries])
+        case "servers":
+            servers = _server_rows(actor)
+            return Page(len(servers), servers=servers)
+
+
+def _server_rows(actor: RegistrarActor) -> list[ServerRow]:
+    resources, held, names = _read(
+        actor, lambda catalog: (list(catalog.resources.values()), list(catalog.held.values()), list(catalog.servers))
+    )
+    states: dict[str, Counter[str]] = {name: Counter() for name in names}
+    holds: dict[str, Counter[str]] = {}
+    homes: dict[str, str] = {}
+    for row in resources:
+        homes[row.id] = row.server
+        states.setdefault(row.server, Counter())[str(row.state if row.phase is Phase.LOADED else row.phase.value)] += 1
+    for query in held:
+        if query.hold is not Hold.OWED:
+            holds.setdefault(homes.get(query.parent, ""), Counter())[f"{query.registrar}/{query.server}"] += 1
+    rows = [ServerRow(f"{actor.name}/{name}", dict(states[name]), dict(holds.get(name, {}))) for name in states]
+    return [*rows, ServerRow(actor.name, {}, dict(holds[""]))] if "" in holds else rows
 
 
 def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
@@ -140,7 +214,7 @@ def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
 def _chosen(rows: list[_Row], wanted: Wanted, name: str) -> tuple[list[_Row], int]:
     if wanted.match:
         text, raw = wanted.match, wanted.match.encode("utf-8", "replace")
-        in_json = _json_of(text)[1:-1]
+        in_json = json_of(text)[1:-1]
         # To decode a request takes 5 us. It must be done if the text may be in it though its bytes are not.
         decodes = _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
@@ -149,7 +223,7 @@ def _chosen(rows: list[_Row], wanted: Wanted, name: str) -> tuple[list[_Row], in
                 return True
             if not (decodes or raw in row.request):
                 return False
-            request = _json_of(shown_plain(row.request))  # a number or a length may be the same byte as a letter
+            request = json_of(shown_plain(row.request))  # a number or a length may be the same byte as a letter
             return text in request or in_json in request
 
         rows = [row for row in rows if matches(row)]
@@ -163,7 +237,7 @@ def _texts(row: Resource | Held, name: str) -> tuple[str, ...]:
 
 
 def _of_id(actor: RegistrarActor, id: str) -> tuple[list[Resource], list[Held]]:
-    """Return the resource and the query of an id; else the first of those whose ids begin with it.
+    """Return the resource and the query of an id; else the first of those whose ids begin or end with it.
 
     The id of a query that is served here stands for its resource.
     """
@@ -173,23 +247,29 @@ def _of_id(actor: RegistrarActor, id: str) -> tuple[list[Resource], list[Held]]:
         return list(resources.values()), [row for name in held if (row := catalog.held.get(name)) is not None]
 
     found = _read(actor, lambda catalog: rows(catalog, [id], [id]))
-    if any(found) or len(id) < _PREFIX:
+    if any(found) or len(id) < _PART:
         return found
     served, held = _read(actor, lambda catalog: ([*catalog.resources, *catalog.queries], list(catalog.held)))
-    served, held = _beginning(id, served), _beginning(id, held)
+    served, held = _with_part(id, served), _with_part(id, held)
     return _read(actor, lambda catalog: rows(catalog, served, held))
 
 
-def _beginning(text: str, ids: Iterable[str]) -> list[str]:
-    return list(itertools.islice((id for id in ids if id.startswith(text)), _FOUND))
+def _with_part(text: str, ids: Iterable[str]) -> list[str]:
+    return list(itertools.islice((id for id in ids if id.startswith(text) or id.endswith(text)), _FOUND))
 
 
 def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[ResourceRow]:
-    def around(catalog: Catalog, resource: Resource) -> tuple[list[Holder], int, list[str], int]:
+    def around(catalog: Catalog, resource: Resource) -> tuple[list[Holder], int, list[str], int, int | None, bool]:
         queries, parts = catalog.holders.get(resource.id, ()), catalog.parts_of(resource.id)
         first = [catalog.queries[id] for id in itertools.islice(queries, HOLDERS_SHOWN)]
-        holders = [Holder(query.id, query.origin, query.parent) for query in first]
-        return holders, len(queries), list(reversed(parts))[:HOLDERS_SHOWN], len(parts)
+        unheard = [len(catalog.notices_on.get(query.id, ())) for query in first]
+        holders = [
+            Holder(query.id, query.origin, query.parent, n, priority_of(query.priority))
+            for query, n in zip(first, unheard, strict=True)
+        ]
+        priority = priority_of(catalog.priority_of(resource.id))
+        shown = list(reversed(parts))[:HOLDERS_SHOWN]
+        return holders, len(queries), shown, len(parts), priority, resource.id in catalog.revocations
 
     neighbours = _read(actor, lambda catalog: [around(catalog, resource) for resource in resources])
     rows: list[ResourceRow] = []
@@ -198,30 +278,14 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         message = row.message
         if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
             message = shown_progress(*progress)
-        texts = _text_of_value(row.request), _text_of_value(row.response), row.phase.value, state, message
+        elif row.server not in actor.catalog.servers:
+            message = failures.waits_for_server(actor.catalog, row)
+        texts = text_of_value(row.request), text_of_value(row.response), row.phase.value, state, message
         rows.append(ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *others))
     return rows
 
 
 def _query_row(name: str, row: Held) -> QueryRow:
-    server, request = f"{row.registrar}/{row.server}", _text_of_value(row.request)
-    return QueryRow(row.id, name, server, row.resource_id, row.parent, request, row.hold.value, row.state.value)
-
-
-def _text_of_value(raw: bytes | None) -> str:
-    """Return a request's or response's bytes as the text that is shown; "" for None."""
-    if raw is None:
-        return ""
-    value: Any = shown_plain(raw)
-    if value is None and raw != b"\xc0":
-        return f"<{len(raw)} bytes>"
-    text = readable(_json_of(value))
-    return text if len(text) <= _CELL else text[: _CELL - 1] + "…"
-
-
-def _json_of(value: Any) -> str:
-    """Return a value as JSON; what JSON does not have is shown as in Python."""
-    try:
-        return msgspec.json.encode(value, enc_hook=repr).decode()
-    except Exception:  # a key is no text, a number is too long, or the nesting is too deep
-        return repr(value)
+    server, request = f"{row.registrar}/{row.server}", text_of_value(row.request)
+    facts = row.hold.value, row.state.value, priority_of(row.priority)
+    return QueryRow(row.id, name, server, row.resource_id, row.parent, request, *facts)

@@ -6,16 +6,16 @@ first report of a load, and ends with the last of these loads. If the error outp
 
 from __future__ import annotations
 
-import logging
 import sys
 import threading
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine import progress as reports
 
-logger = logging.getLogger("rr_actors.registrar")
+logger = Log("rr_actors.registrar")
 
 
 class _Display:

@@ -7,25 +7,25 @@ block=False a worker. A slow one hears only the newest report. One that raises i
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import contextvars
-import logging
 import queue
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import cast
+from typing import Protocol, cast
 
 import msgspec
 
 from rr_actors.base.checks import check_takes, examined, needing
-from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
+from rr_actors.base.errors import Unavailable, UsageError, shown
+from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.progress import Progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
-from rr_actors.registrar.model.rows import Held
 from rr_actors.runtime.callback_errors import Raised, described, log_raised
 from rr_actors.runtime.workers import is_async
 
-logger = logging.getLogger("rr_actors.registrar")
+logger = Log("rr_actors.registrar")
 
 ProgressCallback = Callable[[Progress], object]
 ProgressWanted = bool | ProgressCallback
@@ -95,38 +95,71 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
 # -- three ways to wait, and to hear meanwhile -------------------------------------------------------------------------
 
 
-class HearingWait:
-    """The wait of one thread for a load. The thread calls its hearer meanwhile. Otherwise as loads.Wait."""
+class Hearing(Protocol):
+    """What the loop calls for a load of which a caller hears the progress. It must be quick."""
+
+    def progressed(self, progress: Progress) -> None:
+        """Pass on a report. On the loop."""
+        ...
+
+    def ended(self) -> None:
+        """Note that the load has ended. On the loop."""
+        ...
+
+
+class _Newest:
+    """The newest report that a hearer has not heard: of many, only one waits. The loop puts, one other thread takes."""
+
+    def __init__(self) -> None:
+        self._report: deque[Progress] = deque(maxlen=1)
+        self._planned = False
+
+    def put(self, progress: Progress) -> bool:
+        """Keep the report, and return whether a take() has to be planned for it."""
+        self._report.append(progress)  # first: a take() that is planned already will find it
+        if self._planned:
+            return False
+        self._planned = True
+        return True
+
+    def take(self) -> Progress | None:
+        """Return the report; None if there is none."""
+        self._planned = False
+        return self._report.pop() if self._report else None
+
+
+class HearsHere:
+    """The thread that waits for the load calls the hearer meanwhile."""
 
     def __init__(self, hearer: Hearer) -> None:
         self._hearer = hearer
-        self._arrived: queue.SimpleQueue[Progress | None] = queue.SimpleQueue()
-        self.done = False
-        self.error: BaseException | None = None
+        self._newest = _Newest()
+        self._woken: queue.SimpleQueue[bool] = queue.SimpleQueue()  # whether the load has ended
 
-    def ended(self, _held: Held | None, error: RrError | None) -> None:
-        """Note how the load ended, and wake the thread that waits. On the loop."""
-        self.error = error
-        self.done = True
-        self._arrived.put(None)
+    def close(self) -> None:
+        """Close the hearer, as the thread waits no more."""
+        self._hearer.close()
+
+    def ended(self) -> None:
+        """Wake the thread that waits. On the loop."""
+        self._woken.put(True)
 
     def progressed(self, progress: Progress) -> None:
         """Pass a report to the waiting thread. On the loop."""
-        self._arrived.put(progress)
+        if self._newest.put(progress):
+            self._woken.put(False)
 
-    def done_within(self, timeout_s: float | None) -> bool:
+    def hear_within(self, timeout_s: float | None) -> bool:
         """Wait, call the hearer meanwhile, and return whether the load has ended."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             try:
-                arrived = self._arrived.get(timeout=None if deadline is None else max(0.0, deadline - time.monotonic()))
+                ended = self._woken.get(timeout=None if deadline is None else max(0.0, deadline - time.monotonic()))
+                while not (ended or self._woken.empty()):
+                    ended = self._woken.get()
             except queue.Empty:
                 return False
-            newest, ended = arrived, arrived is None
-            while not ended and not self._arrived.empty():
-                arrived = self._arrived.get()
-                newest, ended = arrived or newest, arrived is None
-            if newest is not None:
+            if (newest := self._newest.take()) is not None:
                 self._hearer.hear(newest)
             if ended:
                 return True
@@ -134,33 +167,54 @@ class HearingWait:
                 return False
 
 
-def on_this_loop(hearer: Hearer) -> Callable[[Progress], None]:
-    """Return a listener that has the hearer called on the event loop that runs here, in the caller's context."""
-    loop, context = asyncio.get_running_loop(), contextvars.copy_context()
+class HearsOnThisLoop:
+    """The event loop that runs here calls the hearer, in the caller's context. The task closes the hearer."""
 
-    def listener(progress: Progress) -> None:
-        try:
-            loop.call_soon_threadsafe(hearer.hear, progress, context=context)
-        except RuntimeError:  # the event loop is closed, with the task that waited
+    def __init__(self, hearer: Hearer) -> None:
+        self._hearer = hearer
+        self._newest = _Newest()
+        self._loop, self._context = asyncio.get_running_loop(), contextvars.copy_context()
+
+    def progressed(self, progress: Progress) -> None:
+        """Have the event loop call the hearer with the newest report."""
+        if self._newest.put(progress):
+            with contextlib.suppress(RuntimeError):  # the event loop is closed, with the task that waited
+                self._loop.call_soon_threadsafe(self._hear, context=self._context)
+
+    def _hear(self) -> None:
+        if (newest := self._newest.take()) is not None:
+            self._hearer.hear(newest)
+
+    def ended(self) -> None:
+        """Do nothing: the task closes the hearer before it goes on."""
+
+
+class HearsInWorkers:
+    """A worker calls the hearer, in the caller's context, one call at a time."""
+
+    def __init__(self, hearer: Hearer, query_id: str) -> None:
+        self._hearer = hearer
+        self._workers = hearer.actor.workers
+        self._key = ("progress", query_id)
+        self._context = contextvars.copy_context()
+        self._newest = _Newest()
+
+    def progressed(self, progress: Progress) -> None:
+        """Have a worker call the hearer with the newest report."""
+        if not self._newest.put(progress):
             return
-
-    return listener
-
-
-def in_workers(hearer: Hearer, actor: RegistrarActor, query_id: str) -> Callable[[Progress], None]:
-    """Return a listener that has the hearer called in a worker, in the caller's context, one call at a time."""
-    context = contextvars.copy_context()
-    newest: deque[Progress] = deque(maxlen=1)
-
-    def hear() -> None:
-        if newest:
-            hearer.hear(newest.pop())
-
-    def listener(progress: Progress) -> None:
-        newest.append(progress)
         try:
-            actor.workers.serial(("progress", query_id), hear, context=context.copy())
+            self._workers.serial(self._key, self._hear, context=self._context.copy())
         except Unavailable as error:  # too many threads are running
-            logger.debug("%s: a report of progress was not heard: %s", actor.name, error)
+            self._newest.take()
+            logger.debug("%s: a report of progress was not heard: %s", self._hearer.actor.name, error)
 
-    return listener
+    def _hear(self) -> None:
+        newest, audience = self._newest.take(), self._hearer.actor.audience
+        if newest is not None and audience is not None and audience.hears(self._key[1]):
+            self._hearer.hear(newest)
+
+    def ended(self) -> None:
+        """Have a worker close the hearer, after the calls that wait."""
+        with contextlib.suppress(Unavailable):  # the registrar's workers have ended, and the bar with them
+            self._workers.serial(self._key, self._hearer.close)

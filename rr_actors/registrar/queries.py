@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
-import logging
 import threading
 import time
 from collections import deque
@@ -13,19 +13,23 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, Self
 
 import msgspec
 
-from rr_actors.actors.messaging.futures import Reply
+from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.base import pickling
-from rr_actors.base.errors import LoadTimeout, Unavailable, UnknownQuery, shown
-from rr_actors.base.names import ServerId, parse_server_id
+from rr_actors.base.errors import LoadTimeout, ResourceLost, RrError, Unavailable, UnknownQuery, shown
+from rr_actors.base.names import ServerId, check_name, parse_server_id
 from rr_actors.base.notebook import bundle_or_text, table
-from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.values.canonical import Codec, encode, shown_plain
+from rr_actors.hosting.streams import Keep, Source, Stream, StreamReader, Wake, streams_in
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.status import Status, state_of, status_of
 from rr_actors.registrar.model.rows import OK, Held, Notice, Phase, ServerType, State
 from rr_actors.runtime.callback_errors import log_raised
-from rr_actors.runtime.event_loop import check_may_block
+from rr_actors.runtime.event_loop import check_asyncio, check_may_block
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.user_loop import CallersLoop
+from rr_actors.runtime.workers import is_async
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
@@ -37,6 +41,8 @@ else:
     Response = TypeVar("Response", covariant=True)
 
 _KEPT_STATUSES = 256
+_UNLOAD_S = 30.0
+_CANCELLED_S = 2.0  # the release goes on, and the provider gets it when it is back
 
 _lock = threading.Lock()  # guards the list of waiting threads of every query
 
@@ -44,11 +50,46 @@ _lock = threading.Lock()  # guards the list of waiting threads of every query
 class Holder(Protocol):
     """The methods of a Registrar that its queries call."""
 
-    def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> object:
-        """Release the query, and return when that is done."""
+    def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
+        """Release the query, and return when that is done; with ``block=False``, a future of the end at once."""
 
-    async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
-        """Release the query as unload() does, awaited."""
+    def fetch_state(self, query_or_id: Query, /) -> str:
+        """Return the state of the query's last status, as the registrar has it."""
+        ...
+
+    def fetch_priority(self, query_or_id: Query, /) -> int | None:
+        """Return the query's priority, as the registrar has it."""
+        ...
+
+    def set_priority(self, query_or_id: Query, priority: int | None, /) -> None:
+        """Give the query a priority."""
+        ...
+
+
+def raise_or_note(refusal: RrError, error: BaseException | None) -> None:
+    """Raise the error of an unload at the end of a block; or note it on the block's own exception, which goes on."""
+    if error is None:
+        raise refusal
+    error.add_note(f"and {type(refusal).__name__}: {refusal}")
+
+
+def patience_s(error: BaseException | None) -> float:
+    """Return how long the end of a block waits for a provider that is down: not long if the block was cancelled."""
+    return _CANCELLED_S if isinstance(error, asyncio.CancelledError) else _UNLOAD_S
+
+
+class _Statuses(deque[Status]):
+    """The newest statuses of a query that no call of wait_status() has returned yet. A FATAL goes last."""
+
+    missed = 0
+
+    def hear(self, status: Status) -> None:
+        if len(self) >= _KEPT_STATUSES:
+            heard = list(self)
+            with contextlib.suppress(ValueError):  # a thread has returned it meanwhile
+                self.remove(next((old for old in heard if old.state is not State.FATAL), heard[0]))
+                self.missed += 1
+        self.append(status)
 
 
 class Query(Generic[Response]):
@@ -94,7 +135,7 @@ class Query(Generic[Response]):
         parent: str,
         origin: str,
         holder: Holder | None,
-        types: Callable[[str], tuple[Any, Any]],
+        types: Callable[[str], tuple[Codec, Codec]],
     ) -> None:
         self.id = id
         self.resource_id = ""
@@ -109,8 +150,8 @@ class Query(Generic[Response]):
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
-        self._waiters: list[Flag] | None = None
-        self._statuses: deque[Status] | None = None  # made for the first: most queries hear of none
+        self._waiters: list[Flag | Wake] | None = None
+        self._statuses: _Statuses | None = None  # made for the first: most queries hear of none
 
     @property
     def server_id(self) -> str:
@@ -153,21 +194,54 @@ class Query(Generic[Response]):
             UnloadFailed: this was the last query, and the unload callback raised. The query is still held.
             Unavailable: the provider did not come back in time. The release stays owed.
         """
-        self._asked_to_unload().unload(self, timeout_s=timeout_s)
+        self._at_holder().unload(self, timeout_s=timeout_s)
         self._is_released = True
 
     async def unload_async(self, *, timeout_s: float | None = 30.0) -> None:
         """Release the query as unload() does, awaited. If it is cancelled, the unload goes on."""
-        await self._asked_to_unload().unload_async(self, timeout_s=timeout_s)
+        check_asyncio("unload_async")
+        await self._at_holder().unload(self, timeout_s=timeout_s, block=False)
         self._is_released = True
 
-    def _asked_to_unload(self) -> Holder:
+    def fetch_state(self) -> str:
+        """Ask the registrar that holds the query for the state of its last status.
+
+        Raises:
+            UnknownQuery: the query is not held any more, or another process holds it.
+        """
+        return self._at_holder().fetch_state(self)
+
+    @property
+    def priority(self) -> int | None:
+        """How urgently the holder needs the resource, from -1000 to 1000; None: on standby (docs/planning.md).
+
+        To set it also replaces what a dependency inherits. It is on disk then, and reaches the provider soon, or when
+        that is back.
+
+        Raises:
+            UnknownQuery: the query is not held any more, or another process holds it.
+            UsageError: it is set to something else, or to more than the registrar's `max_priority`.
+        """
+        return self._at_holder().fetch_priority(self)
+
+    @priority.setter
+    def priority(self, priority: int | None) -> None:
+        self._at_holder().set_priority(self, priority)
+
+    def standby(self) -> None:
+        """Keep the query, and say that the resource is not needed now. A priority ends that."""
+        self.priority = None
+
+    def _at_holder(self) -> Holder:
         if self._holder is None:
             raise UnknownQuery(f"query {self.id}: another process holds it; unload it there", query_id=self.id)
         return self._holder
 
     def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
         """Wait for a status of `state` (None: of any), and return the oldest that no earlier call has returned.
+
+        The newest 256 are kept for later calls, and a FATAL longer than others. A warning in the log says how many
+        older ones are missing.
 
         Raises:
             LoadTimeout: none came within `timeout_s` seconds.
@@ -179,8 +253,7 @@ class Query(Generic[Response]):
         deadline = None if limit_s is None else time.monotonic() + limit_s
         while True:
             flag = Flag()
-            with _lock:  # before it looks at the statuses, so that it misses none
-                self._waiters = [*(self._waiters or ()), flag]
+            self._watch(flag)  # before it looks at the statuses, so that it misses none
             try:
                 if (found := self._take(wanted)) is not None:
                     return found
@@ -193,11 +266,64 @@ class Query(Generic[Response]):
                     text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
                     raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
             finally:
-                with _lock:
-                    self._waiters = [other for other in self._waiters or () if other is not flag] or None
+                self._unwatch(flag)
+
+    def stream(
+        self, name: str | None = None, *, keep: Keep = "latest", depth: int = 4, timeout_s: float | None = None
+    ) -> StreamReader:
+        """Read a stream that the resource's manager has opened: iterate over it, with ``for`` or ``async for``.
+
+        It is the stream of this name that the response names, which another resource may have opened, or else the
+        resource's own. The iteration ends when the query is released. It goes on after a crash of the manager, once
+        that has opened the stream again. It goes on with another stream if update_response() or replace_part() names
+        that.
+
+        Args:
+            name: the stream's name; None: the only one.
+            keep: "latest": a slow reader gets the newest frame. "all": it gets each, and the publisher waits for it.
+            depth: with "all", how many frames the reader may be behind until the publisher waits; from 1 to 1000.
+            timeout_s: the longest wait for one frame; None: no limit.
+
+        Raises:
+            UnknownQuery: the query is released, or another process holds it.
+            InvalidName, UsageError: an argument is something else, or no name, and there are several streams.
+            NotFound: the resource has no stream of this name. If it has none at all, the iteration raises this after
+                thirty seconds. `.id`, `.known`
+            ResourceLost: by the iteration: the resource was lost.
+            TimeoutError: by the iteration: no frame has come within `timeout_s`.
+        """
+        limit_s = time_limit(timeout_s)
+        self._at_holder()
+        if self._is_released:
+            raise UnknownQuery(f"{self.server_id}: query {self.id} is released: it has no streams", query_id=self.id)
+        source = Source(self.resource_id, self._is_over, self._named_streams, self._watch, self._unwatch)
+        checked = None if name is None else check_name(name, "stream")
+        return StreamReader(source, checked, keep, depth, limit_s)
+
+    def _named_streams(self) -> list[Stream]:
+        return streams_in(shown_plain(self._response_bytes()))
+
+    def _watch(self, waiter: Flag | Wake) -> None:
+        with _lock:
+            self._waiters = [*(self._waiters or ()), waiter]
+
+    def _unwatch(self, waiter: Flag | Wake) -> None:
+        with _lock:
+            self._waiters = [other for other in self._waiters or () if other is not waiter] or None
+
+    def _is_over(self) -> bool:
+        """Return whether the query is released; raise ResourceLost if the resource is lost."""
+        if self.released or self.state is State.FATAL:
+            text = f"{self.server_id}: resource {self.resource_id} is lost"
+            raise ResourceLost(text, query_id=self.id, resource_id=self.resource_id)
+        return self._is_released
 
     def _take(self, wanted: State | None) -> Status | None:
-        statuses = self._statuses or deque[Status]()
+        statuses = self._statuses or _Statuses()
+        if statuses.missed:
+            text = "%s: wait_status() misses %d statuses of query %s: the newest %d are kept"
+            logger.warning(text, self.server_id, statuses.missed, self.id, _KEPT_STATUSES)
+            statuses.missed = 0
         for status in list(statuses):
             if wanted is None or status.state is wanted:
                 with contextlib.suppress(ValueError):  # another thread was faster
@@ -207,13 +333,13 @@ class Query(Generic[Response]):
 
     def _hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
         """Note a status that has arrived, and wake the threads that wait for one. On the loop."""
-        self.state = status.state
+        self.state = State.FATAL if self.state is State.FATAL else status.state
         if response is not None:
             self._response = _Bytes(response)
         self.released = self.released or released
         if self._statuses is None:
-            self._statuses = deque(maxlen=_KEPT_STATUSES)
-        self._statuses.append(status)
+            self._statuses = _Statuses()
+        self._statuses.hear(status)
         self._wake()
 
     def _end(self) -> None:
@@ -235,9 +361,11 @@ class Query(Generic[Response]):
         if held.response is not None:
             self._response = _Bytes(held.response)
 
-    def _loaded_directly(self, resource_id: str, response: bytes) -> None:
+    def _loaded_directly(self, resource_id: str, response: bytes, state: State) -> None:
         """Note that the load has succeeded. In the thread that loads."""
         self.resource_id = resource_id
+        if state is not OK and self.state is OK:  # otherwise a status arrived before the answer
+            self.state = state
         if self._response is None:  # otherwise an update arrived before the answer
             self._response = _Bytes(response)
 
@@ -264,6 +392,10 @@ class Query(Generic[Response]):
         """Return the response's canonical bytes: those that arrived, if the response has not been read yet."""
         return self._response.raw if type(self._response) is _Bytes else encode(self._response, "response")
 
+    def _was_given(self, request: object) -> None:
+        """Note the request as the caller has given it. It is not decoded."""
+        self._request = request
+
     def _held_by(self, holder: Holder) -> Self:
         """Make `holder` the registrar that unload() calls."""
         self._holder = holder
@@ -272,8 +404,11 @@ class Query(Generic[Response]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self.unload_if_held()
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        try:
+            self.unload_if_held()
+        except RrError as refusal:
+            raise_or_note(refusal, error)
 
     def unload_if_held(self, *, timeout_s: float | None = 30.0) -> None:
         """Release the query as unload() does; do nothing if it is released already, by its holder or its provider.
@@ -289,15 +424,34 @@ class Query(Generic[Response]):
                     raise
 
     async def __aenter__(self) -> Self:
+        check_asyncio("async with Query")
         return self
 
-    async def __aexit__(self, *exc: object) -> None:
+    async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        try:
+            await self._unload_if_held_async(patience_s(error))
+        except RrError as refusal:
+            raise_or_note(refusal, error)
+
+    async def _unload_if_held_async(self, timeout_s: float | None) -> None:
+        """Release the query as unload_if_held() does, awaited. If it is cancelled, the unload goes on."""
         if not self._is_gone():
             try:
-                await self.unload_async()
+                await self.unload_async(timeout_s=timeout_s)
             except UnknownQuery:
                 if not self._may_be_gone():
                     raise
+
+    def _begin_unload(self, timeout_s: float | None) -> Reply[None]:
+        """Begin to release the query if it is still held, and return the future of the end."""
+        ended: Reply[None] = Reply()
+        try:
+            if not self._is_gone():
+                return self._at_holder().unload(self, timeout_s=timeout_s, block=False)
+            ended.set()
+        except RrError as error:
+            fail(ended, error)
+        return ended
 
     def _may_be_gone(self) -> bool:
         """Return whether the query is gone, or belongs to a handle: such a query is not notified of its end."""
@@ -335,24 +489,15 @@ hear = Query._hear  # pyright: ignore[reportPrivateUsage]  # same file
 end = Query._end  # pyright: ignore[reportPrivateUsage]
 loaded = Query._loaded  # pyright: ignore[reportPrivateUsage]
 loaded_directly = Query._loaded_directly  # pyright: ignore[reportPrivateUsage]
+was_given = Query._was_given  # pyright: ignore[reportPrivateUsage]
 held_by = Query._held_by  # pyright: ignore[reportPrivateUsage]
 response_bytes = Query._response_bytes  # pyright: ignore[reportPrivateUsage]
 read_as = Query._read_as  # pyright: ignore[reportPrivateUsage]
+begin_unload = Query._begin_unload  # pyright: ignore[reportPrivateUsage]
+unload_if_held_async = Query._unload_if_held_async  # pyright: ignore[reportPrivateUsage]
 
 
-def read_later(loaded: Any, codec: Codec) -> Reply[Query]:
-    """Return a future of a load's query whose response this codec decodes."""
-    read: Reply[Query] = Reply()
-    read.withdraw = loaded.cancel
-
-    def done(loaded: Reply[Query]) -> None:
-        read.set_unopened(lambda: read_as(loaded.get(), codec))
-
-    loaded.add_done_callback(done)
-    return read
-
-
-def _no_types(server_id: str) -> tuple[Any, Any]:
+def _no_types(server_id: str) -> tuple[Codec, Codec]:
     raise UnknownQuery(f"{server_id}: a query of another process has no types here")
 
 
@@ -368,12 +513,13 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     Attributes:
         id, server, request, response: the response is None while the resource is loading.
         state: a str. While the resource is loaded, the state of the last status, "OK" at first. Otherwise its phase:
-            "queued", "loading", "unloading" or "unload_failed".
+            "queued", "loading", "unloading", "unload_failed", "pausing", "paused" or "resuming".
         phase: the phase alone.
         status, message: the state and the message of the last status.
         attempt: how often its load callback has begun.
         holders: the registrars that hold it, one entry for each query.
         queries: their query ids.
+        priority: the highest priority of its holders; None: all of them have it on standby, or nobody holds it.
     """
 
     id: str
@@ -387,14 +533,16 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     attempt: int
     holders: tuple[str, ...]
     queries: tuple[str, ...]
+    priority: int | None = 0
 
 
-logger = logging.getLogger("rr_actors.registrar")
+logger = Log("rr_actors.registrar")
 
 StatusCallback = Callable[[Status], Any]
 
 PLAIN = Codec(None)
 _TYPES_S = 2.0
+_AFTER_FATAL = (State.FATAL, State.UPDATE)  # what is heard of a resource that is lost
 
 
 class Views:
@@ -408,6 +556,8 @@ class Views:
         self._actor = actor
         self.holder = holder
         self._queries: dict[str, Query] = {}
+        self._taken: dict[str, Held] = {}  # queries that were taken away, until their callbacks have heard of that
+        self._lost: set[str] = set()  # queries whose resource has said FATAL
         self._on_query: dict[str, StatusCallback] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
@@ -415,9 +565,14 @@ class Views:
         self._left: set[tuple[str, str]] = set()  # servers where something was held, and released
         self._silent: set[str] = set()  # servers whose types were asked for, and did not come in time
 
-    def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
-        """Return a Query that is being loaded. No status reaches it before add()."""
-        return Query(id, place, request, parent, self._actor.name, self.holder, self._codecs_of)
+    def new(self, id: str, place: ServerId, request: bytes, parent: str, codec: Codec | None = None) -> Query:
+        """Return a Query that is being loaded. No status reaches it before add().
+
+        Args:
+            codec: decodes the response; None: that of the server's response type.
+        """
+        query = Query(id, place, request, parent, self._actor.name, self.holder, self._codecs_of)
+        return query if codec is None else read_as(query, codec)
 
     def seen(self, held: Held) -> Query:
         """Return a new Query of a held row."""
@@ -432,12 +587,18 @@ class Views:
             view = self._queries[held.id] = self.seen(held)
         return view
 
+    def known(self, query_id: str) -> Query | None:
+        """Return the Query of this id that was given out, or is being loaded; None once it is not held any more."""
+        return self._queries.get(query_id)
+
     def add(self, query: Query) -> None:
         """Have statuses reach a query."""
         self._queries[query.id] = query
 
-    def listen(self, query_id: str, callback: StatusCallback) -> None:
-        """Have the callback called with each status of one query."""
+    def listen(self, query_id: str, callback: StatusCallback, loop: CallersLoop | None = None) -> None:
+        """Have the callback called with each status of one query, on this loop if it is async."""
+        if loop is not None:
+            callback = loop.bring(self._while_heard(query_id, callback))
         self._on_query[query_id] = callback  # first: an interrupt may come now, and forget() looks here
         self._actor.catalog.listened.add(query_id)
 
@@ -447,11 +608,27 @@ class Views:
         self._on_server.setdefault(server, []).append(callback)
 
     def forget(self, query_id: str) -> None:
-        """Forget a query that is not held any more, and its callback; wake the threads that wait for its statuses."""
+        """Forget a query that its holder has released: no callback begins for it from now on."""
+        self._taken.pop(query_id, None)
+        self._drop(query_id)
+
+    def forget_taken(self, wanted: Callable[[Held], bool]) -> None:
+        """Forget the wanted ones of the queries that were taken away, and whose callbacks have not heard all of it."""
+        for held in list(self._taken.values()):
+            if wanted(held):
+                self.forget(held.id)
+
+    def hears(self, query_id: str) -> bool:
+        """Return whether callbacks for a query may begin now: it is not released, nor is the registrar closed."""
+        return (query_id in self._queries or query_id in self._taken) and not self._actor.closed
+
+    def _drop(self, query_id: str) -> None:
+        """Drop a query that is not held any more, and its callback; wake the threads that wait for its statuses."""
         if (view := self._queries.pop(query_id, None)) is not None:
             end(view)
             if view.resource_id:
                 self._left.add((view.registrar, view.server))
+        self._lost.discard(query_id)
         if self._on_query.pop(query_id, None) is not None:
             self._actor.catalog.listened.discard(query_id)
 
@@ -472,18 +649,34 @@ class Views:
         `heard` is called when all callbacks have returned, with whether one of them has handled the status. After a
         crash before that, the provider sends the status again.
         """
+        server = f"{held.registrar}/{held.server}"
+        if held.id in self._lost and notice.state not in _AFTER_FATAL:
+            heard(False)
+            return
+        if notice.state is State.FATAL and notice.source == server:  # else a part of the resource is lost
+            self._lost.add(held.id)
         status = status_of(notice, repeated=repeated)
-        view = self._queries.get(held.id)
-        if view is not None:
-            hear(view, status, notice.response, released=notice.released)
-        callbacks = list(self._on_server.get(f"{held.registrar}/{held.server}", ()))
+        callbacks = list(self._on_server.get(server, ()))
         if (own := self._on_query.get(held.id)) is not None:
             callbacks.insert(0, own)
+        view = self.of(held) if callbacks else self._queries.get(held.id)
+        if view is not None:
+            hear(view, status, notice.response, released=notice.released)
+        if notice.released:
+            self._taken[held.id] = held
+            self._drop(held.id)
         left = itertools.count(len(callbacks) - 1, -1)
+
+        def through() -> None:
+            if next(left) <= 0:
+                if notice.released:
+                    self._taken.pop(held.id, None)
+                heard(status.is_handled)
+
         for callback in callbacks:
-            self._run(held, callback, status, lambda: None if next(left) else heard(status.is_handled))
+            self._run(held, callback, status, through)
         if not callbacks:
-            heard(False)
+            through()
 
     def _run(self, held: Held, callback: StatusCallback, status: Status, through: Callable[[], None]) -> None:
         def done(_result: Any, error: BaseException | None) -> None:
@@ -493,9 +686,21 @@ class Views:
                 log_raised(logger, error, "%s: a status callback for %s raised", self._actor.name, held.server)
 
         try:
-            self._actor.workers.serial(("hear", held.id), callback, status, done=done)
+            self._actor.workers.serial(("hear", held.id), self._while_heard(held.id, callback), status, done=done)
         except Unavailable as error:
             done(None, error)
+
+    def _while_heard(self, query_id: str, callback: StatusCallback) -> StatusCallback:
+        """Return a callback that does nothing if, when it begins, no callback for the query may begin any more."""
+
+        async def begin_async(status: Status) -> None:
+            if self.hears(query_id):
+                await callback(status)
+
+        def begin(status: Status) -> Any:
+            return callback(status) if self.hears(query_id) else None
+
+        return begin_async if is_async(callback) else begin
 
     def codecs_of(self, server_id: str) -> tuple[Codec, Codec]:
         """Return the codecs of a server's requests and responses, made of the types that it sent. Not on the loop."""

@@ -6,16 +6,19 @@ loop. The docstrings have the promises.
 
 from __future__ import annotations
 
+import abc
 import asyncio
 import functools
-import logging
 import sys
+import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Unpack, cast, overload
 
 import pykka
+from msgspec.structs import replace
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
@@ -23,22 +26,39 @@ from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
 from rr_actors.base.names import ServerId, check_name, new_id, parse_server
 from rr_actors.base.notebook import bundle_or_text, table
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode
+from rr_actors.base.values.failure import error_of
 from rr_actors.registrar.arguments import (
+    DEFAULTS,
+    GroupKeywords,
+    LoadKeywords,
+    LoadOptions,
+    Parent,
+    check_allowed,
     check_text,
-    codec_for,
+    checked,
+    checked_callback,
+    checked_priority,
     resource_target,
     server_target,
-    status_callback,
+    shows,
     target_id,
 )
 from rr_actors.registrar.declarations import Declared
+from rr_actors.registrar.engine.monitor import RegistrarBase
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.server import (
+    RECOVER_S,
     Current,
+    Measured,
     ServerActor,
     ServerSpec,
+    Usages,
+    check_not_measuring,
     check_not_own,
+    checked_pauses,
     checked_spec,
     current_or_none,
     log_unread_types,
@@ -46,26 +66,28 @@ from rr_actors.registrar.engine.server import (
     status_callback_of,
 )
 from rr_actors.registrar.engine.status import Status, message_text
-from rr_actors.registrar.load_groups import Group, Queries, wanted
-from rr_actors.registrar.loads import CALL_TIMEOUT_S, Calls, Loads, Unloads, settle
+from rr_actors.registrar.load_groups import Group, GroupWays, LoadWanted, Queries, wanted
+from rr_actors.registrar.loads import CALL_TIMEOUT_S, Calls, Loads, LoadWays, Unloads, UnloadWays, settle
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.messages import FetchedQuery, error_of
-from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
+from rr_actors.registrar.model.messages import FetchedQuery
+from rr_actors.registrar.model.rows import (
+    STANDBY,
+    Held,
+    Hold,
+    Phase,
+    Put,
+    Resource,
+    State,
+    StoredServer,
+    priority_of,
+    types_id,
+)
 from rr_actors.registrar.model.rows import Query as QueryRow
 from rr_actors.registrar.pages import Page, Wanted, page_of
-from rr_actors.registrar.progress_hearers import ProgressWanted, hearer_of
-from rr_actors.registrar.queries import (
-    PLAIN,
-    Query,
-    ResourceInfo,
-    StatusCallback,
-    Views,
-    read_as,
-    read_later,
-    response_bytes,
-)
+from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, response_bytes
 from rr_actors.registrar.replacements import Replacements, encoded_response
+from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import time_limit
 
 if TYPE_CHECKING:
@@ -79,7 +101,7 @@ else:
 
 Request = TypeVar("Request")
 
-logger = logging.getLogger("rr_actors.registrar")
+logger = Log("rr_actors.registrar")
 
 _KEPT = (
     "%s/%s: a process that has ended had loaded %d of its resources. They are kept as they are. What that process "
@@ -87,26 +109,389 @@ _KEPT = (
     "and returns the response, or recovery='reload' or 'lost'. If they live outside the process, say recovery='keep'."
 )
 
+NO_FIELDS: dict[str, object] = {}
+"""The request of a load that gives none."""
+
 _SHOWN = 50  # rows of a picture in a notebook
+_AT_ONCE = 64  # usage callbacks that begin together
+_PATIENCE_S = 0.25  # after that, the next ones begin: some that hang do not hold them up
 
 
-class Registrar:
+class Consumer(abc.ABC):
+    """The calls that load and unload: the same for every kind of registrar.
+
+    They check the arguments. The ways to load and unload are those of the kind: of a registrar of this process (Loads,
+    Unloads), or of one that another process has (RemoteLoads).
+    """
+
+    _unload_ways: UnloadWays
+    _warned_in_event_loop = False
+    _encode = staticmethod(encode)
+
+    @property
+    @abc.abstractmethod
+    def _load_ways(self) -> LoadWays:
+        """The ways in which this registrar loads."""
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """The registrar's name, unique in its system."""
+
+    @abc.abstractmethod
+    def _target(self, server: object) -> ServerId:
+        """Return the id of the server that is meant."""
+
+    @abc.abstractmethod
+    def _holder(self, parent: Parent | None) -> tuple[Consumer, str]:
+        """Return the registrar that holds the next load, and the id of its resource that needs it; "" for none."""
+
+    @abc.abstractmethod
+    def _group(self, requests: Sequence[LoadWanted], parent: str, options: LoadOptions) -> GroupWays:
+        """Return a group of loads that has not begun."""
+
+    @abc.abstractmethod
+    def _check_open(self) -> None:
+        """Raise RegistrarDown if the registrar is closed."""
+
+    @abc.abstractmethod
+    def _may_block(self) -> bool:
+        """Return whether the calling thread may wait."""
+
+    @abc.abstractmethod
+    def fetch_state(self, query_or_id: Query | str) -> str:
+        """Return the state of the last status of a query, as its registrar has it."""
+
+    @abc.abstractmethod
+    def fetch_priority(self, query_or_id: Query | str) -> int | None:
+        """Return the priority of a query, as its registrar has it."""
+
+    @abc.abstractmethod
+    def set_priority(self, query_or_id: Query | str, priority: int | None) -> None:
+        """Give a query a priority."""
+
+    # -- load ----------------------------------------------------------------------------------------------------
+
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Response],
+        request: Request = ...,
+        *,
+        block: Literal[True] = True,
+        **options: Unpack[LoadKeywords],
+    ) -> Query[Response]: ...
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Response],
+        request: Request = ...,
+        *,
+        block: Literal[False],
+        **options: Unpack[LoadKeywords],
+    ) -> pykka.Future[Query[Response]]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object = ...,
+        *,
+        response_type: type[Response] | None = None,
+        block: Literal[True] = True,
+        **options: Unpack[LoadKeywords],
+    ) -> Query[Response]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object = ...,
+        *,
+        response_type: type[Response] | None = None,
+        block: Literal[False],
+        **options: Unpack[LoadKeywords],
+    ) -> pykka.Future[Query[Response]]: ...
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Any],
+        request: Request = ...,
+        *,
+        block: bool = True,
+        **options: Unpack[LoadKeywords],
+    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object = ...,
+        *,
+        response_type: Any = None,
+        block: bool = True,
+        **options: Unpack[LoadKeywords],
+    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
+
+    @shows(LoadKeywords)
+    def load(
+        self,
+        server: str | Declared[Any, Any, Any],
+        request: Any = NO_FIELDS,
+        *,
+        response_type: Any = None,
+        block: bool = True,
+        **options: Unpack[LoadKeywords],
+    ) -> Any:
+        """Load the resource for this request, or share it if somebody holds it already.
+
+        If a callback makes the call, the resource becomes a dependency of the callback's resource.
+
+        Args:
+            server: "registrar/server"; or the method that declares it, such as `Cameras.open_camera`, if exactly one
+                child of the system has that class. Type checkers then know the response's type.
+            request: a value of the server's request type (docs/values.md). By default it has no fields: for a callback
+                without parameters, or with defaults for all.
+            response_type: the type to read the response as, in place of the type that the server declares.
+            on_status: a worker calls it with each Status of this query, in order. With load_async(), an ``async def``
+                runs on the event loop that awaits the load, in the caller's context. For a dependency it runs before
+                the status callback of the resource that needs it, and instead of it if it calls `status.handled()`.
+            timeout_s: seconds that the whole load may take. After that the load is withdrawn. None: no limit.
+            parent: rr.current() of the callback, if another thread makes the call for it.
+            priority: how urgently the resource is needed, from -1000 to 1000; None: on standby. A dependency for which
+                none is given inherits the priority of the resource that needs it (docs/planning.md).
+            progress: a callable that hears each rr.Progress that the load callback reports, while this load waits. Or
+                True: draw a bar, if the error output is a terminal (needs `rr-actors[progress]`). The thread that waits
+                calls it: the calling thread, with load_async() the task's event loop, with ``block=False`` a worker.
+            block: False returns a Pykka future of the query at once.
+
+        Returns:
+            The Query, or with ``block=False`` a future of it.
+
+        Raises:
+            LoadFailed: the provider could not load it, most often because a load callback raised. `.trace` has the
+                places.
+            CircularDependency: the request would wait for itself. `.ring` has the servers around the ring; the text
+                names the request that closes it.
+            LoadTimeout: the provider did not answer in time.
+            UnknownServer, UnknownRegistrar, InvalidName: there is no such server.
+            InvalidRequest, NotSerializable: the request has another type, or cannot travel.
+            UsageError: several children of the system have the class that declares the server; `progress` is neither a
+                callable nor a bool, or is True without rich; or the priority is wrong, or over `max_priority`.
+            RegistrarDown: the provider is stopped or gone for good.
+            MailboxFull: too many loads are in flight.
+        """
+        if block and asyncio._get_running_loop() is not None:
+            self._warn_in_event_loop("load", "load_async")
+        wanted = checked("load", options, response_type) if options or response_type is not None else DEFAULTS
+        owner, parent = self._holder(wanted.parent)
+        target = parse_server(server) if type(server) is str and "/" in server else self._target(server)
+        loads = owner._load_ways
+        return (loads.wait if block else loads.begin)(target, self._encode(request), parent, wanted)
+
+    @overload
+    async def load_async(
+        self, server: Declared[Request, Any, Response], request: Request = ..., **options: Unpack[LoadKeywords]
+    ) -> Query[Response]: ...
+    @overload
+    async def load_async(
+        self,
+        server: str,
+        request: object = ...,
+        *,
+        response_type: type[Response] | None = None,
+        **options: Unpack[LoadKeywords],
+    ) -> Query[Response]: ...
+
+    @shows(LoadKeywords)
+    async def load_async(
+        self,
+        server: str | Declared[Any, Any, Any],
+        request: Any = NO_FIELDS,
+        *,
+        response_type: Any = None,
+        **options: Unpack[LoadKeywords],
+    ) -> Query[Any]:
+        """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
+        wanted = checked("load_async", options, response_type)
+        owner, parent = self._holder(wanted.parent)
+        return await owner._load_ways.awaited(self._target(server), self._encode(request), parent, wanted)
+
+    def _warn_in_event_loop(self, called: str, instead: str) -> None:
+        """Warn once for each registrar that a call blocks the event loop of the calling thread.
+
+        A notebook runs each cell on its kernel's event loop, which has nothing else to do.
+        """
+        if self._warned_in_event_loop or "ipykernel" in sys.modules:
+            return
+        if not self._may_block():  # a callback that is a coroutine: the call is refused
+            return
+        self._warned_in_event_loop = True
+        text = f"{called}() blocks the event loop that runs in this thread until it returns"
+        warnings.warn(f"registrar {self.name!r}: {text}: write `await {instead}(...)`", RuntimeWarning, stacklevel=3)
+
+    @shows(GroupKeywords)
+    def load_all(self, requests: Iterable[tuple[str, Any]], **options: Unpack[GroupKeywords]) -> Queries:
+        """Load several resources at once, and hold all of them or none::
+
+            with app.load_all([("cameras/camera", "front"), ("maps/map", "hall")]) as (camera, map):
+                ...
+
+        Args:
+            requests: one ("registrar/server", request) for each load.
+            on_status, parent, priority: as for load(), for each load.
+            timeout_s: seconds that each load may take. None: no limit.
+
+        Returns:
+            The queries, in the order of the requests: a tuple, and a context manager that unloads them.
+
+        Raises:
+            The first error of a load, with a note that names its request. Everything that was held is released.
+        """
+        if asyncio._get_running_loop() is not None:
+            self._warn_in_event_loop("load_all", "load_all_async")
+        return self._asked("load_all", requests, options).wait()
+
+    @shows(GroupKeywords)
+    async def load_all_async(self, requests: Iterable[tuple[str, Any]], **options: Unpack[GroupKeywords]) -> Queries:
+        """Load as load_all() does, awaited. If it is cancelled, all loads are released or withdrawn."""
+        return await self._asked("load_all_async", requests, options).awaited()
+
+    def _asked(self, called: str, requests: Iterable[tuple[str, Any]], given: GroupKeywords) -> GroupWays:
+        """Return a group of loads that has not begun, with its arguments checked."""
+        asked = wanted(requests, self._target, self._encode)
+        options = checked(called, given, names=GroupKeywords)
+        owner, parent = self._holder(options.parent)
+        return owner._group(asked, parent, options)
+
+    # -- unload --------------------------------------------------------------------------------------------------
+
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: Literal[True] = True,
+    ) -> None: ...
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: Literal[False],
+    ) -> pykka.Future[None]: ...
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: bool = True,
+    ) -> pykka.Future[None] | None: ...
+
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: bool = True,
+    ) -> Any:
+        """Release a query. Return when the unload callback has run, or at once if others hold the resource.
+
+        Args:
+            query_or_id: a query of this registrar, or its id. With `force`: a resource served here, a query on it, or
+                the id of either.
+            force: unload the resource although it is held. Its holders hear FATAL.
+            timeout_s: seconds to wait for a provider that is down. None: no limit.
+            block: False returns a Pykka future at once.
+
+        Raises:
+            UnknownQuery: this registrar never held the query, or has unloaded it already.
+            NotHolder: another registrar holds the query.
+            UnloadFailed: the unload callback raised. The query is still held, and can be unloaded again.
+            UsageError: with `force`, a callback of that resource made the call, and would wait for itself.
+            Unavailable: the provider did not come back in time. The release is owed, on disk, until it does.
+        """
+        self._check_open()
+        limit_s = time_limit(timeout_s)
+        query_id = target_id(query_or_id)
+        unloads = self._unload_ways
+        if force:
+            return (unloads.force_wait if block else unloads.force_begin)(query_id, limit_s)
+        if is_a(query_or_id, Query) and query_or_id.origin != self.name:
+            raise error_of(failures.not_holder(query_id, query_or_id.origin, self.name))
+        return unloads.wait(query_id, limit_s) if block else unloads.begin(query_id, limit_s)
+
+    async def unload_async(
+        self, query_or_id: Query | ResourceInfo | str, *, force: bool = False, timeout_s: float | None = 30.0
+    ) -> None:
+        """Release a query as unload() does, awaited. If it is cancelled, the unload goes on."""
+        check_asyncio("unload_async")
+        await self.unload(query_or_id, force=force, timeout_s=timeout_s, block=False)
+
+    @overload
+    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
+    @overload
+    def unload_client(
+        self, server: str, *, timeout_s: float | None = 30.0, block: Literal[False]
+    ) -> pykka.Future[None]: ...
+    @overload
+    def unload_client(
+        self, server: str, *, timeout_s: float | None = 30.0, block: bool
+    ) -> pykka.Future[None] | None: ...
+
+    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
+        """Release everything that this registrar holds at one server ("registrar/server"), newest first.
+
+        Raises:
+            InvalidName: `server` does not have that form.
+            UnknownServer: this registrar holds nothing there and never did. `.known` has the servers where it does.
+            The errors of unload(), after all queries have been tried.
+        """
+        self._check_open()
+        unloads = self._unload_ways
+        return (unloads.wait_all if block else unloads.begin_all)(self._target(server), time_limit(timeout_s))
+
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[False]) -> pykka.Future[None]: ...
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool) -> pykka.Future[None] | None: ...
+
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
+        """Release everything that this registrar holds for itself, newest first. Its resources keep their dependencies.
+
+        Raises:
+            The errors of unload(), after all queries have been tried.
+        """
+        self._check_open()
+        return (self._unload_ways.wait_all if block else self._unload_ways.begin_all)(None, time_limit(timeout_s))
+
+
+class Registrar(Consumer):
     """A registrar of this process. It consumes resources of other registrars, provides its own, or both.
 
     System.open_registrar() makes one, and every Manager has one. Call its methods from any thread. With ``block=False``
     they return a Pykka future, which can also be awaited.
     """
 
-    def __init__(self, actor: RegistrarActor) -> None:
+    def __init__(self, node: Node, actor: RegistrarActor) -> None:
         self._actor = actor
-        self._node = actor.node
+        self._node = node
         self._calls = Calls(actor)
         self._views = Views(actor, self)
         self._loads = Loads(self._calls, self._views)
-        self._unloads = Unloads(self._calls, self._views)
+        self._unload_ways = self._unloads = Unloads(self._calls, self._views)
         self._replacements = Replacements(self._loads, self._unloads)
-        self._warned_in_event_loop = False
         actor.audience = self._views
+
+    @property
+    def _load_ways(self) -> LoadWays:
+        return self._loads
 
     @property
     def name(self) -> str:
@@ -161,24 +546,50 @@ class Registrar:
         response_type: Any = None,
         linger_s: float = 0.0,
         load_timeout_s: float | None = None,
+        recover_timeout_s: float | None = RECOVER_S,
         recovery: Literal["keep", "reload", "lost"] | None = None,
+        usage: Callable[..., Any] | None = None,
+        idle: Literal["unload", "pause"] = "unload",
+        paused_s: float | None = None,
+        pause: Callable[..., Any] | None = None,
+        resume: Callable[..., Any] | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
         Args:
-            load: ``load(request) -> response``. Plain or ``async def``; like all callbacks it runs off the loop.
+            load: ``load(request) -> response``. Plain or ``async def``; like all callbacks it runs off the loop. With
+                several parameters or none, the callbacks take the fields of the request in its place (docs/values.md).
             unload: ``unload(request, response)`` runs when the last holder has released the resource. After an
                 interrupted load that was withdrawn or given up, the response is None and ``rr.current().interrupted``
-                is true.
+                is true. Default: None. Give one where something has to be closed.
             status: ``status(request, status)`` runs for a status of the resource itself, before the holders hear it
                 (``status.resource_id`` is then rr.current().resource_id), and for statuses of its dependencies.
+                Default: None. Give one to replace a part that fails.
             recover: ``recover(request, response) -> response`` runs after a respawn. It returns the response if the
-                resource lives, and raises if it is lost.
-            request_type, response_type: by default the annotations of `load`; without these, any plain value.
-            linger_s: seconds for which a resource without holders is kept.
-            load_timeout_s: seconds after which a running `load` counts as failed.
-            recovery: without `recover`: "keep" the resource, "reload" it, or give it up as "lost". None: as
-                "keep", and the log has a warning if a process that has ended had loaded kept resources.
+                resource lives, and raises if it is lost. Default: None. Give one where a crash ends what was loaded,
+                such as a connection.
+            request_type, response_type: the types of both. Default: None, the annotations of `load`; without these, any
+                plain value. Set them for a callable without annotations.
+            linger_s: seconds for which a resource without holders is kept. Default: 0.0. Raise it where loading takes
+                long and the next holder often comes soon.
+            load_timeout_s: seconds after which a running `load` counts as failed. Default: None, no limit but that of
+                each caller. Set it where a device may hang, and its callers wait for long.
+            recover_timeout_s: seconds after which a running `recover` counts as failed, and the resource as lost.
+                Default: 30.0. Raise it for a slow device; None sets no limit.
+            recovery: without `recover`: "keep" the resource, "reload" it, or give it up as "lost". Default: None, as
+                "keep", and the log has a warning if a process that has ended had loaded kept resources. Set "keep" for
+                what lives outside the process, "reload" or "lost" for what ends with it.
+            usage: ``usage(request, response)`` returns what a loaded resource uses now, as a dict of numbers; usage()
+                runs it. Default: None. Give one where a resource takes CPU, memory, power or a like amount.
+            idle: what happens after `linger_s` to a resource that nobody holds, or that all its holders have on
+                standby: "unload" it if nobody holds it, or "pause" it. Default: unload. Give "pause" where a start
+                takes long, and idling costs CPU or power.
+            paused_s: seconds after which a paused resource is unloaded that nobody holds. Default: None, never. Give
+                them where a paused one keeps memory.
+            pause: ``pause(request, response)`` runs when the resource is paused. Default: None. Give one with
+                idle="pause".
+            resume: ``resume(request, response)`` runs when the resource is needed again, and may return a new response.
+                Default: None. Give one with idle="pause".
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -187,7 +598,11 @@ class Registrar:
             NotSerializable: a callback cannot travel to the registrar's process.
         """
         callbacks, types = (load, unload, status, recover), (request_type, response_type)
-        spec = checked_spec(ServerSpec(name, *callbacks, *types, linger_s, load_timeout_s, recovery))
+        limits = linger_s, load_timeout_s, recovery, recover_timeout_s
+        spec = ServerSpec(
+            name, *callbacks, *types, *limits, usage=usage, idle=idle, paused_s=paused_s, pause=pause, resume=resume
+        )
+        spec = checked_pauses(checked_spec(spec))
         self._register_spec(spec)
 
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
@@ -202,19 +617,26 @@ class Registrar:
         types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
         server = ServerActor(self._actor, spec, types)
         server.restored = restored
-        kept = self._calls.call(self._register, server, stored)
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            resources = [catalog.resources[id] for id in catalog.by_server.get(spec.name, ())]
+            known = catalog.server_types.get(types_id(spec.name))
+        reread = server.reread(resources, b"" if known is None else known.blob)
+        kept = self._calls.call(self._register, server, stored, reread)
         if kept and is_declared_here and spec.recovery is None and spec.recover is None:
             logger.warning(_KEPT, self.name, spec.name, kept)
 
-    def _register(self, server: ServerActor, stored: bytes | None) -> int:
+    def _register(self, server: ServerActor, stored: bytes | None, reread: tuple[c.Reread, ...]) -> int:
         """Register a server on the loop, and return how many usable held resources it finds; 0 if it replaces one."""
         name = server.spec.name
         with self._actor.enter():
             catalog = self._actor.whole()
-            resources = [catalog.resources[id] for id in catalog.by_server.get(name, ()) if id in catalog.holders]
+            lost = {found.resource_id for found in reread if found.misfit}
+            ids = [id for id in catalog.by_server.get(name, ()) if id in catalog.holders and id not in lost]
+            resources = [catalog.resources[id] for id in ids]
         kept = sum(found.phase is Phase.LOADED and found.state is not State.FATAL for found in resources)
         known = self._actor.servers.get(name)
-        self._actor.servers.register(server)
+        self._actor.servers.register(server, reread)
         if stored is not None:
             self._actor.commit_rows([Put(StoredServer(name, stored))])
         return kept if known is None else 0
@@ -226,8 +648,10 @@ class Registrar:
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
         """Remove a server: release all queries on it, send its holders FATAL, unload its resources.
 
+        Resources that wait for a server of this name, which is not registered, are removed without its callbacks.
+
         Raises:
-            UnknownServer: this registrar has no server of that name.
+            UnknownServer: this registrar has no server of that name, and no resource that waits for one.
             UnloadFailed: an unload callback raised. The resource stays in the catalog.
             UsageError: a callback of this server made the call, and would wait for itself. Nothing has changed.
         """
@@ -259,6 +683,38 @@ class Registrar:
         own = status_callback_of(self._actor)
         what = f"status for {target_id(query_or_resource_id)}"
         self._calls.command(lambda ticket: c.SetStatus(resource, new_id(), state, text, ticket, own), what)
+
+    def revoke(
+        self,
+        query_or_resource_id: Query | ResourceInfo | str,
+        why: str,
+        *,
+        grace_s: float = 5.0,
+        timeout_s: float | None = None,
+    ) -> None:
+        """Take a resource served here away from its holders, the highest first. Return when it is unloaded.
+
+        Each holder hears FATAL with `status.reason == "revoked"`, and its query is released when its callbacks have
+        heard that. A resource that depends on this one is revoked itself, unless its status callback has put another in
+        its place, or says `status.handled()`. New requests wait until the resource is gone.
+
+        Args:
+            query_or_resource_id: the resource or its id, or a query on it or the query's id.
+            grace_s: seconds after which the resource is unloaded by force.
+            timeout_s: seconds to wait. The revocation goes on after them.
+
+        Raises:
+            UnknownQuery: this registrar serves no such resource.
+            UsageError: the resource is not loaded, or is revoked already; or `grace_s` is no time; or a callback of the
+                resource made the call, and would wait for itself.
+            UnloadFailed: the unload callback raised.
+        """
+        self._check_open()
+        seconds = time_limit(grace_s, "grace_s")
+        if seconds is None:
+            raise UsageError(f"revoke: grace_s: expected seconds, 0 or more, got {shown(grace_s)}")
+        target, limit_s = target_id(query_or_resource_id), time_limit(timeout_s)
+        self._unloads.revoke(target, message_text(why), seconds, limit_s)
 
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
@@ -328,272 +784,36 @@ class Registrar:
         if not is_a(status, Status):
             raise UsageError(f"replace_part: expected the Status of the callback, got {shown(status)}")
         owner, resource_id = self._holder(None)
-        if not resource_id:
+        if not (resource_id and isinstance(owner, Registrar)):
             where = "expected to be called in a status callback of a server"
             raise UsageError(f"registrar {self.name!r}: replace_part: {where}")
         return owner._replacements.replace(status, request, target, response, limit_s)
 
-    # -- load ----------------------------------------------------------------------------------------------------
-
-    @overload
-    def load(
-        self,
-        server: Declared[Request, Any, Response],
-        request: Request,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[True] = True,
-    ) -> Query[Response]: ...
-    @overload
-    def load(
-        self,
-        server: Declared[Request, Any, Response],
-        request: Request,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[False],
-    ) -> pykka.Future[Query[Response]]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object,
-        *,
-        response_type: type[Response] | None = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[True] = True,
-    ) -> Query[Response]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object,
-        *,
-        response_type: type[Response] | None = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[False],
-    ) -> pykka.Future[Query[Response]]: ...
-    @overload
-    def load(
-        self,
-        server: Declared[Request, Any, Any],
-        request: Request,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: bool = True,
-    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object,
-        *,
-        response_type: Any = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: bool = True,
-    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
-
-    def load(
-        self,
-        server: str | Declared[Any, Any, Any],
-        request: Any,
-        *,
-        response_type: Any = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: bool = True,
-    ) -> Any:
-        """Load the resource for this request, or share it if somebody holds it already.
-
-        If a callback makes the call, the resource becomes a dependency of the callback's resource.
-
-        Args:
-            server: "registrar/server"; or the method that declares it, such as `Cameras.open_camera`, if exactly one
-                child of the system has that class. Type checkers then know the response's type.
-            request: a value of the server's request type (docs/values.md).
-            response_type: the type to read the response as, in place of the type that the server declares.
-            on_status: a worker calls it with each Status of this query, in order. For a dependency it runs before the
-                status callback of the resource that needs it, and instead of it if it calls `status.handled()`.
-            timeout_s: seconds that the whole load may take. After that the load is withdrawn. None: no limit.
-            parent: rr.current() of the callback, if another thread makes the call for it.
-            progress: a callable that hears each rr.Progress that the load callback reports, while this load waits. Or
-                True: draw a bar, if the error output is a terminal (needs `rr-actors[progress]`). The thread that waits
-                calls it: the calling thread, with load_async() the task's event loop, with ``block=False`` a worker.
-            block: False returns a Pykka future of the query at once.
-
-        Returns:
-            The Query, or with ``block=False`` a future of it.
-
-        Raises:
-            LoadFailed: the provider could not load it, most often because a load callback raised. `.trace` has the
-                places.
-            CircularDependency: the request would wait for itself. `.ring` has the servers around the ring; the text
-                names the request that closes it.
-            LoadTimeout: the provider did not answer in time.
-            UnknownServer, UnknownRegistrar, InvalidName: there is no such server.
-            InvalidRequest, NotSerializable: the request has another type, or cannot travel.
-            UsageError: several children of the system have the class that declares the server; or `progress` is
-                neither a callable nor a bool, or is True without rich.
-            RegistrarDown: the provider is stopped or gone for good.
-            MailboxFull: too many loads are in flight.
-        """
-        if block and asyncio._get_running_loop() is not None:
-            self._warn_in_event_loop("load", "load_async")
-        codec = None if response_type is None else codec_for(response_type)
-        limit_s = time_limit(timeout_s)
-        if on_status is not None:
-            on_status = status_callback(on_status, "load")
-        owner, parent_id = self._holder(parent)
-        loads = owner._loads
-        way = loads.wait if block else loads.future
-        target = parse_server(server) if type(server) is str and "/" in server else self._target(server)
-        hearer = None if progress is False else hearer_of(progress, owner._actor)
-        loaded = way(target, encode(request), parent_id, on_status, limit_s, hearer)
-        if codec is None:
-            return loaded
-        return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
-
-    @overload
-    async def load_async(
-        self,
-        server: Declared[Request, Any, Response],
-        request: Request,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-    ) -> Query[Response]: ...
-    @overload
-    async def load_async(
-        self,
-        server: str,
-        request: object,
-        *,
-        response_type: type[Response] | None = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-    ) -> Query[Response]: ...
-
-    async def load_async(
-        self,
-        server: str | Declared[Any, Any, Any],
-        request: Any,
-        *,
-        response_type: Any = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-    ) -> Query[Any]:
-        """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
-        codec = None if response_type is None else codec_for(response_type)
-        limit_s = time_limit(timeout_s)
-        on_status = status_callback(on_status, "load")
-        owner, parent_id = self._holder(parent)
-        target = self._target(server)
-        hearer = hearer_of(progress, owner._actor)
-        query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s, hearer)
-        return query if codec is None else read_as(query, codec)
-
-    def _warn_in_event_loop(self, called: str, instead: str) -> None:
-        """Warn once for each registrar that a call blocks the event loop of the calling thread.
-
-        A notebook runs each cell on its kernel's event loop, which has nothing else to do.
-        """
-        if self._warned_in_event_loop or "ipykernel" in sys.modules:
-            return
-        if not self._node.dispatcher.may_block():  # a callback that is a coroutine: the call is refused
-            return
-        self._warned_in_event_loop = True
-        text = f"{called}() blocks the event loop that runs in this thread until it returns"
-        warnings.warn(f"registrar {self.name!r}: {text}: write `await {instead}(...)`", RuntimeWarning, stacklevel=3)
+    # -- for the calls that load -----------------------------------------------------------------------------------
 
     def _target(self, server: object) -> ServerId:
         return server_target(server, self._node)
 
-    def load_all(
-        self,
-        requests: Iterable[tuple[str, Any]],
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-    ) -> Queries:
-        """Load several resources at once, and hold all of them or none::
+    def _check_open(self) -> None:
+        if self._actor.closed:
+            raise self._actor.down()
 
-            with app.load_all([("cameras/camera", "front"), ("maps/map", "hall")]) as (camera, map):
-                ...
+    def _may_block(self) -> bool:
+        return self._node.dispatcher.may_block()
 
-        Args:
-            requests: one ("registrar/server", request) for each load.
-            on_status, parent: as for load(), for each load.
-            timeout_s: seconds that each load may take. None: no limit.
-
-        Returns:
-            The queries, in the order of the requests: a tuple, and a context manager that unloads them.
-
-        Raises:
-            The first error of a load, with a note that names its request. Everything that was held is released.
-        """
-        if asyncio._get_running_loop() is not None:
-            self._warn_in_event_loop("load_all", "load_all_async")
-        return self._group(requests, on_status, timeout_s, parent).wait()
-
-    async def load_all_async(
-        self,
-        requests: Iterable[tuple[str, Any]],
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-    ) -> Queries:
-        """Load as load_all() does, awaited. If it is cancelled, all loads are released or withdrawn."""
-        return await self._group(requests, on_status, timeout_s, parent).result()
-
-    def _group(self, requests: Any, on_status: Any, timeout_s: Any, parent: Any) -> Group:
-        """Return a group of loads that has not begun, with its arguments checked."""
-        asked = wanted(requests, self._target)
-        limit_s = time_limit(timeout_s)
-        on_status = status_callback(on_status, "load_all")
-        owner, parent_id = self._holder(parent)
-        return Group(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
-
-    def _holder(self, parent: Any) -> tuple[Registrar, str]:
+    def _holder(self, parent: Parent | None) -> tuple[Consumer, str]:
         """Return the registrar that holds the next load, and the id of its resource that needs it; "" for none.
 
         Without `parent`, in a callback of this system, these are the callback's own.
         """
-        context: Any = parent
+        context: object = parent
         if context is None:
-            context = current_or_none()
-            if context is None or serving(context).node is not self._node:
+            current = current_or_none()
+            if current is None or serving(current).node is not self._node:
                 return self, ""
+            context = current
         if is_a(context, Current):
-            audience = serving(context).audience
-            return (self if audience is None else audience.holder), context.resource_id
+            return registrar_of(serving(context)) or self, context.resource_id
         if is_a(context, str):
             return self, exact_text(context)
         if is_a(context, ResourceInfo):
@@ -602,115 +822,21 @@ class Registrar:
             return self, context.resource_id
         raise UsageError(f"parent: expected rr.current() or a resource id, got {type(context).__name__}")
 
-    # -- unload --------------------------------------------------------------------------------------------------
+    def _load(
+        self, server: str, request: bytes, parent: str = "", options: LoadOptions = DEFAULTS, *, timeout_s: float | None
+    ) -> Query:
+        """Load with a request's canonical bytes, for another process. In a worker."""
+        limited = replace(options, timeout_s=time_limit(timeout_s))
+        return self._loads.wait(parse_server(server), request, parent, limited)
 
-    @overload
-    def unload(
-        self,
-        query_or_id: Query | ResourceInfo | str,
-        *,
-        force: bool = False,
-        timeout_s: float | None = 30.0,
-        block: Literal[True] = True,
-    ) -> None: ...
-    @overload
-    def unload(
-        self,
-        query_or_id: Query | ResourceInfo | str,
-        *,
-        force: bool = False,
-        timeout_s: float | None = 30.0,
-        block: Literal[False],
-    ) -> pykka.Future[None]: ...
-    @overload
-    def unload(
-        self,
-        query_or_id: Query | ResourceInfo | str,
-        *,
-        force: bool = False,
-        timeout_s: float | None = 30.0,
-        block: bool,
-    ) -> pykka.Future[None] | None: ...
+    def _load_all(
+        self, requests: Sequence[LoadWanted], parent: str, options: LoadOptions, *, timeout_s: float | None
+    ) -> Queries:
+        """Load all or none, for another process. In a worker."""
+        return self._group(requests, parent, replace(options, timeout_s=time_limit(timeout_s))).wait()
 
-    def unload(
-        self,
-        query_or_id: Query | ResourceInfo | str,
-        *,
-        force: bool = False,
-        timeout_s: float | None = 30.0,
-        block: bool = True,
-    ) -> Any:
-        """Release a query. Return when the unload callback has run, or at once if others hold the resource.
-
-        Args:
-            query_or_id: a query of this registrar, or its id. With `force`: a resource served here, a query on it, or
-                the id of either.
-            force: unload the resource although it is held. Its holders hear FATAL.
-            timeout_s: seconds to wait for a provider that is down. None: no limit.
-            block: False returns a Pykka future at once.
-
-        Raises:
-            UnknownQuery: this registrar never held the query, or has unloaded it already.
-            NotHolder: another registrar holds the query.
-            UnloadFailed: the unload callback raised. The query is still held, and can be unloaded again.
-            UsageError: with `force`, a callback of that resource made the call, and would wait for itself.
-            Unavailable: the provider did not come back in time. The release is owed, on disk, until it does.
-        """
-        self._calls.check_open()
-        limit_s = time_limit(timeout_s)
-        query_id = target_id(query_or_id)
-        unloads = self._unloads
-        if force:
-            return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
-        if is_a(query_or_id, Query) and query_or_id.origin != self.name:
-            raise error_of(failures.not_holder(query_id, query_or_id.origin, self.name))
-        return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
-
-    async def unload_async(
-        self, query_or_id: Query | ResourceInfo | str, *, force: bool = False, timeout_s: float | None = 30.0
-    ) -> None:
-        """Release a query as unload() does, awaited. If it is cancelled, the unload goes on."""
-        await self.unload(query_or_id, force=force, timeout_s=timeout_s, block=False)
-
-    @overload
-    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
-    @overload
-    def unload_client(
-        self, server: str, *, timeout_s: float | None = 30.0, block: Literal[False]
-    ) -> pykka.Future[None]: ...
-    @overload
-    def unload_client(
-        self, server: str, *, timeout_s: float | None = 30.0, block: bool
-    ) -> pykka.Future[None] | None: ...
-
-    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        """Release everything that this registrar holds at one server ("registrar/server"), newest first.
-
-        Raises:
-            InvalidName: `server` does not have that form.
-            UnknownServer: this registrar holds nothing there and never did. `.known` has the servers where it does.
-            The errors of unload(), after all queries have been tried.
-        """
-        self._calls.check_open()
-        reply = self._unloads.at_server(self._target(server), time_limit(timeout_s))
-        return reply.get() if block else reply
-
-    @overload
-    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
-    @overload
-    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[False]) -> pykka.Future[None]: ...
-    @overload
-    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool) -> pykka.Future[None] | None: ...
-
-    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        """Release everything that this registrar holds for itself, newest first. Its resources keep their dependencies.
-
-        Raises:
-            The errors of unload(), after all queries have been tried.
-        """
-        self._calls.check_open()
-        reply = self._unloads.many(lambda held: not held.parent, time_limit(timeout_s))
-        return reply.get() if block else reply
+    def _group(self, requests: Sequence[LoadWanted], parent: str, options: LoadOptions) -> GroupWays:
+        return Group(self._loads, self._unloads, requests, parent, options)
 
     # -- looking -------------------------------------------------------------------------------------------------
 
@@ -721,6 +847,41 @@ class Registrar:
     def _queries_now(self) -> list[Query]:
         held = [row for row in self._held_now() if row.hold is Hold.HELD]
         return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
+
+    def fetch_state(self, query_or_id: Query | str) -> str:
+        """Return the state of the last status of a query that this registrar holds: "OK", "WARNING" ...
+
+        Raises:
+            UnknownQuery: the query is not held any more.
+        """
+        return str(self._calls.call(self._held_row, target_id(query_or_id)).state)
+
+    def fetch_priority(self, query_or_id: Query | str) -> int | None:
+        """Return the priority of a query that this registrar holds; None: on standby.
+
+        Raises:
+            UnknownQuery: the query is not held any more.
+        """
+        return priority_of(self._calls.call(self._held_row, target_id(query_or_id)).priority)
+
+    def set_priority(self, query_or_id: Query | str, priority: int | None) -> None:
+        """Give a query that this registrar holds a priority, as `query.priority = 5` does.
+
+        Raises:
+            UnknownQuery: the query is not held any more.
+            UsageError: the priority is neither None nor a whole number from -1000 to 1000, or over `max_priority`.
+        """
+        id, given = target_id(query_or_id), checked_priority(priority, "set_priority")
+        check_allowed(given, self._actor.config)
+        number = STANDBY if given is None else given
+        self._calls.command(lambda ticket: c.SetPriority(id, number, ticket), f"the priority of {shortened(id)}")
+
+    def _held_row(self, id: str) -> Held:
+        with self._actor.enter():
+            row = self._actor.whole().held.get(id)
+        if row is None or row.hold is Hold.OWED:
+            raise UnknownQuery(f"query {shortened(id)}: {self.name} does not hold it any more", query_id=id)
+        return row
 
     def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
         """Ask a provider for all queries that this registrar holds there, as the provider's catalog has them.
@@ -744,7 +905,7 @@ class Registrar:
 
     def _fetched_view(self, registrar: str, row: FetchedQuery) -> Query:
         place = (registrar, row.server, row.request, row.response, row.resource_id, row.parent, row.attempt, row.seq)
-        held = Held(row.query_id, *place, Hold.HELD, State(row.state))
+        held = Held(row.query_id, *place, Hold.HELD, State(row.state), row.priority, row.own)
         return self._views.seen(held)
 
     def children(self, query: Query | ResourceInfo | str) -> list[Query]:
@@ -765,9 +926,9 @@ class Registrar:
             provider = None if held is None else held.registrar
         if provider in (None, self.name):
             return self._calls.call(self._children_now, id)
-        target, here = resource_target(query), self._node.registrars.get(provider)
-        if here is not None and here.audience is not None:
-            return here.audience.holder.children(target)
+        target, here = resource_target(query), registrar_of(self._node.registrars.get(provider))
+        if here is not None:
+            return here.children(target)
         reply = self._node.handle(provider).call("children", (target,), {})
         return self._calls.finish(reply, CALL_TIMEOUT_S, f"children of {provider!r}")
 
@@ -801,7 +962,62 @@ class Registrar:
         state = str(resource.state if resource.phase is Phase.LOADED else resource.phase)
         facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
         holders, ids = tuple(query.origin for query in queries), tuple(query.id for query in queries)
-        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, ids)
+        priority = priority_of(max((query.priority for query in queries), default=STANDBY))
+        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, ids, priority)
+
+    def usage(self, *, of: Iterable[str] | None = None, timeout_s: float = 5.0) -> Usages:
+        """Return what each loaded resource served here uses now, as the usage callback of its server says.
+
+        A resource of a server without a usage callback is not in it. Nothing is stored.
+
+        Args:
+            of: the ids of the resources to ask; None: all.
+            timeout_s: seconds that all callbacks together may take. One that has not returned by then is named in
+                `failures`; it goes on, and does not begin again for that resource until it has returned.
+
+        Returns:
+            A dict, by resource id, of dicts of numbers. `.failures` says, by resource id, why a usage is not known: a
+            callback that raises, hangs, or returns something else than finite numbers holds up no other.
+
+        Raises:
+            UsageError: a usage callback of this registrar made the call, or the call would hang in this thread; or an
+                argument is wrong.
+        """
+        limit_s, wanted = time_limit(timeout_s), _wanted_ids(of)
+        if limit_s is None:
+            raise UsageError(f"usage: timeout_s: expected seconds, 0 or more, got {shown(timeout_s)}")
+        check_not_measuring(self._actor)
+        self._calls.dispatcher.check_may_block("usage()")
+        ended = self._measured(wanted, limit_s)
+        found = {id: numbers for id, numbers in ended.items() if isinstance(numbers, dict)}
+        return Usages(found, {id: why for id, why in ended.items() if isinstance(why, str)})
+
+    def _measured(self, wanted: frozenset[str] | None, limit_s: float) -> dict[str, Measured]:
+        """Run the usage callbacks, and return what they have said within the limit."""
+        deadline = time.monotonic() + limit_s
+        asked = self._calls.call(self._measured_now, wanted)
+        begun: dict[str, Future[Measured]] = {}
+        while len(begun) < len(asked) and (left_s := deadline - time.monotonic()) > 0:
+            some = self._calls.call(_begun, asked[len(begun) : len(begun) + _AT_ONCE])
+            begun |= some
+            wait(some.values(), left_s if len(begun) == len(asked) else min(_PATIENCE_S, left_s))
+        wait(begun.values(), max(0.0, deadline - time.monotonic()))
+        ended: dict[str, Measured] = {}
+        for resource, server in asked:
+            future, late = begun.get(resource.id), f"{server.origin}: usage: not returned within {limit_s:g} s"
+            ended[resource.id] = late if future is None or not future.done() else future.result()
+        return ended
+
+    def _measured_now(self, wanted: frozenset[str] | None) -> list[tuple[Resource, ServerActor]]:
+        """Return the loaded resources, with their servers, of which the usage can be asked."""
+        with self._actor.enter():
+            rows = self._actor.whole().resources
+            chosen = rows.values() if wanted is None else [rows[id] for id in wanted if id in rows]
+            loaded = [
+                row for row in chosen if row.phase in (Phase.LOADED, Phase.PAUSED) and row.state is not State.FATAL
+            ]
+        served = [(row, self._actor.servers.get(row.server)) for row in loaded]
+        return [(row, server) for row, server in served if server is not None and server.spec.usage is not None]
 
     def clients(self) -> list[str]:
         """Return the servers ("registrar/server") where this registrar holds something."""
@@ -812,33 +1028,42 @@ class Registrar:
         with self._actor.enter():
             return list(self._actor.whole().held.values())
 
+    def _unsettled_now(self) -> tuple[int, list[Held]]:
+        """Return the number of all rows, and the rows that are pending or owed."""
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            return len(catalog.held), [catalog.held[id] for id in catalog.unsettled]
+
     def servers(self) -> list[str]:
         """Return the servers registered here, as "registrar/server"."""
         return sorted(f"{self.name}/{name}" for name in self._calls.call(self._actor.servers.names))
 
     def owed(self) -> list[str]:
         """Return the ids of released queries whose provider does not know it yet."""
-        return [row.id for row in self._calls.call(self._held_now) if row.hold is Hold.OWED]
+        return [row.id for row in self._calls.call(self._unsettled_now)[1] if row.hold is Hold.OWED]
 
     def stats(self) -> dict[str, int]:
         """Return counts of the present, and of events since the registrar was opened.
 
         Present: resources, queries held, releases owed, loads and unloads in flight, notices, and messages that wait
-        for a decision ("mailbox"). Events: commits, and status and progress callbacks that raised. While a recording
-        runs, commits are timed: "timed_commits" of them took "commit_us" microseconds.
+        for a decision ("mailbox"). "unheard": statuses that this registrar has not dealt with. Events: commits, and
+        status and progress callbacks that raised. While a recording runs, commits are timed: "timed_commits" of them
+        took "commit_us" microseconds.
         """
         return self._calls.call(self._stats_now)
 
     def _stats_now(self) -> dict[str, int]:
         actor = self._actor
-        holds = [row.hold for row in self._held_now()]
+        rows, unsettled = self._unsettled_now()
+        owed = sum(row.hold is Hold.OWED for row in unsettled)
         return {
             "resources": len(actor.catalog.resources),
-            "queries": holds.count(Hold.HELD),
-            "owed": holds.count(Hold.OWED),
-            "loading": holds.count(Hold.PENDING) + len(actor.catalog.in_flight),
+            "queries": rows - len(unsettled),
+            "owed": owed,
+            "loading": len(unsettled) - owed + len(actor.catalog.in_flight),
             "unloading": len(actor.unloads),
             "notices": len(actor.catalog.notices),
+            "unheard": len(actor.catalog.hearing),
             "callback_failures": actor.callback_failures,
             "mailbox": len(actor.waiting),
             **actor.commit_counts(),
@@ -856,10 +1081,7 @@ class Registrar:
         As in a load's `on_status`, `status.handled()` stops the status from going further up.
         """
         key = str(self._target(server))
-        own = status_callback(callback, "on_status", "callback")
-        if own is None:
-            raise UsageError("on_status: callback: expected a callable, got None")
-        self._calls.call(self._views.listen_to_server, key, own)
+        self._calls.call(self._views.listen_to_server, key, checked_callback(callback))
 
     # -- the catalog ---------------------------------------------------------------------------------------------
 
@@ -883,7 +1105,7 @@ class Registrar:
         """
         self._calls.dispatcher.check_may_block("load_catalog()")
         self._calls.call(self._actor.reload_catalog)
-        self._calls.dispatcher.run(self._actor.node.settle(self._actor))
+        self._calls.dispatcher.run(self._node.settle(self._actor))
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
         """Release everything held, unload everything served, and leave the system. A second close does nothing.
@@ -893,27 +1115,35 @@ class Registrar:
                 for itself. Nothing is closed.
         """
         limit_s = time_limit(timeout_s)
-        node = self._actor.node
         if self._actor.closed:
             return
         instead = "start a thread for it, and let the callback return"
         check_not_own(f"registrar {self.name!r}: close()", lambda me: serving(me) is self._actor, instead)
-        node.dispatcher.run(node.dismiss(self.name, limit_s))
+        self._calls.dispatcher.run(self._node.dismiss(self.name, limit_s))
+
+
+def _begun(some: list[tuple[Resource, ServerActor]]) -> dict[str, Future[Measured]]:
+    return {row.id: server.measure(row) for row, server in some}
+
+
+def _wanted_ids(of: object) -> frozenset[str] | None:
+    if of is None:
+        return None
+    if is_a(of, str) or not is_a(of, Iterable):
+        raise UsageError(f"usage: of: expected ids of resources, got {shown(of)} ({type(of).__name__})")
+    ids = cast("Iterable[object]", of)
+    return frozenset(check_text(id, "usage: of: expected the id of a resource") for id in ids)
 
 
 # For the package's own modules. As a private method it stays out of an editor's list of names.
 register_spec = Registrar._register_spec  # pyright: ignore[reportPrivateUsage]  # same file
+load_bytes = Registrar._load  # pyright: ignore[reportPrivateUsage]  # same file
 
 
-def load_bytes(registrar: Registrar, server: str, request: bytes, timeout_s: float | None) -> tuple[Query[Any], bytes]:
-    """Load with a request's canonical bytes, and return the query and its response's bytes.
-
-    Raises:
-        LoadError: the load failed, as in Registrar.load().
-    """
-    wait = registrar._loads.wait  # pyright: ignore[reportPrivateUsage]  # same file
-    query = wait(parse_server(server), request, "", None, time_limit(timeout_s))
-    return query, response_bytes(query)
+def news(registrar: Registrar, query_id: str) -> tuple[bytes | None, bool]:
+    """Return the newest response of a query, as canonical bytes, and whether the query is not held any more."""
+    query = registrar._views.known(query_id)  # pyright: ignore[reportPrivateUsage]  # same file
+    return (None, True) if query is None else (response_bytes(query), query.released)
 
 
 def page(registrar: Registrar, wanted: Wanted) -> Page:
@@ -923,3 +1153,9 @@ def page(registrar: Registrar, wanted: Wanted) -> Page:
         RegistrarDown: the registrar is closed, or does not run.
     """
     return registrar._page(wanted)  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def registrar_of(actor: RegistrarBase | None) -> Registrar | None:
+    """Return the Registrar that users call, for its actor; None if there is none."""
+    holder = None if actor is None or actor.audience is None else actor.audience.holder
+    return holder if isinstance(holder, Registrar) else None

@@ -1,30 +1,339 @@
-"""RegistrarHandle: a registrar of another process, to be used like one of this process."""
+"""Registrars that another process has: how they are called from here.
+
+RemoteLoads and RemoteUnloads wait, withdraw and release in one way for all of them. A subclass of RemoteCalls carries
+the calls: a handle's to a registrar of the same system, a client's (system/console/connected_client.py) to the system
+that it has connected to.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import abc
 import functools
 import inspect
-from collections.abc import Callable, Iterable
-from typing import Any
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar, cast
 
 import pykka
+from msgspec.structs import replace
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
-from rr_actors.base.errors import RrError, Unavailable, UsageError, is_a
-from rr_actors.registrar.arguments import codec_for
-from rr_actors.registrar.engine.server import ServerSpec, log_unread_types
-from rr_actors.registrar.load_groups import Queries, iterated
-from rr_actors.registrar.progress_hearers import ProgressWanted
-from rr_actors.registrar.queries import Query, held_by, read_as
-from rr_actors.registrar.registrar import Registrar, StatusCallback
+from rr_actors.base.errors import RegistrarDown, RrError, Unavailable, UnknownQuery, UsageError, is_a
+from rr_actors.base.names import ServerId
+from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.arguments import LoadOptions
+from rr_actors.registrar.engine.node import Node
+from rr_actors.registrar.engine.server import ROLES, ServerSpec, log_unread_types
+from rr_actors.registrar.links.remote_calls import HandleLine
+from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries
+from rr_actors.registrar.queries import Holder, Query, held_by, read_as
+from rr_actors.registrar.registrar import Registrar
 from rr_actors.runtime.time_limits import time_limit
-from rr_actors.system.hosting.node import Node
-from rr_actors.system.hosting.remote_calls import METHODS, HandleLine
 
+logger = Log("rr_actors.registrar")
+
+T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
+
+CALL_TIMEOUT_S = 30.0
 _GRACE_S = 10.0
+
+
+# -- every registrar of another process --------------------------------------------------------------------------------
+
+
+class RemoteCalls(abc.ABC):
+    """The calls to one registrar of another process. From any thread."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @abc.abstractmethod
+    def send(self, reply: Reply[Any], method: str, *args: Any, **options: Any) -> None:
+        """Have the other process call a method of the registrar. `reply` gets the result, or the error.
+
+        Raises:
+            NotSerializable: an argument cannot travel.
+        """
+
+    def ask(self, method: str, *args: Any, **options: Any) -> Any:
+        """Call a method as send() does, and return its result."""
+        reply: Reply[Any] = Reply()
+        self.send(reply, method, *args, **options)
+        return self.finish(reply, time_limit(options.get("timeout_s", CALL_TIMEOUT_S)))
+
+    def finish(self, reply: Reply[T], timeout_s: float | None) -> T:
+        """Return the result of a call. The other process ends an overdue call; the thread waits a little longer."""
+        try:
+            return reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S)
+        except pykka.Timeout:
+            raise Unavailable(f"registrar {self.name!r}: no answer within {timeout_s:g} s{self.paused()}") from None
+
+    def paused(self) -> str:
+        """Return words, "; it is ...", for an error if a signal has stopped the registrar's process; "" else."""
+        return ""
+
+
+class _Begun(Reply[T]):
+    """A load by the other process, or all loads of a group: the future of the queries. cancel() withdraws it.
+
+    Args:
+        send: has the other process load. The reply that it is given gets the queries, or the error.
+        own: returns what has arrived, made queries of this process's registrar object.
+    """
+
+    def __init__(self, loads: RemoteLoads, send: Callable[[Reply[T]], None], own: Callable[[T], T]) -> None:
+        super().__init__()
+        self._loads = loads
+        self._send = send
+        self._own = own
+        self._sent: Reply[T] = Reply()
+        self.withdraw = self.give_up
+
+    def begin(self) -> Reply[T]:
+        """Send the call, and return this future."""
+        try:
+            self._begin()
+        except BaseException as error:  # also KeyboardInterrupt: the caller never gets the future
+            self._failed(error)
+            raise
+        return self
+
+    def wait(self, timeout_s: float | None) -> T:
+        """Return the queries, within the time limit of the call."""
+        try:
+            self._begin()
+            return self._loads.calls.finish(self, timeout_s)
+        except BaseException as error:  # also KeyboardInterrupt: the caller never gets the queries
+            self._failed(error)
+            raise
+
+    async def awaited(self) -> T:
+        """Return the queries, awaited on any event loop. If that is cancelled, release them."""
+        try:
+            self._begin()
+            return await self
+        except BaseException as error:  # also KeyboardInterrupt, which may come anywhere
+            self._failed(error)
+            raise
+
+    def unawaited(self) -> None:
+        """Withdraw the load, or release the queries, which nobody has got."""
+        if not self.cancel():
+            self.give_up()
+
+    def give_up(self) -> None:
+        """Release what is loaded, now or later, as no caller waits for it any more."""
+        self._sent.when_set(lambda: self._loads.release_later(self._sent))
+
+    def _begin(self) -> None:
+        self._send(self._sent)
+        self._sent.when_set(lambda: self.set_unopened(lambda: self._own(self._sent.get())))
+
+    def _failed(self, error: BaseException) -> None:
+        if not (self.done() and isinstance(error, RrError)):  # else nothing is held
+            self.unawaited()
+
+
+class RemoteLoads(abc.ABC):
+    """The loads of a registrar that another process has. From any thread."""
+
+    def __init__(self, calls: RemoteCalls, holder: Holder) -> None:
+        self.calls = calls
+        self.holder = holder
+
+    @abc.abstractmethod
+    def send_load(
+        self, reply: Reply[Query], target: ServerId, request: bytes, parent: str, options: LoadOptions
+    ) -> None:
+        """Have the other process load. `reply` gets the query, or the error."""
+
+    @abc.abstractmethod
+    def send_all(
+        self, reply: Reply[Queries], requests: Sequence[LoadWanted], parent: str, options: LoadOptions
+    ) -> None:
+        """Have the other process load all requests, or none. `reply` gets the queries, or the error."""
+
+    def own(self, query: Query, options: LoadOptions) -> Query:
+        """Make a query that has arrived one of this process's registrar object."""
+        return query if options.codec is None else read_as(query, options.codec)
+
+    def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Reply[Query]:
+        """Begin a load, and return the future of its query at once."""
+        return self._begun(target, request, parent, options).begin()
+
+    def wait(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
+        """Load a resource, and return its query when the resource is held."""
+        return self._begun(target, request, parent, options).wait(options.timeout_s)
+
+    async def awaited(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
+        """Load a resource, awaited on any event loop. If it is cancelled, the load is withdrawn."""
+        return await self._begun(target, request, parent, options).awaited()
+
+    def _begun(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> _Begun[Query]:
+        self.check(options)
+        send = functools.partial(self.send_load, target=target, request=request, parent=parent, options=options)
+        return _Begun(self, send, functools.partial(self.own, options=options))
+
+    def check(self, options: LoadOptions) -> None:
+        """Raise UsageError for an option that has no meaning in this process."""
+        if options.progress is not False and options.progress is not None:
+            text = "progress is heard only in the process that holds the query: load by a registrar of this process"
+            raise UsageError(f"registrar {self.calls.name!r}: {text} (system.open_registrar)")
+
+    def release_later(self, sent: Reply[Any]) -> None:
+        """Release the queries of a call that no caller waits for, in a thread of its own: this one may be the loop."""
+        threading.Thread(target=self._release, args=(sent,), name="rr-undo").start()
+
+    def _release(self, sent: Reply[Any]) -> None:
+        try:
+            got = sent.get()
+        except Exception:
+            return  # nothing is held
+        for query in got if isinstance(got, Queries) else (got,):
+            self.release(query)
+
+    def release(self, query: Query) -> None:
+        """Release a query for which no caller waits."""
+        try:
+            self.calls.ask("unload", query.id, timeout_s=CALL_TIMEOUT_S)
+        except (Unavailable, RegistrarDown, UnknownQuery):
+            logger.debug("%r: it is released already, or its registrar has ended", query)
+        except RrError:
+            logger.exception("%r: its load was cancelled, and it is not released", query)
+
+
+class RemoteGroup:
+    """The loads of one load_all() by a registrar that another process has."""
+
+    def __init__(self, loads: RemoteLoads, requests: Sequence[LoadWanted], parent: str, options: LoadOptions) -> None:
+        self._loads = loads
+        self._call = requests, parent, options
+        self._options = options
+
+    def _begun(self) -> _Begun[Queries]:
+        self._loads.check(self._options)
+        return _Begun(self._loads, lambda sent: self._loads.send_all(sent, *self._call), self._own)
+
+    def _own(self, queries: Queries) -> Queries:
+        return Queries(self._loads.own(query, self._options) for query in queries)
+
+    def wait(self) -> Queries:
+        """Load all requests, and return their queries when all are held."""
+        return self._begun().wait(self._options.timeout_s)
+
+    async def awaited(self) -> Queries:
+        """Load all requests, awaited on any event loop. If it is cancelled, all queries are released."""
+        return await self._begun().awaited()
+
+
+class RemoteUnloads:
+    """The unloads of a registrar that another process has. From any thread."""
+
+    def __init__(self, calls: RemoteCalls) -> None:
+        self._calls = calls
+
+    def begin(self, query_id: str, timeout_s: float | None) -> Reply[None]:
+        """Begin to release a query, and return a future of its end at once."""
+        return self._begun("unload", query_id, timeout_s=timeout_s)
+
+    def wait(self, query_id: str, timeout_s: float | None) -> None:
+        """Release a query, and return when that is done."""
+        self._calls.ask("unload", query_id, timeout_s=timeout_s)
+
+    def force_begin(self, target: str, timeout_s: float | None) -> Reply[None]:
+        """Begin to unload a resource that the registrar serves, even if it is held."""
+        return self._begun("unload", target, force=True, timeout_s=timeout_s)
+
+    def force_wait(self, target: str, timeout_s: float | None) -> None:
+        """Unload a resource that the registrar serves, even if it is held, and return when that is done."""
+        self._calls.ask("unload", target, force=True, timeout_s=timeout_s)
+
+    def begin_all(self, server: ServerId | None, timeout_s: float | None) -> Reply[None]:
+        """Begin to release all queries at a server, or, for None, all that the registrar holds for itself."""
+        method, args = _all_at(server)
+        return self._begun(method, *args, timeout_s=timeout_s)
+
+    def wait_all(self, server: ServerId | None, timeout_s: float | None) -> None:
+        """Release as begin_all() does, and return when all have been tried."""
+        method, args = _all_at(server)
+        self._calls.ask(method, *args, timeout_s=timeout_s)
+
+    def _begun(self, method: str, *args: Any, **options: Any) -> Reply[None]:
+        reply: Reply[None] = Reply()
+        self._calls.send(reply, method, *args, **options)
+        return reply
+
+
+def _all_at(server: ServerId | None) -> tuple[str, tuple[str, ...]]:
+    return ("unload_all", ()) if server is None else ("unload_client", (str(server),))
+
+
+# -- a registrar of the same system ------------------------------------------------------------------------------------
+
+
+class HandleCalls(RemoteCalls):
+    """The calls of a handle. Arguments and results travel by cloudpickle.
+
+    Args:
+        patient: whether a call waits for a registrar that is being started or respawned.
+    """
+
+    def __init__(self, line: HandleLine, name: str, *, patient: bool) -> None:
+        super().__init__(name)
+        self._line = line
+        self._patient = patient
+
+    def send(self, reply: Reply[Any], method: str, *args: Any, **options: Any) -> None:
+        """Have a worker of the other process call the method."""
+        limit_s = time_limit(options.get("timeout_s", CALL_TIMEOUT_S))
+        self._line.call(method, args, options, limit_s if self._patient else 0.0, reply)
+
+    def paused(self) -> str:
+        """Return words, "; it is ...", for an error if a signal has stopped the registrar's process; "" else."""
+        return self._line.paused()
+
+
+class HandleLoads(RemoteLoads):
+    """The loads of a handle. The other process runs `on_status`."""
+
+    def send_load(
+        self, reply: Reply[Query], target: ServerId, request: bytes, parent: str, options: LoadOptions
+    ) -> None:
+        """Have the other process load."""
+        there = _without_own(options)
+        self.calls.send(reply, "_load", str(target), request, parent, there, timeout_s=options.timeout_s)
+
+    def send_all(
+        self, reply: Reply[Queries], requests: Sequence[LoadWanted], parent: str, options: LoadOptions
+    ) -> None:
+        """Have the other process load all requests."""
+        there = _without_own(options)
+        self.calls.send(reply, "_load_all", list(requests), parent, there, timeout_s=options.timeout_s)
+
+    def own(self, query: Query, options: LoadOptions) -> Query:
+        """Have the handle unload the query."""
+        return super().own(held_by(query, self.holder), options)
+
+
+def _without_own(options: LoadOptions) -> LoadOptions:
+    """Return the options without those that have their effect in this process."""
+    return replace(options, codec=None, parent=None, loop=None)
+
+
+def _called_there(method: F) -> F:
+    """Return a method for RegistrarHandle that has a method of Registrar called in the registrar's process."""
+    signature = inspect.signature(method)
+
+    @functools.wraps(method)
+    def call(self: RegistrarHandle, *args: Any, **options: Any) -> Any:
+        bound = signature.bind(self, *args, **options)
+        bound.apply_defaults()  # sent, too: while a call waits to be sent, its timeout_s gets less
+        return self._ask(method.__name__, *bound.args[1:], **bound.kwargs)  # pyright: ignore[reportPrivateUsage]  # same file
+
+    return cast("F", call)
 
 
 class RegistrarHandle(Registrar):
@@ -34,8 +343,9 @@ class RegistrarHandle(Registrar):
     `patient=False` it raises RegistrarDown at once. If the process dies during a call that changes nothing, the call is
     made again. Any other call then raises RegistrarDown: whether it was done is not known.
 
-    That registrar holds what the handle loads. Callbacks travel to its process by cloudpickle, and run there. Its
-    catalog keeps a server that is registered through the handle, so that a respawn restores the server.
+    That registrar holds what the handle loads; in a callback, the callback's own registrar does. Callbacks travel to
+    its process by cloudpickle, and run there. Its catalog keeps a server that is registered through the handle, so that
+    a respawn restores the server.
     """
 
     def __init__(  # pyright: ignore[reportMissingSuperCall] - nothing in common
@@ -44,8 +354,12 @@ class RegistrarHandle(Registrar):
         self._owner = owner  # kept alive while this handle is in use
         self._node = node
         self._name = name
-        self._patient = patient
-        self._line: HandleLine = node.handle(name)
+        self._far = HandleCalls(node.handle(name), name, patient=patient)
+        self._unload_ways = RemoteUnloads(self._far)
+
+    @property
+    def _load_ways(self) -> HandleLoads:
+        return HandleLoads(self._far, self)  # not kept: it would be a cycle
 
     @property
     def name(self) -> str:
@@ -60,124 +374,18 @@ class RegistrarHandle(Registrar):
     def __repr__(self) -> str:
         return f"<Registrar {self._name} (handle)>"
 
+    def _check_open(self) -> None:
+        """Do nothing: the other process knows whether the registrar is open."""
+
+    def _group(self, requests: Sequence[LoadWanted], parent: str, options: LoadOptions) -> GroupWays:
+        return RemoteGroup(self._load_ways, requests, parent, options)
+
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server in the other process from its checked spec; a respawn restores it."""
         log_unread_types(spec, f"{self.name}/{spec.name}")
-        for role in ("load", "unload", "status", "recover"):
+        for role in ROLES:
             pickling.dumps(getattr(spec, role), f"{role} callback")  # its error names the callback that cannot travel
         self._register_stored(pickling.dumps(spec, f"server {spec.name!r}"))
-
-    def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
-        self,
-        server: Any,
-        request: Any,
-        *,
-        response_type: Any = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: bool = True,
-    ) -> Any:
-        """Load as Registrar.load() does. That registrar holds the resource, and its process runs `on_status`.
-
-        In a callback, the callback's own registrar holds the resource, as with any other registrar.
-
-        Raises:
-            UsageError: `progress` is given outside of a callback: only a registrar of this process can hear it.
-        """
-        limit_s = time_limit(timeout_s)
-        target = str(self._target(server))
-        owner, parent = self._holder(parent)
-        if owner is not self:  # in a callback
-            options: dict[str, Any] = {"response_type": response_type, "on_status": on_status, "timeout_s": limit_s}
-            return owner.load(target, request, **options, parent=parent, progress=progress, block=block)
-        if progress is not False and progress is not None:
-            text = "progress is heard only in the process that holds the query: load by a registrar of this process"
-            raise UsageError(f"registrar {self.name!r}: {text} (system.open_registrar)")
-        codec = None if response_type is None else codec_for(response_type)
-        reply: Reply[Query] = Reply()
-
-        def own(query: Query) -> Query:
-            return held_by(query, self) if codec is None else read_as(held_by(query, self), codec)
-
-        try:
-            self._begin(reply, "load", target, request, on_status=on_status, timeout_s=limit_s, parent=parent)
-            if block:
-                return own(self._finish(reply, limit_s))
-            owned: Reply[Query] = Reply()
-            owned.withdraw = lambda: self._withdraw(reply)
-            reply.add_done_callback(lambda reply: owned.set_unopened(lambda: own(reply.get())))
-            return owned
-        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
-            self._withdraw(reply)
-            raise
-
-    async def load_async(  # pyright: ignore[reportIncompatibleMethodOverride] - as load()
-        self,
-        server: Any,
-        request: Any,
-        *,
-        response_type: Any = None,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-    ) -> Any:
-        """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
-        options: dict[str, Any] = {"response_type": response_type, "on_status": on_status, "timeout_s": timeout_s}
-        owner, parent = self._holder(parent)
-        if owner is not self:
-            target = str(self._target(server))
-            return await owner.load_async(target, request, **options, parent=parent, progress=progress)
-        reply: Reply[Query] = self.load(server, request, **options, parent=parent, progress=progress, block=False)
-        try:
-            return await reply
-        except BaseException:  # cancelled, or KeyboardInterrupt: the caller never gets the query
-            self._withdraw(reply)
-            raise
-
-    def load_all(
-        self,
-        requests: Iterable[tuple[str, Any]],
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-    ) -> Queries:
-        """Load as Registrar.load_all() does. That registrar holds the resources."""
-        owner, parent = self._holder(parent)
-        if owner is not self:
-            return owner.load_all(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
-        requests = list(iterated(requests))
-        reply: Reply[Queries] = Reply()
-        try:
-            options: dict[str, Any] = {"on_status": on_status, "timeout_s": timeout_s, "parent": parent}
-            return self._own(self._finish(reply, self._begin(reply, "load_all", requests, **options)))
-        except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries
-            self._withdraw(reply)
-            raise
-
-    async def load_all_async(
-        self,
-        requests: Iterable[tuple[str, Any]],
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-    ) -> Queries:
-        """Load as load_all() does, awaited. If it is cancelled, all queries are released."""
-        owner, parent = self._holder(parent)
-        if owner is not self:
-            return await owner.load_all_async(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
-        requests = list(iterated(requests))
-        reply: Reply[Queries] = Reply()
-        try:
-            self._begin(reply, "load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
-            return self._own(await reply)
-        except BaseException:  # cancelled, or KeyboardInterrupt: the caller never gets the queries
-            self._withdraw(reply)
-            raise
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
         """Refuse to close: a manager's registrar lives as long as its manager.
@@ -187,65 +395,33 @@ class RegistrarHandle(Registrar):
         """
         raise UsageError(f"registrar {self._name!r}: a handle cannot close it; stop its manager instead")
 
-    # -- calling -------------------------------------------------------------------------------------------------
-
-    def _ask(self, method: str, *args: Any, block: bool = True, **options: Any) -> Any:
-        reply: Reply[Any] = Reply()
-        limit_s = self._begin(reply, method, *args, **options)
-        return self._own(self._finish(reply, limit_s)) if block else reply
-
-    def _begin(self, reply: Reply[Any], method: str, *args: Any, **options: Any) -> float | None:
-        """Have the other process call a method, and return for how many seconds the caller may wait for the reply."""
-        limit_s: float | None = 30.0
-        if "timeout_s" in options:
-            limit_s = options["timeout_s"] = time_limit(options["timeout_s"])
-        self._line.call(method, args, options, limit_s if self._patient else 0.0, reply)
-        return limit_s
-
-    def _finish(self, reply: Reply[Any], timeout_s: float | None) -> Any:
-        try:
-            return reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S)
-        except pykka.Timeout:
-            raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
-
-    def _withdraw(self, reply: Reply[Any]) -> None:
-        """Release the queries of a load if it still succeeds, because its caller has gone."""
-
-        def done(reply: Reply[Query]) -> None:
-            with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it
-                self._node.dispatcher.workers.submit(self._release, reply, patient=True)
-
-        reply.add_done_callback(done)
-
-    def _release(self, reply: Reply[Any]) -> None:
-        try:
-            got = reply.get()
-        except RrError:
-            return  # nothing is held
-        for query in got if isinstance(got, Queries) else (got,):
-            self.unload(query, block=False)
-
-    def _own(self, got: Any) -> Any:
-        """Return the result of a call, and make this handle the holder of the queries in it."""
+    def _ask(self, method: str, *args: Any, **options: Any) -> Any:
+        """Call a method there, and make this handle the holder of the queries in its result."""
+        got = self._far.ask(method, *args, **options)
         several: Iterable[Any] = got if issubclass(type(got), (list, tuple)) else ()
         for one in several:
             if is_a(one, Query):
                 held_by(one, self)
         return got
 
-
-def _called_there(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a method for RegistrarHandle that has a method of Registrar called in the registrar's process."""
-    signature = inspect.signature(method)
-
-    @functools.wraps(method)
-    def call(self: RegistrarHandle, *args: Any, **options: Any) -> Any:
-        bound = signature.bind(self, *args, **options)
-        bound.apply_defaults()  # sent, too: while a call waits to be sent, its timeout_s gets less
-        return self._ask(method.__name__, *bound.args[1:], **bound.kwargs)  # pyright: ignore[reportPrivateUsage]  # same file
-
-    return call
-
-
-for _name in METHODS - vars(RegistrarHandle).keys():  # the methods that are not defined above
-    setattr(RegistrarHandle, _name, _called_there(getattr(Registrar, _name)))
+    children = _called_there(Registrar.children)
+    clients = _called_there(Registrar.clients)
+    fetch_priority = _called_there(Registrar.fetch_priority)
+    fetch_queries = _called_there(Registrar.fetch_queries)
+    fetch_state = _called_there(Registrar.fetch_state)
+    load_catalog = _called_there(Registrar.load_catalog)
+    on_status = _called_there(Registrar.on_status)
+    owed = _called_there(Registrar.owed)
+    queries = _called_there(Registrar.queries)
+    resources = _called_there(Registrar.resources)
+    revoke = _called_there(Registrar.revoke)
+    save_catalog = _called_there(Registrar.save_catalog)
+    send_status = _called_there(Registrar.send_status)
+    set_priority = _called_there(Registrar.set_priority)
+    servers = _called_there(Registrar.servers)
+    stats = _called_there(Registrar.stats)
+    unregister_server = _called_there(Registrar.unregister_server)
+    update_response = _called_there(Registrar.update_response)
+    usage = _called_there(Registrar.usage)
+    _page = _called_there(Registrar._page)
+    _register_stored = _called_there(Registrar._register_stored)

@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 from rr_actors.base.errors import UnknownQuery, UsageError
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.base.values.canonical import encode
+from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.engine.server import ServerActor, status_callback_of
 from rr_actors.registrar.engine.status import Status, next_spare
 from rr_actors.registrar.loads import Loads, Unloads
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.rows import Held, Hold, Resource
+from rr_actors.registrar.model.rows import Held, Hold, Resource, priority_of
 from rr_actors.registrar.queries import Query
 
 
@@ -67,7 +68,8 @@ class Replacements:
             spare = self._calls.call(self._views.of, row)
         else:
             id = _spare_id(family, place, raw, next_spare(status))
-            spare = self._loads.wait(place, raw, resource_id, None, timeout_s, query_id=id)
+            options = LoadOptions(timeout_s=timeout_s, priority=priority_of(found.part.priority), own=found.part.own)
+            spare = self._loads.wait(place, raw, resource_id, options, query_id=id)
         self._swap(found, status, spare, family, response)
         status.handled()
         return spare
@@ -98,7 +100,7 @@ class Replacements:
         try:
             raw = None if response is None else encoded_response(response(spare), found.resource, found.server)
         except BaseException:
-            self._unloads.future(spare.id, None)
+            self._unloads.begin(spare.id, None)
             raise
         others = tuple(row.id for row in self._calls.call(self._find, resource.id, "", family).spares)
         rest = tuple(id for id in others if id != spare.id)

@@ -49,6 +49,8 @@ class Backlog(Generic[_T]):
         self._waiting: deque[_T] = deque()
         self._missed = 0
         self._is_running = False
+        self._closed = False
+        self._heard = threading.Event()  # set when the backlog is closed, and all of it has been heard
 
     def put(self, what: _T) -> None:
         """Queue a call of the callback with this item, after all earlier items. Returns at once.
@@ -57,6 +59,8 @@ class Backlog(Generic[_T]):
             Unavailable: the workers are closed.
         """
         with self._lock:
+            if self._closed:
+                return
             if len(self._waiting) >= KEPT:
                 self._missed += len(self._waiting)
                 self._waiting.clear()
@@ -64,6 +68,17 @@ class Backlog(Generic[_T]):
             begins, self._is_running = not self._is_running, True
         if begins:
             self._begin()
+
+    def close(self, wait_s: float = 0.0) -> None:
+        """Take no more items. Wait for those that wait, but not long; drop the others: none of them is heard later."""
+        with self._lock:
+            self._closed = True
+            waits = self._is_running and wait_s > 0
+        if waits:
+            self._heard.wait(wait_s)
+        with self._lock:
+            self._waiting.clear()
+            self._missed = 0
 
     def _begin(self) -> None:
         try:
@@ -83,6 +98,8 @@ class Backlog(Generic[_T]):
                 if missed == 0:
                     if not self._waiting:
                         self._is_running = False
+                        if self._closed:
+                            self._heard.set()
                         return
                     what = self._waiting.popleft()
             try:

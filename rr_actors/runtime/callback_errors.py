@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
-import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
-from rr_actors.base.errors import Unavailable, UsageError, name_of_class, text_of
-from rr_actors.registrar.model.messages import readable
+from rr_actors.base.errors import Described, Unavailable, UsageError, name_of_class, text_of
+from rr_actors.base.reporting import tracebacks
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import trace_of
 from rr_actors.runtime import event_loop
 from rr_actors.runtime.user_loop import closing, is_coroutine
 from rr_actors.runtime.workers import is_async
@@ -34,21 +33,15 @@ def _nothing_more(_error: BaseException) -> None:
     return None
 
 
-class Raised(Exception):
+class Raised(Described):
     """A callback raised.
 
     Attributes:
-        error: the exception itself. Do not examine it on the loop.
-        text: the exception, as "ValueError: no such device".
-        trace: the traceback, as Python prints it.
         details: the result of `describe`.
     """
 
     def __init__(self, error: BaseException, describe: Callable[[BaseException], Any] = _nothing_more) -> None:
-        self.text = readable(text_of(error))
-        super().__init__(self.text)
-        self.error = error
-        self.trace = _trace_of(error)
+        super().__init__(error, text_of(error), trace_of(error))
         self.details = describe(error)
 
 
@@ -76,7 +69,7 @@ def described(
         try:
             return await begin(*args)
         except BaseException as error:  # of any class: it is the callback's error
-            raised = await _raised(error, describe)
+            raised = await described_error(error, describe)
         raise raised from None
 
     def run(*args: Any) -> Any:
@@ -91,8 +84,8 @@ def described(
     return run_async if awaits else run
 
 
-async def _raised(error: BaseException, describe: Callable[[BaseException], Any]) -> Raised:
-    """Describe a coroutine's exception in a worker; by its class alone if its text hangs."""
+async def described_error(error: BaseException, describe: Callable[[BaseException], Any] = _nothing_more) -> Raised:
+    """Describe an exception in a worker, for a coroutine; by its class alone if its text hangs."""
     coming = _described_elsewhere(error, describe)
     await asyncio.wait((asyncio.wrap_future(coming),), timeout=TEXT_LIMIT_S)
     return coming.result() if coming.done() else Raised(_unspoken(error), describe)
@@ -132,16 +125,12 @@ def _unspoken(error: BaseException) -> TimeoutError:
     return TimeoutError(f"{cls} was raised; its str() had not returned after {TEXT_LIMIT_S:g} s")
 
 
-def log_raised(logger: logging.Logger, error: BaseException, message: str, *args: object) -> None:
+def log_raised(logger: Log, error: BaseException, message: str, *args: object) -> None:
     """Log the error of a callback, or this package's error about why the callback did not run."""
-    if type(error) is not Raised:
+    if type(error) is Raised:
+        logger.error(message, *args, exc_info=error.error, trace=error.trace)
+    else:
         logger.error(message, *args, exc_info=error)
-    elif logger.isEnabledFor(logging.ERROR):
-        raised = error.error
-        found = (type(raised), raised, raised.__traceback__)
-        record = logger.makeRecord(logger.name, logging.ERROR, __file__, 0, message, args, found)
-        record.exc_text = error.trace  # so that no handler has to make it
-        logger.handle(record)
 
 
 def traceback_of(error: BaseException) -> str:
@@ -149,14 +138,7 @@ def traceback_of(error: BaseException) -> str:
 
     Of a long one the end is kept, which says most.
     """
-    found = error.__traceback__
+    found = tracebacks.traceback_of(error)
     while found is not None and found.tb_frame.f_code.co_filename.startswith(_PACKAGE):
         found = found.tb_next
-    return "" if found is None else readable(_trace_of(error, found)[-_LONGEST_TRACEBACK:])
-
-
-def _trace_of(error: BaseException, since: TracebackType | None = None) -> str:
-    try:
-        return "".join(traceback.format_exception(type(error), error, since or error.__traceback__)).rstrip()
-    except BaseException as reason:  # from its own __str__, __cause__ ...
-        return f"(its trace is not known: {name_of_class(type(reason))} was raised while it was made)"
+    return "" if found is None else trace_of(error, found)[-_LONGEST_TRACEBACK:]

@@ -10,7 +10,6 @@ import asyncio
 import concurrent.futures
 import contextlib
 import functools
-import logging
 import os
 import threading
 import weakref
@@ -19,13 +18,15 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 from rr_actors.base.errors import Unavailable, UsageError
+from rr_actors.base.reporting import log
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.user_loop import log_exception, start_loop_thread
 from rr_actors.runtime.workers import Workers
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 T = TypeVar("T")
 
@@ -61,6 +62,7 @@ class Dispatcher:
         closing = weakref.finalize(self, os.close, self._bell)
         closing.atexit = False
         self.workers = Workers(self.call, self.hand_over)
+        log.begin_thread(_may_block)
         try:
             self.thread = start_loop_thread(self._begin, "rr-loop")
         except Unavailable:
@@ -168,6 +170,7 @@ class Dispatcher:
         self.closed = True
         if not on_loop:
             self.thread.join()
+            log.flush(timeout_s)
 
     def _abandon(self) -> None:
         """Refuse everything, in a forked child: it does not have the threads, and must not wait for them."""
@@ -192,13 +195,13 @@ class Dispatcher:
             except BaseException as error:  # SystemExit on the loop would end all actors of the process
                 logger.error("%s raised on the loop", getattr(fn, "__qualname__", fn), exc_info=error)
 
-    def _begin(self, loop: asyncio.AbstractEventLoop) -> Coroutine[Any, Any, object]:
+    def _begin(self, loop: asyncio.AbstractEventLoop) -> asyncio.Future[None]:
         self._ident = threading.get_ident()
         self._stop = asyncio.Event()
         self.loop = loop
         loop.set_exception_handler(log_exception)
         loop.add_reader(self._bell, self._rung)
-        return self._until_closed()
+        return loop.create_task(self._until_closed())
 
     async def _until_closed(self) -> None:
         await self._stop.wait()
@@ -280,9 +283,13 @@ def acquire(*, workers_limit: int | None = None) -> Dispatcher:
 
     Args:
         workers_limit: the most worker threads from now on; unchanged if None.
+
+    Raises:
+        UsageError: gevent or eventlet has patched this process.
     """
     with _process.lock:
         if _process.dispatcher is None:
+            interpreter.check_not_patched()
             _process.dispatcher = Dispatcher()
         _process.holders += 1
         if workers_limit is not None:
@@ -305,6 +312,40 @@ def release() -> None:
 def current() -> Dispatcher | None:
     """Return the process's dispatcher if it runs, without holding it."""
     return _process.dispatcher
+
+
+def aside(work: Callable[[], object]) -> None:
+    """Run a user's code in a worker: the calling thread may be the loop's, or that of another user's handler.
+
+    Without a worker, call it here; in a new thread if an event loop runs here.
+    """
+    process = _process.dispatcher
+    if process is not None:
+        with contextlib.suppress(Unavailable):  # it is ending, or the machine gives no thread
+            process.workers.in_thread(work, beyond_limit=True)
+            return
+    with contextlib.suppress(RuntimeError):  # no loop runs here, or the machine gives no thread
+        asyncio.get_running_loop()
+        threading.Thread(target=work, name="rr-aside", daemon=True).start()
+        return
+    work()
+
+
+def _may_block() -> bool:
+    process = _process.dispatcher
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return process is None or process.may_block()
+    return False
+
+
+def check_asyncio(what: str) -> None:
+    """Raise UsageError if no event loop of asyncio runs in this thread, as under trio."""
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        raise UsageError(f"{what}: needs asyncio; under trio, make the call that blocks in a thread") from None
 
 
 def check_may_block(what: str) -> None:

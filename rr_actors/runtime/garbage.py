@@ -13,7 +13,8 @@ _was_on = False
 _shared = False
 _frozen = False
 
-_SELDOM = 16  # blocks in a row without a full collection
+_MANY = 2_000  # objects that a block leaves: the usual collections go through less at little cost
+_SELDOM = 16  # blocks that left many, in a row without a full collection
 _blocks = 0
 _collections = 0
 
@@ -22,9 +23,10 @@ _collections = 0
 def left_alone() -> Generator[None]:
     """Switch the collector off in this process until the end of the block, or of the last overlapping block.
 
-    Then all objects count as old, or are shared: otherwise the next collection would go through all of them. Python
-    collects old objects when many have become old, but does not count those of such blocks. So after some blocks
-    without a full collection, the next block begins with one, which also frees what dead objects keep open.
+    If the block leaves many objects, all count as old then, or are shared: otherwise the next collection would go
+    through all of them. Python collects old objects when many have become old, but does not count those of such
+    blocks. So after some of them without a full collection, the next block begins with one, which also frees what dead
+    objects keep open.
     """
     global _asleep, _was_on
     with _lock:
@@ -40,7 +42,8 @@ def left_alone() -> Generator[None]:
         with _lock:
             _asleep -= 1
             if _asleep == 0 and _was_on:
-                _make_old()
+                if _shared or gc.get_count()[0] > _MANY:
+                    _make_old()
                 gc.enable()
 
 
@@ -54,7 +57,6 @@ def share() -> None:
 
 def _look_at_the_old() -> None:
     global _blocks, _collections
-    _blocks += 1
     if (collections := gc.get_stats()[-1]["collections"]) != _collections:
         _blocks, _collections = 0, collections
     elif _blocks >= _SELDOM:
@@ -62,7 +64,8 @@ def _look_at_the_old() -> None:
 
 
 def _make_old() -> None:
-    global _shared, _frozen
+    global _blocks, _shared, _frozen
+    _blocks += 1
     if _shared:  # the first block in a new child, which has no garbage of its own yet
         _shared = False
         gc.freeze()

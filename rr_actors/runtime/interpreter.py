@@ -1,17 +1,25 @@
-"""The interpreter's shared parts: its lock, its signal handlers, and its exit handlers."""
+"""The interpreter's shared parts: its lock, its signal handlers, its exit handlers, and patches of its modules."""
 
 from __future__ import annotations
 
+import _thread
 import atexit
 import contextlib
 import os
+import queue
+import select
 import signal
+import socket
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import TypeVar
+
+from rr_actors.base.errors import UsageError
 
 # Turns: how long this process's loop waits for Python's lock while a callback computes.
 #
@@ -40,6 +48,22 @@ def begin() -> None:
     sys.setswitchinterval(_AGAIN_S)
     _process.hurried_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
+
+
+def python(what: str) -> str:
+    """Return the path of this Python interpreter, by which `what` runs a program of this package.
+
+    Raises:
+        UsageError: this is a frozen program, which would run itself again, or Python is built into a program.
+    """
+    if sys.executable and not is_frozen():
+        return sys.executable
+    raise UsageError(f"{what}: refused in a frozen program, which has no Python interpreter (sys.executable) to run it")
+
+
+def is_frozen() -> bool:
+    """Return whether this is a frozen program (PyInstaller, cx_Freeze, Nuitka): sys.executable is the program."""
+    return getattr(sys, "frozen", False)
 
 
 def name_process(name: str) -> None:
@@ -115,3 +139,42 @@ def at_exit(handler: Callable[[], object]) -> None:
     """Register a handler for the orderly end of this process, and of each process that a fork server forks from it."""
     of_each_process.append(handler)
     atexit.register(handler)
+
+
+# Patches: gevent and eventlet put functions of their own into modules of the standard library. A thread is then a
+# greenlet of the thread that made it, and the first one that waits in C code, as an event loop does, stops them all.
+
+_PATCHED = {
+    "thread": (_thread, "start_new_thread"),
+    "select": (select, "select"),
+    "socket": (socket, "socket"),
+    "subprocess": (subprocess, "Popen"),
+    "queue": (queue, "SimpleQueue"),
+    "os": (os, "read"),
+}
+_PATCHERS = {
+    "gevent": ("gevent.monkey.patch_all", ("thread", "select", "socket", "subprocess", "queue")),
+    "eventlet": ("eventlet.monkey_patch", ("thread", "select", "socket", "subprocess", "os")),
+}
+
+
+def patched() -> str:
+    """Say what gevent or eventlet has replaced of what this package's threads and processes need; "" if nothing."""
+    for patcher, (patch, parts) in _PATCHERS.items():
+        if found := [part for part in parts if _source(*_PATCHED[part]).partition(".")[0] == patcher]:
+            return (
+                f"{patcher} has patched {', '.join(found)} in process {os.getpid()}: no event loop can run there in a "
+                f"thread of its own. Call {patch}({', '.join(f'{part}=False' for part in parts)}), or run the system "
+                "in a process that is not patched: its clients (rr.connect) may be"
+            )
+    return ""
+
+
+def check_not_patched() -> None:
+    """Raise UsageError if patched()."""
+    if text := patched():
+        raise UsageError(text)
+
+
+def _source(module: ModuleType, name: str) -> str:
+    return str(getattr(getattr(module, name, None), "__module__", ""))

@@ -3,7 +3,7 @@
 Each running callback has a thread, and idle threads are reused. A small pool deadlocks on recursion: a callback that
 loads a resource blocks its thread until another callback has run, as deep as the dependencies go. So the limit is high,
 and reaching it is a clear error. `async def` callbacks run as tasks on a second loop, the user loop. If one blocks by
-mistake, it delays other user code, but never the framework.
+mistake, it delays other user code, never the framework, and the log names it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import inspect
-import logging
 import threading
 import time
 from collections import deque
@@ -23,10 +22,11 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import Unavailable, text_of
+from rr_actors.base.reporting.log import Log
 from rr_actors.runtime.thread_pool import GETS_A_THREAD, REFUSED, WAITS, Task, Threads
 from rr_actors.runtime.user_loop import Done, UserLoop, is_coroutine, name_of
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 
 def is_async(fn: Callable[..., Any]) -> bool:
@@ -50,6 +50,7 @@ class Workers:
 
     Attributes:
         threads: the worker threads, running or idle.
+        closed: whether this process is stopping, and they take no more calls.
     """
 
     def __init__(self, deliver: Callable[..., None], hand_over: Callable[..., None]) -> None:
@@ -60,7 +61,7 @@ class Workers:
         self._queues: dict[Hashable, deque[Task] | None] = {}
         self._user_loop: UserLoop | None = None
         self.user_loop_ident: int | None = None
-        self._closed = False
+        self.closed = False
 
     def submit(
         self,
@@ -146,10 +147,10 @@ class Workers:
         """Run the coroutine as a task on the user loop; `done` is called in that loop's thread."""
         try:
             with self._lock:
-                if self._closed:
+                if self.closed:
                     raise Unavailable("the workers are closed: this process is stopping")
                 if self._user_loop is None:
-                    self._user_loop = UserLoop(functools.partial(self.in_thread, beyond_limit=True))
+                    self._user_loop = UserLoop(functools.partial(self.in_thread, beyond_limit=True), self._deliver)
                     self.user_loop_ident = self._user_loop.thread.ident
                 user_loop = self._user_loop
             user_loop.start(coroutine, done, context)
@@ -164,7 +165,7 @@ class Workers:
         being started now ends by itself.
         """
         with self._lock:
-            self._closed = True
+            self.closed = True
             user_loop = self._user_loop
         threads = self.threads.close()
         if user_loop is not None:
@@ -178,7 +179,7 @@ class Workers:
     def abandon(self) -> None:
         """Refuse everything, in a forked child: it does not have the threads."""
         self._lock = threading.Lock()  # another thread may have held it at the fork
-        self._closed = True
+        self.closed = True
         self.threads.abandon()
 
     def _start(self, task: Task) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import io
-import logging
 import os
 import weakref
 import zlib
@@ -20,8 +19,9 @@ import msgspec
 
 from rr_actors.base.errors import CatalogError, CatalogLocked
 from rr_actors.base.folder import Folder, NotAFile
+from rr_actors.base.reporting.log import Log
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 
 class Reached(msgspec.Struct, frozen=True, gc=False):

@@ -17,7 +17,7 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
-from rr_actors.base.errors import CatalogDamaged, CatalogError
+from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked
 from rr_actors.base.folder import NotAFile, NotOurs
 from rr_actors.base.scarcity import wanted_by
 
@@ -86,8 +86,6 @@ _NOT_ITS_FAULT = {  # errors that do not come from the file's content
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_PERM,
     sqlite3.SQLITE_READONLY,
-    sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_LOCKED,
     sqlite3.SQLITE_NOMEM,
 }
 
@@ -155,7 +153,15 @@ def errors_named(path: Path) -> Generator[None]:
             want.__cause__ = error
             text = f"{path}: {error}; the catalog is left as it is. {wanted_by(want)}"
             raise CatalogError(text, path=str(path)) from want
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+            raise CatalogLocked(
+                f"{path}: expected a catalog that nobody has open, got one that another process has locked ({error});"
+                " close it there",
+                path=str(path),
+                pid=None,
+            ) from error
+        if code in _NOT_ITS_FAULT:
             raise CatalogError(
                 f"{path}: expected to read and write the catalog, got: {error}. It is left as it is."
                 " See that its file may be written and that the disk has room, and try again",

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import os
 import re
 import struct
 import threading
+import time
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
@@ -23,6 +23,7 @@ import msgspec
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.folder import Folder
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
 from rr_actors.storage import checked_records
@@ -30,9 +31,12 @@ from rr_actors.storage.checked_records import Damage
 from rr_actors.storage.sql_tables import Meta, net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
 
-_AT_MOST = 100_000  # changes in the journal; with more, the committing thread folds them itself
+_AT_MOST = 1_000_000  # changes in the journal: those of many seconds. The folding has failed all the time, or hangs
 
-_log = logging.getLogger(__name__)
+LOOK_S = 0.1
+"""The longest time for which commits are acknowledged after the directory of a catalog has gone away."""
+
+_log = Log(__name__)
 
 
 class JournaledStore:
@@ -48,6 +52,7 @@ class JournaledStore:
         self.path = tables.path
         self.epoch = tables.epoch
         self._tables = tables
+        self._look_at = 0.0  # when a commit looks next whether the directory is in its place
         self._lock = threading.Lock()  # protects the next four
         self._segment: Segment | None = None  # takes commits; made by the first commit
         self._end = End()  # of the segment before
@@ -68,15 +73,23 @@ class JournaledStore:
         """Write all changes in their order, atomically.
 
         Raises:
-            CatalogError: the changes could not be written (disk full, I/O error), or the journal is full and cannot be
-                folded into the SQLite file; nothing was written.
+            CatalogError: the changes could not be written (disk full, I/O error, the directory has gone away), or the
+                journal is full because the SQLite file takes nothing; nothing was written.
             OverflowError: a number or a row is too large for SQLite; nothing was written.
             UnicodeEncodeError: a text has no UTF-8; nothing was written.
         """
         if not changes:
             return
-        if len(self._pending) > _AT_MOST:
-            self.tidy()
+        if len(self._pending) >= _AT_MOST:
+            raise CatalogError(
+                f"{self.path}: expected fewer than {_AT_MOST} changes in its journal, got {len(self._pending)}, which"
+                " the SQLite file has not taken; no more are written until it takes them. The log has the reason; a"
+                " tool that keeps the file locked is one",
+                path=str(self.path),
+            )
+        if (now := time.monotonic()) >= self._look_at:
+            self._tables.place.check()
+            self._look_at = now + LOOK_S
         with self._lock:
             try:
                 if self._segment is None:
@@ -96,12 +109,13 @@ class JournaledStore:
         return bool(self._pending)
 
     def tidy(self) -> None:
-        """Fold the journal's changes into the SQLite file, and keep its -wal small. Do nothing once this is closed.
+        """Fold the journal's changes into the SQLite file, and keep its -wal small. Do nothing once this is closed,
+        or while the directory has gone away.
 
         If the folding fails, the changes stay in the journal.
         """
         with self._tidying:
-            if self._closed:
+            if self._closed or not self._tables.place.is_there():
                 return
             self._tables.keep_lock()
             self._fold()
@@ -149,7 +163,7 @@ class JournaledStore:
                 changes, self._pending = self._pending, []
             if changes:
                 self._tables.fold(net_of(changes), self._full[-1].number)
-        except BaseException:  # KeyboardInterrupt, too: commit() may fold in the main thread
+        except BaseException:  # KeyboardInterrupt, too: save_catalog() may fold in the main thread
             with self._lock:
                 self._pending = changes + self._pending
             raise

@@ -7,25 +7,27 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import logging
 import os
 import sqlite3
 import stat
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 
-from rr_actors.base.errors import CatalogDamaged, CatalogError, shortened
+from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked, shortened
 from rr_actors.base.folder import Folder, NotAFile, make_directories
+from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.model.rows import Change, Content, Row, apply, content_of, rows_of
+from rr_actors.registrar.model.store import MemoryStore, Store, is_needed
 from rr_actors.storage import journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
 from rr_actors.storage.journaled_store import JournaledStore
-from rr_actors.storage.store import Store
-from rr_actors.storage.witness import Witness, missing_text
+from rr_actors.storage.witness import Known, Witness, missing_text
 
 Durability = Literal["process", "power"]
 
@@ -33,9 +35,37 @@ _PATH_BYTES = 500
 """SQLite's limit is 512 bytes (MAX_PATHNAME in its os_unix.c), the endings ".new", of a catalog that is being made, and
 "-journal" included."""
 
+_LOCKED_S = 1.0
+"""How long an opening waits for the lock: a thread may be looking whether the catalog is still needed."""
+_LOOK_AGAIN_S = 0.05
+
 _READINGS = 20  # attempts to read a catalog that is opened or closed during each reading
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
+
+
+def open_catalog(config: RegistrarConfig, state_dir: str) -> Store:
+    """Open the store of a registrar as its configuration says; raise as open_store() does."""
+    if config.durability == "none":
+        return MemoryStore()
+    path, witness = config.catalog_path(state_dir), Witness(state_dir, config.name)
+    deadline = time.monotonic() + _LOCKED_S
+    while True:
+        try:
+            return open_store(path, durability=config.durability, on_damage=config.on_damage, witness=witness)
+        except CatalogLocked:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_LOOK_AGAIN_S)
+
+
+def remove_catalogs(registrars: Sequence[str], state_dir: str) -> None:
+    """Remove those of the registrars' catalogs in the state directory that have nothing that would be missed."""
+    for name in registrars:
+        try:
+            remove_unneeded(RegistrarConfig(name).catalog_path(state_dir), Witness(state_dir, name))
+        except CatalogError as error:  # it is open again already, say
+            _log.info("%s: its catalog stays: %s", name, error)
 
 
 def open_store(
@@ -62,17 +92,84 @@ def open_store(
         text = f"{shortened(str(path))}: its path has {length} bytes, expected at most {_PATH_BYTES}, as SQLite opens"
         raise CatalogError(f"{text} no longer one; choose a shorter state_dir, or another location", path=str(path))
     with errors_named(path):
-        make_directories(path.parent, synced=durability == "power")
-        with contextlib.ExitStack() as if_not:
-            folder = if_not.enter_context(Folder.at(path.parent))
-            _make_private(folder)
-            files = [file.name for file in (path.with_suffix(".lock"), *sqlite_store.files_of(path))]
-            _make_files_private(folder, [*files, *sqlite_store.segments_among(folder.names(), path)])
-            lock = CatalogLock(folder, path)
-            if_not.callback(lock.release)
-            store = _open_locked(folder, path, lock, durability, on_damage, witness)
-            if_not.pop_all()
-            return store
+        while True:
+            try:
+                folder = _folder_of(path, witness, synced=durability == "power")
+                return _open_in_directory(folder, path, durability, on_damage, witness)
+            except FileNotFoundError:  # who closed the catalog for good has removed the directory just now
+                if os.path.lexists(path.parent):
+                    raise
+
+
+def _open_in_directory(
+    folder: Folder, path: Path, durability: Durability, on_damage: str, witness: Witness | None
+) -> Store:
+    with contextlib.ExitStack() as if_not:
+        if_not.enter_context(folder)
+        _make_private(folder)
+        files = [file.name for file in (path.with_suffix(".lock"), *sqlite_store.files_of(path))]
+        _make_files_private(folder, [*files, *sqlite_store.segments_among(folder.names(), path)])
+        lock = CatalogLock(folder, path)
+        if_not.callback(lock.release)
+        store = _open_locked(folder, path, lock, durability, on_damage, witness)
+        if_not.pop_all()
+        return store
+
+
+def remove_unneeded(path: Path, witness: Witness) -> None:
+    """Remove a catalog that nobody has open, with its directory, if it has nothing that would be missed.
+
+    Raises:
+        CatalogError: as open_store() describes; or the catalog cannot be removed.
+    """
+    if not os.path.lexists(path) or is_needed(content_of(read_rows(path))):
+        return
+    store = open_store(path, witness=witness)
+    needed = True
+    try:
+        needed = is_needed(store.load())
+    finally:
+        store.close(erase=not needed)
+
+
+def _folder_of(path: Path, witness: Witness | None, *, synced: bool) -> Folder:
+    """Open or make the directory of a catalog. Below the state directory, no link is followed."""
+    parent = path.parent
+    top = parent if witness is None else witness.state_dir
+    is_below = parent.is_relative_to(top) and ".." not in parent.relative_to(top).parts
+    if not is_below:  # a location that was chosen
+        top = parent
+    try:
+        for at in (parent, *parent.parents):
+            if at == top:
+                break
+            if at.is_symlink():
+                raise NotAFile(at, "a symbolic link")
+        make_directories(parent, synced=synced)
+        return Folder.below(top, parent)
+    except NotAFile as error:
+        raise CatalogError(
+            f"{error.filename}: expected a directory of the catalog's own, got {error.got}; it is left as it is, and so"
+            " is what it leads to. Remove it, or choose the directory that it leads to as the registrar's location",
+            path=str(error.filename),
+        ) from error
+
+
+def move_catalog(old: Path, new: Path) -> None:
+    """Move a catalog that nobody has open, with its directory. A crash leaves it at one of the two places.
+
+    Raises:
+        CatalogLocked: the catalog is open. `.path`, `.pid`
+        CatalogError: it cannot be moved: there is a directory with something in it, say.
+    """
+    with errors_named(new):
+        make_directories(new.parent.parent)
+        with Folder.at(old.parent) as folder:
+            lock = CatalogLock(folder, old)
+            try:
+                os.rename(old.parent, new.parent)
+            finally:
+                lock.release()
 
 
 def read_rows(path: str | os.PathLike[str]) -> list[Row]:
@@ -126,9 +223,10 @@ def _open_locked(
     folder: Folder, path: Path, lock: CatalogLock, durability: Durability, on_damage: str, witness: Witness | None
 ) -> Store:
     registrar = "" if witness is None else witness.registrar
+    known = None if witness is None else witness.known()
     try:
         with errors_named(path):
-            meta, content, left = _read(folder, path, lock.reached, registrar)
+            meta, content, left = _read(folder, path, lock.reached, witness)
             sqlite_store.check_under_wal(folder, path, meta)
     except CatalogDamaged as error:
         if on_damage != "aside":
@@ -136,14 +234,19 @@ def _open_locked(
         meta, content, left = sqlite_store.NONE, content_of(()), _Left()
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(folder, path).name)
     else:
-        if witness is not None:
-            left = _compared(path, meta, left, witness)
-    if not folder.has(path.name):
-        meta = sqlite_store.create(folder, path, durability, registrar)
-    changes = sql_tables.net_of(left.changes)
-    meta = sql_tables.Meta(
-        meta.id, max(meta.epoch, left.epoch) + 1, max(meta.folded, left.last), registrar or meta.registrar
-    )
+        if known is not None:
+            _compare(path, meta, known, registrar)
+    spent = max(meta.epoch, left.epoch, 0 if known is None else known.epoch)
+    if witness is not None and not spent:
+        spent = witness.spent()
+    changes: sql_tables.Net | None = sql_tables.net_of(left.changes)
+    place = (spent + 1, max(meta.folded, left.last), registrar or meta.registrar)
+    if folder.has(path.name):
+        meta = sql_tables.Meta(meta.id, *place)
+    else:
+        meta = sqlite_store.create(folder, path, durability, *place)
+        if durability != "power":  # with it the first commit is SQLite's, and must not wait for the opening of the file
+            changes = None
     store = sqlite_store.SqliteStore(folder, path, lock, durability, meta, changes, content, witness)
     for segment in left.segments:
         folder.discard(segment)  # if that fails: it is folded, so it is ignored, and the next opening removes it
@@ -163,13 +266,13 @@ class _Left(msgspec.Struct, frozen=True):
 
 
 def _read(
-    folder: Folder, path: Path, reached: Reached | None = None, registrar: str = ""
+    folder: Folder, path: Path, reached: Reached | None = None, witness: Witness | None = None
 ) -> tuple[sql_tables.Meta, Content, _Left]:
     """Return a catalog's meta row, its rows with the journal's changes, and its journal.
 
     Args:
         reached: the catalog's progress, if it was not closed.
-        registrar: the catalog's registrar, if that is known.
+        witness: has the name of the catalog's registrar, if that is known.
     """
     found = journaled_store.read(folder, path)  # first: the file then has the segments that are folded meanwhile
     if not folder.has(path.name):
@@ -178,8 +281,8 @@ def _read(
         if reached is not None:
             damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
     meta, content = sqlite_store.read_catalog(folder, path)
-    if registrar and meta.registrar not in ("", registrar):
-        damaged(path, f"that of the registrar {meta.registrar!r} in the place of that of {registrar!r}")
+    if witness is not None and meta.registrar not in ("", witness.registrar, witness.formerly):
+        damaged(path, f"that of the registrar {meta.registrar!r} in the place of that of {witness.registrar!r}")
     if reached is not None and reached.id != meta.id:
         _log.warning("%s: another catalog than the one that was open here, and was not closed; that one is lost", path)
         reached = None
@@ -200,18 +303,15 @@ def _read(
     return meta, content, _Left(found.segments, last, epoch, changes)
 
 
-def _compared(path: Path, meta: sql_tables.Meta, left: _Left, witness: Witness) -> _Left:
-    """Compare the catalog with its last known opening, warn of differences; return `left` with the higher epoch."""
-    known = witness.known()
-    if known is None:
-        return left
+def _compare(path: Path, meta: sql_tables.Meta, known: Known, registrar: str) -> None:
+    """Compare the catalog with its last known opening, and warn of differences."""
     if not meta.id:
-        _log.warning("%s", missing_text(witness.registrar, known))
+        _log.warning("%s", missing_text(registrar, known))
     elif known.id != meta.id:
         _log.warning(
             "%s: another catalog than the one that %s had last (%s); what that one held and served is not in it",
             path,
-            witness.registrar,
+            registrar,
             known.path,
         )
     elif known.epoch > meta.epoch:
@@ -222,8 +322,6 @@ def _compared(path: Path, meta: sql_tables.Meta, left: _Left, witness: Witness) 
             known.epoch,
             meta.epoch,
         )
-        return msgspec.structs.replace(left, epoch=max(left.epoch, known.epoch))
-    return left
 
 
 def _set_aside(folder: Folder, path: Path) -> Path:

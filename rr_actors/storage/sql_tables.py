@@ -10,7 +10,7 @@ import sqlite3
 import types
 import typing
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import msgspec
@@ -43,6 +43,7 @@ class Net(msgspec.Struct, frozen=True):
 
 T = TypeVar("T")
 
+Statements = Iterable[tuple[str, Sequence[Any]]]  # SQL, each with its parameters
 _Stored = Row | Meta
 _STORED: dict[str, type[_Stored]] = {**TABLES, "meta": Meta}
 _encode = msgspec.msgpack.Encoder().encode
@@ -50,8 +51,25 @@ _values_of = msgspec.structs.astuple
 _CHUNK = 1000  # rows read at a time: with all at once the garbage collector takes as long as SQLite
 
 
-def _create(table: str, row: type[_Stored]) -> str:
-    described = [f"{field.name} {_column_type(field.type)}" for field in msgspec.structs.fields(row)]
+SCHEMA_VERSION = 6
+OLDEST_VERSION = 3
+"""A catalog of this version, or of a later one up to SCHEMA_VERSION, is read, and migrated when it is opened."""
+
+_SINCE = {
+    "callback_runs": 4,
+    "peers.released": 4,
+    **dict.fromkeys(("queries.priority", "queries.own", "held.priority", "held.own"), 5),
+    **dict.fromkeys(("revocations", "notices.reason", "notices.grace_ms"), 6),
+}
+"""The version that has brought a table, or a column, if a catalog of OLDEST_VERSION has none of that name.
+
+Such columns are the last ones of their table, and their fields have defaults.
+"""
+
+
+def _create(table: str, row: type[_Stored], version: int = SCHEMA_VERSION) -> str:
+    fields = [it for it in msgspec.structs.fields(row) if _SINCE.get(f"{table}.{it.name}", OLDEST_VERSION) <= version]
+    described = [f"{field.name} {_column_type(field.type)}" for field in fields]
     described[0] += " PRIMARY KEY"
     return f"CREATE TABLE {table} ({', '.join(described)}, crc INTEGER NOT NULL) WITHOUT ROWID"
 
@@ -76,7 +94,6 @@ def _drop(table: str, count: int = 1) -> str:
     return f"DELETE FROM {table} WHERE id IN ({', '.join('?' * count)})"
 
 
-SCHEMA_VERSION = 3
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
 PUT_META = _put("meta", Meta)
 _AT_ONCE = (32, 8, 1)  # rows a statement: each statement releases Python's lock, and may wait long to get it again
@@ -127,11 +144,42 @@ def _in_parts(items: list[T]) -> Iterator[list[T]]:
             at += count
 
 
+def schema_of(version: int) -> dict[str, str]:
+    """Return the statements that make the tables of a catalog of this version, by their names."""
+    there = {table: row for table, row in _STORED.items() if _SINCE.get(table, OLDEST_VERSION) <= version}
+    return {table: _create(table, row, version) for table, row in there.items()}
+
+
+def migration_from(version: int, content: Content) -> Iterator[tuple[str, Sequence[Any]]]:
+    """Yield the statements that make a catalog of this version and content one of SCHEMA_VERSION; none if it is one.
+
+    A table with other columns is made anew: the checksum of a row depends on how many it has.
+    """
+    if version == SCHEMA_VERSION:
+        return
+    before = schema_of(version)
+    for table, rows in content.items():
+        if before.get(table) != SCHEMA[table]:
+            if table in before:
+                yield f"DROP TABLE {table}", ()
+            yield SCHEMA[table], ()
+            yield from statements(Net({table: rows}, {}, len(rows)))
+    yield f"PRAGMA user_version = {SCHEMA_VERSION}", ()
+
+
+def version_of(connection: sqlite3.Connection) -> int:
+    """Return the version of a catalog's tables."""
+    return int(connection.execute("PRAGMA user_version").fetchone()[0])
+
+
 def read_all(connection: sqlite3.Connection) -> Content:
     """Return every row of a catalog; raise Damage for a row that differs from the one that was written."""
-    content: Content = {}
+    content: Content = {table: {} for table in TABLES}
+    there = schema_of(version_of(connection))
     for table, type_ in TABLES.items():
-        rows = content[table] = {}
+        if table not in there:
+            continue
+        rows = content[table]
         cursor = connection.execute(f"SELECT * FROM {table}")
         while stored := cursor.fetchmany(_CHUNK):
             rows |= {row.id: row for row in _rows_of(table, stored, type_)}
@@ -147,13 +195,17 @@ def read_meta(connection: sqlite3.Connection) -> Meta:
 
 
 def _rows_of(table: str, stored: list[tuple[Any, ...]], type_: type[_Stored]) -> list[Any]:
+    checksums = [values[-1] for values in stored]
+    encode: Callable[[Any], bytes] = _encode
+    if stored and (count := len(stored[0]) - 1) < len(type_.__struct_fields__):  # of an earlier version
+        stored = [values[:-1] for values in stored]
+        encode = lambda row: _encode(_values_of(row)[:count])  # noqa: E731
     try:
         rows: list[Any] = msgspec.convert(stored, list[type_], strict=False)  # ignores the crc
     except msgspec.ValidationError as error:
         raise Damage(f"a bad row in its table {table}: {error}") from error
-    checksums = [values[-1] for values in stored]
-    if list(map(zlib.crc32, map(_encode, rows))) != checksums:
+    if list(map(zlib.crc32, map(encode, rows))) != checksums:
         pairs = zip(rows, checksums, strict=True)
-        bad = next(row.id for row, checksum in pairs if zlib.crc32(_encode(row)) != checksum)
+        bad = next(row.id for row, checksum in pairs if zlib.crc32(encode(row)) != checksum)
         raise Damage(f"a row in its table {table} that fails its checksum (id {bad!r})")
     return rows

@@ -1,7 +1,7 @@
 """SqliteStore: a catalog in one SQLite file, in WAL mode, that any SQLite tool can read, also while it is open.
 
 `application_id` marks the file as a catalog, `user_version` is its schema's version (sql_tables.py). Beside it are
-SQLite's -wal and -shm while it is open, and its lock (catalog_lock.py).
+its lock (catalog_lock.py), and SQLite's -wal and -shm while it is open: of a new one, from the first folding on.
 
 opening.py has read and checked an existing catalog before a store is made.
 """
@@ -9,7 +9,7 @@ opening.py has read and checked an existing catalog before a store is made.
 from __future__ import annotations
 
 import contextlib
-import logging
+import functools
 import os
 import re
 import sqlite3
@@ -22,8 +22,9 @@ import msgspec
 
 from rr_actors.base.errors import CatalogError, CatalogVersion
 from rr_actors.base.folder import Folder
+from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.model.rows import Change, Content, content_of
-from rr_actors.storage import sql_tables
+from rr_actors.storage import checked_records, sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
 from rr_actors.storage.witness import Known, Witness
@@ -39,7 +40,7 @@ _SOME_A_PAGE = 8  # and each 8 changes write one more
 _SHRINK = "VACUUM"
 _BUSY_S = 1.0  # the wait for a tool that has the file open; processes of this package never wait for each other
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 
 class SqliteStore:
@@ -49,7 +50,8 @@ class SqliteStore:
         folder, path: the catalog's directory, which close() closes, and its checked file there.
         lock: the lock, already held; close() releases it.
         durability: "power": each commit waits for the disk.
-        meta, changes: committed at once.
+        meta, changes: committed at once; an older schema is migrated in the same commit. Without changes the file has
+            this meta row already, and SQLite opens it when it is used first.
         content: the file's content after that.
         witness: the record of this catalog outside of its directory.
 
@@ -68,11 +70,12 @@ class SqliteStore:
         lock: CatalogLock,
         durability: Literal["process", "power"],
         meta: sql_tables.Meta,
-        changes: sql_tables.Net,
+        changes: sql_tables.Net | None,
         content: Content,
         witness: Witness | None = None,
     ) -> None:
         self.folder = folder
+        self.place = folder.place
         self.path = path
         self.meta = meta
         self.epoch = meta.epoch
@@ -80,17 +83,16 @@ class SqliteStore:
         self._has_journal = durability != "power"
         self._lock = lock
         self._writing = threading.Lock()
-        self._connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-        self._cursor = self._connection.cursor()
-        try:
-            self._cursor.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
-            self._cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
-            self._cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
-            self._write(changes, meta)
-        except BaseException:
-            self._cursor.close()
-            self._connection.close()
-            raise
+        self._synchronous = "FULL" if durability == "power" else "NORMAL"
+        self._opened: sqlite3.Cursor | None = None
+        self._closed = False
+        if changes is not None:
+            try:
+                version = sql_tables.version_of(self._connection)
+                self._write(changes, meta, sql_tables.migration_from(version, content))
+            except BaseException:
+                self._close_file()
+                raise
         self.note(meta.folded)
         if witness is not None:
             witness.note(Known(meta.id, meta.epoch, str(path)), synced=durability == "power")
@@ -98,7 +100,34 @@ class SqliteStore:
         self._wal = files_of(path)[1]  # SQLite fills it again from its beginning: its size is not that of its content
         self._pages = 0  # an estimate of the pages written since the last copy
         self._tidying = threading.Lock()
-        self._closed = False
+
+    @property
+    def _cursor(self) -> sqlite3.Cursor:
+        if self._opened is None:
+            if self._closed:
+                raise sqlite3.ProgrammingError("the catalog is closed")
+            uri = f"{self.path.as_uri()}?mode=rw"  # never an empty file in place of one that was removed
+            connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+            self._opened = cursor = connection.cursor()
+            try:
+                cursor.execute(f"PRAGMA synchronous = {self._synchronous}")
+                cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
+                cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
+            except BaseException:
+                self._close_file()
+                raise
+        return self._opened
+
+    @property
+    def _connection(self) -> sqlite3.Connection:
+        return self._cursor.connection
+
+    def _close_file(self) -> None:
+        cursor, self._opened = self._opened, None
+        if cursor is not None:
+            connection = cursor.connection
+            cursor.close()  # a failed statement in it would keep SQLite's files open
+            connection.close()
 
     def load(self) -> Content:
         if self._content is not None:
@@ -109,6 +138,8 @@ class SqliteStore:
 
     def is_too_large(self) -> bool:
         """Return whether the file has more free pages than used ones, and some, or the -wal is over its limit."""
+        if self._opened is None:
+            return False
         with errors_named(self.path):
             return self._has_too_many_pages() or self._wal_bytes() > _WAL_LIMIT_BYTES
 
@@ -121,6 +152,7 @@ class SqliteStore:
 
     def commit(self, changes: Sequence[Change]) -> None:
         unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
+        self.place.check()
         number = self.meta.folded + 1  # each commit writes the meta row: so every -wal has the catalog's id
         self._commit(sql_tables.net_of(changes), number, f"write {len(changes)} change(s)", unwritten)
         self.note(number)
@@ -150,18 +182,20 @@ class SqliteStore:
         unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
         self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
 
-    def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta) -> None:
-        cursor = self._cursor
+    def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta, migration: sql_tables.Statements = ()) -> None:
         with self._writing:
+            cursor = self._cursor
             try:
                 cursor.execute("BEGIN")
+                for sql, parameters in migration:
+                    cursor.execute(sql, parameters)
                 cursor.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
                 for sql, parameters in sql_tables.statements(changes):
                     cursor.execute(sql, parameters)
                 cursor.execute("COMMIT")
             except BaseException:
                 with contextlib.suppress(sqlite3.Error):
-                    if self._connection.in_transaction:  # after some errors SQLite has rolled back itself
+                    if cursor.connection.in_transaction:  # after some errors SQLite has rolled back itself
                         cursor.execute("ROLLBACK")
                 raise
 
@@ -183,7 +217,7 @@ class SqliteStore:
         """
         own = contextlib.ExitStack()
         with self._tidying, errors_named(self.path), own:
-            if self._closed:
+            if self._closed or not self.place.is_there():
                 return  # a file of that name may belong to another store by now
             self._lock.keep()
             self._pages = 0
@@ -204,11 +238,12 @@ class SqliteStore:
             self._closed = True
             with self.folder:
                 try:
-                    if erase:
+                    # First the record outside: a crash in the middle leaves a catalog that nobody misses, or none.
+                    erase = erase and (self._witness is None or self._witness.forget(self.epoch))
+                    if erase and self._opened is not None:
                         with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
                             self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-                    self._cursor.close()  # a failed statement in it would keep SQLite's files open
-                    self._connection.close()
+                    self._close_file()
                     if erase:
                         self._erase()
                     elif settled and not self.folder.has(self._wal.name):
@@ -216,7 +251,7 @@ class SqliteStore:
                 finally:
                     self._lock.release(remove=erase)
             if erase:
-                with contextlib.suppress(OSError):  # something else is in the directory
+                with contextlib.suppress(OSError):  # something else is in the directory, or it is being opened again
                     self.path.parent.rmdir()
 
     def _erase(self) -> None:
@@ -225,8 +260,6 @@ class SqliteStore:
         for name in (*segments, *(file.name for file in files_of(self.path))):
             with contextlib.suppress(FileNotFoundError):
                 self.folder.unlink(name)
-        if self._witness is not None:
-            self._witness.forget()
 
 
 # -- its files ---------------------------------------------------------------------------------------------------
@@ -251,30 +284,41 @@ def segments_among(names: Iterable[str], path: Path) -> list[str]:
     return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
-def create(folder: Folder, path: Path, durability: Literal["process", "power"], registrar: str) -> sql_tables.Meta:
+def create(
+    folder: Folder, path: Path, durability: Literal["process", "power"], epoch: int, folded: int, registrar: str
+) -> sql_tables.Meta:
     """Make an empty catalog under another name and rename it: a crash leaves all of it or nothing.
 
-    Returns its meta row.
+    SQLite makes it in memory, and it is written at once. Returns its meta row.
     """
-    meta = sql_tables.Meta(os.urandom(8).hex(), epoch=0, folded=0, registrar=registrar)
+    meta = sql_tables.Meta(os.urandom(8).hex(), epoch, folded, registrar)
     new = path.with_name(path.name + ".new")
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
         with contextlib.suppress(FileNotFoundError):  # left by a crash
             folder.unlink(file.name)
+    with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        connection.deserialize(_without_meta())
+        connection.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
+        image = connection.serialize()
+    image = image[: _WAL_MODE_AT.start] + _WAL_MODE + image[_WAL_MODE_AT.stop :]
     with folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
-        with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
-            connection.execute("PRAGMA synchronous = OFF")  # fsync once, below
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {sql_tables.SCHEMA_VERSION}")
-            for sql in sql_tables.SCHEMA.values():
-                connection.execute(sql)
-            connection.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
-            connection.execute("PRAGMA journal_mode = WAL").fetchall()
+        checked_records.write_whole(file.fileno(), image, 0)
         os.fsync(file.fileno())
     folder.rename(new.name, path.name)
     if durability == "power":
         os.fsync(folder.fd)
     return meta
+
+
+@functools.cache
+def _without_meta() -> bytes:
+    """Return the bytes of a catalog's file whose tables are all empty, but for the mark of WAL mode."""
+    with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {sql_tables.SCHEMA_VERSION}")
+        for sql in sql_tables.SCHEMA.values():
+            connection.execute(sql)
+        return connection.serialize()
 
 
 # Reading all of a catalog's SQLite file through a read-only connection: the file does not change.
@@ -283,6 +327,7 @@ NONE = sql_tables.Meta("", epoch=0, folded=0)
 """The meta row of a catalog that does not exist."""
 
 _MAGIC = b"SQLite format 3\0"
+_WAL_MODE_AT = slice(18, 20)
 _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
 _HEADER_BYTES = 100
 
@@ -315,9 +360,9 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
     with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
         connection.execute("BEGIN")  # shows one state of the file, even if another process writes it
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        version = sql_tables.version_of(connection)
         _check_version(path, version)
-        if dict(schema) != sql_tables.SCHEMA:
+        if dict(schema) != sql_tables.schema_of(version):
             damaged(path, "other tables than a catalog has")
         problems = connection.execute("PRAGMA quick_check(1)").fetchall()
         if problems != [("ok",)]:
@@ -330,7 +375,7 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
 
     No process may have the file open.
     """
-    if folder.look(files_of(path)[1].name) is None:
+    if not meta.id or folder.look(files_of(path)[1].name) is None:  # SQLite would make a file that is not there
         return
     uri = f"{path.as_uri()}?immutable=1"
     with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
@@ -346,17 +391,19 @@ def _check_header(path: Path, header: bytes) -> None:
     if len(header) < _HEADER_BYTES or not header.startswith(_MAGIC):
         damaged(path, "a file that is not one of SQLite's" if header else "an empty file")
     application_id = int.from_bytes(header[68:72], "big")
-    if application_id != APPLICATION_ID or header[18:20] != _WAL_MODE:
+    if application_id != APPLICATION_ID or header[_WAL_MODE_AT] != _WAL_MODE:
         damaged(path, "an SQLite file of something else")
 
 
 def _check_version(path: Path, version: int) -> None:
     if version < 1:
         damaged(path, f"one of schema version {version}")
-    if version != sql_tables.SCHEMA_VERSION:
+    if not sql_tables.OLDEST_VERSION <= version <= sql_tables.SCHEMA_VERSION:
+        age = "a newer" if version > sql_tables.SCHEMA_VERSION else "an older"
         raise CatalogVersion(
-            f"{path}: expected a catalog of version {sql_tables.SCHEMA_VERSION}, got version {version}; it is left as"
-            " it is. Use the rr_actors that wrote it, or move it away to start with an empty catalog",
+            f"{path}: expected a catalog of version {sql_tables.SCHEMA_VERSION}, got version {version} of {age}"
+            " rr_actors; it is left as it is. Use the rr_actors that wrote it, or move it away to start with an empty"
+            " catalog",
             path=str(path),
             expected=sql_tables.SCHEMA_VERSION,
             got=version,

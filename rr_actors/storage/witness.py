@@ -2,12 +2,16 @@
 
 Each registrar has a file, <state_dir>/.catalogs/<registrar>: the catalog's id, how often it was opened, and its path.
 It tells a new catalog from one whose directory was removed, swapped or put back from an older copy.
+
+A catalog that is erased on purpose leaves no file. One number for all of them, <state_dir>/.catalogs/.epochs, says
+which epochs are spent: links of an earlier incarnation must not be taken for those of a later one.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
+import fcntl
+import io
 import os
 import zlib
 from collections.abc import Generator
@@ -16,10 +20,12 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.base.folder import Folder
+from rr_actors.base.reporting.log import Log
 
 _PLACE = ".catalogs"  # no registrar is called that
+_EPOCHS = ".epochs"  # nor that
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 
 class Known(msgspec.Struct, frozen=True):
@@ -36,30 +42,47 @@ class Witness:
     Args:
         state_dir: the system's state directory.
         registrar: the registrar's name.
+        formerly: its name in earlier runs, which its catalog may have.
     """
 
-    def __init__(self, state_dir: str | os.PathLike[str], registrar: str) -> None:
+    def __init__(self, state_dir: str | os.PathLike[str], registrar: str, formerly: str = "") -> None:
         self.registrar = registrar
-        self._state_dir = Path(state_dir)
+        self.formerly = formerly
+        self.state_dir = Path(state_dir)
 
     def known(self) -> Known | None:
         """Return the catalog at its last opening; None if there was none, or the record cannot be read."""
-        with self._errors_logged(), Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
             return _read(place, self.registrar)
         return None
 
     def note(self, known: Known, *, synced: bool = False) -> None:
         """Record that the catalog was opened. `synced`: a power cut neither loses the record nor damages it."""
         body = msgspec.json.encode(known)
-        with self._errors_logged(), Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
             place.write(self.registrar, b"%08x %b\n" % (zlib.crc32(body), body), synced=synced)
             if synced:
                 os.fsync(state.fd)
 
-    def forget(self) -> None:
-        """Remove the record, because the catalog is erased on purpose."""
-        with self._errors_logged(), Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+    def spent(self) -> int:
+        """Return the highest epoch of all catalogs of this state directory that were erased; 0 if none was."""
+        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
+            if place.has(_EPOCHS):
+                with place.open(_EPOCHS) as file:
+                    fcntl.flock(file, fcntl.LOCK_SH)
+                    return _number_in(file)
+        return 0
+
+    def forget(self, epoch: int) -> bool:
+        """Remove the record, because the catalog is about to be erased; return whether its epoch is noted as spent."""
+        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
+            with place.open(_EPOCHS, os.O_RDWR | os.O_CREAT) as file:
+                fcntl.flock(file, fcntl.LOCK_EX)  # another process may be erasing a catalog, too
+                if epoch > _number_in(file):
+                    os.pwrite(file.fileno(), b"%020d" % epoch, 0)
             place.discard(self.registrar)
+            return True
+        return False
 
     @contextlib.contextmanager
     def _errors_logged(self) -> Generator[None]:
@@ -69,7 +92,7 @@ class Witness:
             _log.warning(
                 "%s: what is known of the catalog of %s cannot be read or written: %s; if that catalog is removed or"
                 " replaced, nobody will notice",
-                self._state_dir / _PLACE,
+                self.state_dir / _PLACE,
                 self.registrar,
                 error,
             )
@@ -97,6 +120,11 @@ def missing_text(registrar: str, known: Known) -> str:
         " the registrar held and served is lost, and it starts empty; put a copy in its place before it is opened, if"
         " there is one"
     )
+
+
+def _number_in(file: io.FileIO) -> int:
+    text = os.pread(file.fileno(), 20, 0)
+    return int(text) if text.isdigit() else 0
 
 
 def _read(place: Folder, name: str) -> Known | None:

@@ -7,28 +7,33 @@ import contextlib
 import functools
 import importlib
 import inspect
-import logging
 import os
 import signal
+import socket
 import sys
-import traceback
 from pathlib import Path
 from typing import Any
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
-from rr_actors.base.errors import NotSerializable, Unavailable, text_of
+from rr_actors.base.errors import NotSerializable, Unavailable
+from rr_actors.base.reporting import log
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.scarcity import wanted_by
+from rr_actors.hosting import forwarded_logs
+from rr_actors.hosting.process_node import SystemInfo
+from rr_actors.registrar.engine.node import Node
 from rr_actors.runtime import event_loop, interpreter
+from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.processes.fork_server import Inherited
+from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.heartbeat import Health
+from rr_actors.supervision.hosted import Hosted, prepare
 from rr_actors.supervision.supervisor import target_of
-from rr_actors.system.hosting import forwarded_logs
-from rr_actors.system.hosting.hosted import Hosted, prepare
-from rr_actors.system.hosting.node import Node, SystemInfo
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 # The fork server imports this module, and these two with it: a child need not import them later.
 for _module in ("concurrent.futures.thread", "uvloop"):
@@ -41,11 +46,11 @@ _CLOSE_S = 2.0
 def main(inherited: Inherited) -> int:
     """Run the child that the payload describes. Return the exit code: 0 after a normal end or a shutdown, else 1."""
     interpreter.begin()
-    info, path, spec = pickling.loads(inherited.payload)
+    info, path, spec, classes = pickling.loads(inherited.payload)
     interpreter.name_process(f"rr: {path.rpartition('/')[2]}")
     sys.breakpointhook = functools.partial(_break, path)
     dispatcher = event_loop.acquire()  # to the end of the process: its last messages are sent after its node has ended
-    child = ChildProcess(inherited, info, path, spec)
+    child = ChildProcess(inherited, info, path, spec, classes)
 
     signal.signal(signal.SIGTERM, lambda _signal, _frame: dispatcher.closed or dispatcher.call(child.terminate))
     return dispatcher.run(child.live())
@@ -65,14 +70,19 @@ class ChildProcess:
 
     Args:
         spec: the pickled ChildSpec. A worker unpickles it, since that may import users' modules.
+        classes: pickled classes that bring their codecs.
     """
 
-    def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes) -> None:
-        self.node = Node(info, path, on_event=self._tell)
+    def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes, classes: list[bytes]) -> None:
+        self.node = Node(info, path, on_event=self._tell, open_catalog=open_catalog, remove_unneeded=remove_catalogs)
+        self.node.on_death_in_callback = lambda runs: self._say(control.DiedInCallback(runs))
+        self.node.on_resumed = self._resumed
+        self._has_resumed = False
         self._health = Health(self._directories)
         self._inherited = inherited
         self._path = path
         self._spec = spec
+        self._classes = classes
         self._shutdown_s: Shutdown  # from the specification
         self._channel: control.Channel | None = None
         self._hosted: Hosted | None = None
@@ -94,7 +104,7 @@ class ChildProcess:
             code = await self._live()
         except Exception as error:
             logger.exception("%s: could not be hosted", self._path)
-            self._say(control.Failed(text_of(error), traceback.format_exc()))
+            self._say(_failed(error))
             code = 1
         await self._close()
         return code
@@ -121,14 +131,18 @@ class ChildProcess:
         except Exception as error:
             if self._stop is not None:
                 return self._leave(ExitReport("shutdown", "stopped while it was starting"))
-            self._say(await self.node.dispatcher.workers.run(_failed, error))
+            in_worker = not interpreter.patched()  # no worker can start there
+            self._say(await self.node.dispatcher.workers.run(_failed, error) if in_worker else _failed(error))
             return 1
         self._say(control.Ready())
         await asyncio.wait((self._told_to_stop, self._report), return_when=asyncio.FIRST_COMPLETED)
         return self._leave(self._report.result() if self._report.done() else await self._stop_actor())
 
     async def _start(self) -> bool:
-        spec: ChildSpec = await self.node.dispatcher.workers.run(pickling.loads, self._spec)
+        try:
+            spec = await self.node.dispatcher.workers.run(self._unpickle)
+        finally:
+            interpreter.check_not_patched()  # by a module that this has imported
         self._shutdown_s = spec.shutdown_s
         cls, args, kwargs = target_of(spec)
         self._hosted = prepare(self.node, cls, self._path, self._report.set_result, once=spec.restart == "temporary")
@@ -137,6 +151,12 @@ class ChildProcess:
         if not starting.done():
             self._hosted.cut_short()
         return await starting
+
+    def _unpickle(self) -> ChildSpec:
+        for blob in self._classes:
+            with contextlib.suppress(Exception):  # the child may not need it
+                pickling.loads(blob)
+        return pickling.loads(self._spec)
 
     async def _stop_actor(self) -> ExitReport:
         assert self._hosted is not None
@@ -157,6 +177,7 @@ class ChildProcess:
         except Exception:
             logger.exception("%s: closing", self._path)
         if self._channel is not None:
+            await self.node.dispatcher.workers.run(log.flush)
             channel, self._channel = self._channel, None  # log records go to standard error from now on
             await channel.finish(_CLOSE_S)
 
@@ -198,15 +219,26 @@ class ChildProcess:
         except NotSerializable:
             logger.exception("%s: an event that is not plain data: %r", self._path, event)
 
+    def _resumed(self, run: str) -> None:
+        """Tell the supervisor of the first such callback: one is enough, and there may be many."""
+        if not self._has_resumed:
+            self._has_resumed = True
+            self._say(control.Resumed(run))
+
     def _say(self, message: control.Message) -> None:
         if self._channel is not None:
             self._channel.send(message)
 
 
-def _failed(error: Exception) -> control.Failed:
+def _failed(error: BaseException) -> control.Failed:
     """Return the message for a failed start. In a worker, since pickling runs users' code."""
-    trace = "".join(traceback.format_exception(error))
+    raised, wanted = raised_by(error), wanted_by(error)
     try:
-        return control.Failed(text_of(error), trace, pickling.dumps(error, "exception"))
-    except Exception:  # then only its text and its traceback are sent
-        return control.Failed(text_of(error), trace)
+        return control.Failed(raised.text, raised.trace, pickling.dumps(raised.error, "exception"), wanted)
+    except BaseException:  # then only its text and its traceback are sent
+        return control.Failed(raised.text, raised.trace, wanted=wanted)
+
+
+def could_not_begin(end: socket.socket, error: BaseException) -> None:
+    """Send the message of a failed start from a process that has no control channel yet."""
+    control.send_first(end, _failed(error))

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import signal
 import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
@@ -21,8 +19,12 @@ from msgspec.structs import replace
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
-from rr_actors.base.errors import StartFailed
+from rr_actors.base.errors import StartFailed, text_of
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import add_note, trace_of
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
+from rr_actors.registrar.engine.node import Node
 from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.process import Exited, Process, signal_name
 from rr_actors.runtime.time_limits import wait_while_running
@@ -31,10 +33,9 @@ from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.core.state import Exit, Reason, Report, StartChild, Why
 from rr_actors.supervision.event_history import Record
 from rr_actors.supervision.heartbeat import Heartbeat
-from rr_actors.system.hosting.hosted import prepare
-from rr_actors.system.hosting.node import Node
+from rr_actors.supervision.hosted import prepare
 
-logger = logging.getLogger("rr_actors.supervision")
+logger = Log("rr_actors.supervision")
 
 ENTRY = "rr_actors.supervision.child_main:main"
 _LAST_WORDS_S = 0.05  # the longest wait for a dead process's last messages
@@ -83,6 +84,8 @@ class ProcessRun:
 
     on_end: OnEnd
     """Called if the child has become ready and then ends without stop(). Set it before start()."""
+    on_death_in_callback: Callable[[str], None]
+    """Called once, before the child is ready, if its last process died in callbacks of resources. Set it, too."""
 
     def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
         self._loop = loop = asyncio.get_running_loop()
@@ -102,6 +105,8 @@ class ProcessRun:
         self._killed: Exit | None = None  # why the supervisor killed it
         self._silent = False  # the child's end of the channel is closed
         self._up = False
+        self._died_before = False  # its last process died in callbacks of resources
+        self._resumed = ""  # a callback of a resource that went on with such work during its start
         self._stopping = False
         self._heartbeat: Heartbeat | None = None
 
@@ -123,8 +128,7 @@ class ProcessRun:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
         self._channel.send(control.Start())
         if self.spec.heartbeat_s is not None and not self._end.done():
-            limit_s = self.spec.heartbeat_s
-            self._heartbeat = Heartbeat(limit_s, self._ping, lambda why: self._kill(Exit("abnormal", why)))
+            self._heartbeat = Heartbeat(self.spec.heartbeat_s, self._ping, self._kill_hung, self._starved_s)
         await wait_while_running(self._answer, timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -182,7 +186,7 @@ class ProcessRun:
     def _spawn(self) -> Process:
         """Pickle the ChildSpec and launch the process. In a worker, since both block."""
         spec = pickling.dumps(self.spec, f"the ChildSpec of {self._path}")
-        payload = pickling.dumps((self._node.info, self._path, spec))
+        payload = pickling.dumps((self._node.info, self._path, spec, pickling.classes_with_codecs()))
         return self._node.spawner.start(ENTRY, payload, name=self._path)
 
     async def _judge(self, answer: control.Message | None) -> bool:
@@ -200,7 +204,11 @@ class ProcessRun:
                 raise await self._node.dispatcher.workers.run(_unpack, answer, self._path)
             case _:
                 exit = await asyncio.shield(self._end)
-                error = StartFailed(f"{self._path}: {exit} before it was ready", id=self._path, code=exit.code)
+                text = f"{self._path}: {exit} before it was ready"
+                facts = {"callback": self._resumed} if self._resumed and self._killed is None else {}
+                if self._resumed:
+                    text += f", while callbacks of resources went on with what a crash had interrupted: {self._resumed}"
+                error = StartFailed(text, id=self._path, code=exit.code, **facts)
                 if exit.traceback:
                     error.add_note(exit.traceback)
                 raise error
@@ -224,6 +232,12 @@ class ProcessRun:
             case control.Pong():
                 if self._heartbeat is not None:
                     self._heartbeat.heard(message.trouble)
+            case control.Resumed():
+                self._resumed = message.run
+            case control.DiedInCallback():
+                if not (self._up or self._died_before):
+                    self._died_before = True
+                    self.on_death_in_callback(message.runs)
             case control.News():
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # resource events may be many
@@ -243,10 +257,20 @@ class ProcessRun:
         if self._channel is not None:
             self._channel.send(control.Ping())
 
+    def _starved_s(self) -> float:
+        return 0.0 if self._process is None else lifeline.starved_s(self._process.pid)
+
     # -- its end ---------------------------------------------------------------------------------------------------
 
+    def _kill_hung(self, why: str) -> None:
+        self._kill(Exit("abnormal", why))
+
     def _kill(self, why: Exit) -> None:
-        if self._process is not None and self._process.kill():
+        if self._process is None:
+            return
+        if paused := lifeline.stopped(self._process.pid):
+            why = replace(why, detail=f"{why.detail}; it was {paused}")
+        if self._process.kill():
             self._killed = self._killed or why
 
     def _died(self, exited: Exited) -> None:
@@ -319,12 +343,15 @@ def _unpack(failed: control.Failed, path: str) -> BaseException:
     """Return the exception of the child, with its traceback as a note. In a worker, since it runs users' code."""
     error: BaseException | None = None
     if failed.error:
-        with contextlib.suppress(Exception):  # its class cannot be imported here: its text and traceback must do
+        with contextlib.suppress(BaseException):  # its class cannot be imported here: its text and traceback must do
             error = pickling.loads(failed.error)
     if not isinstance(error, BaseException):
-        error = StartFailed(f"{path}: {failed.text}", id=path)
+        error = StartFailed(f"{path}: {failed.text}", id=path, wanted=failed.wanted)
+    elif failed.wanted and not wanted_by(error):  # it has left its causes behind
+        cause, error = error, StartFailed(f"{path}: {failed.text}: {failed.wanted}", id=path, wanted=failed.wanted)
+        error.__cause__ = cause
     if failed.traceback:
-        error.add_note(f"In the process of {path}:\n{failed.traceback}")
+        add_note(error, f"In the process of {path}:\n{failed.traceback}")
     return error
 
 
@@ -384,11 +411,12 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
 
 def _detail(report: Report) -> str:
     if report.error is not None:
-        return f"{type(report.error).__name__}: {report.error}"
+        text, wanted = text_of(report.error), wanted_by(report.error)
+        return text if wanted in text else f"{text}: {wanted}"
     return "" if report.exit is None else report.exit.detail
 
 
 def _traceback(report: Report) -> str:
     if report.event == "start_failed" and report.error is not None:
-        return "".join(traceback.format_exception(report.error))
+        return trace_of(report.error)
     return "" if report.exit is None else report.exit.traceback

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 from collections.abc import Callable
 from typing import Any, cast
 
 import msgspec
 
+from rr_actors.base.reporting.log import Log
 from rr_actors.wire.frames import FrameReader, framed
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 _LIMIT_BYTES = 64 * 2**20
 _REST_S = 0.01
@@ -52,11 +52,27 @@ class Ignored(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 class Failed(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """The actor did not start; the process ends. `error`: the pickled exception, empty if it cannot be pickled."""
+    """The actor did not start; the process ends. `error`: the pickled exception, empty if it cannot be pickled.
+
+    `wanted`: what was wanting (base/scarcity.py), since an exception leaves its causes behind.
+    """
 
     text: str
     traceback: str
     error: bytes = b""
+    wanted: str = ""
+
+
+class DiedInCallback(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """The child's last process died while callbacks of resources ran: its death is theirs. `runs` names them."""
+
+    runs: str
+
+
+class Resumed(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """A callback of a resource goes on with work of before a crash, while the actor is starting. `run` names it."""
+
+    run: str
 
 
 class Exiting(msgspec.Struct, tag=True, array_like=True, frozen=True):
@@ -73,7 +89,13 @@ class News(msgspec.Struct, tag=True, array_like=True, frozen=True):
     event: dict[str, Any]
 
 
-Message = Start | Stop | Ping | Pong | Ready | Ignored | Failed | Exiting | News
+Message = Start | Stop | Ping | Pong | Ready | Ignored | Failed | Exiting | News | DiedInCallback | Resumed
+
+
+def send_first(end: socket.socket, message: Message) -> None:
+    """Send a message on an end that has no channel yet. Blocks."""
+    end.setblocking(True)
+    end.sendall(framed(message, _LIMIT_BYTES))
 
 
 class Channel(asyncio.Protocol):

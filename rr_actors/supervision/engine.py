@@ -9,18 +9,21 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import logging
 import os
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from typing import Any
 
-from rr_actors.base.errors import Unavailable
+from rr_actors.base.errors import RrError, StartFailed, Unavailable, text_of
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
+from rr_actors.registrar.engine.node import Node
+from rr_actors.runtime.callback_errors import described_error
 from rr_actors.runtime.processes import lifeline
 from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, Target, record_of
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.child_calls import find_child
+from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.supervision.core.state import (
     Action,
@@ -37,11 +40,11 @@ from rr_actors.supervision.core.state import (
     Tree,
 )
 from rr_actors.supervision.event_history import History, Record
-from rr_actors.supervision.name_entries import Entries, manager_of
-from rr_actors.system.hosting.node import Node
-from rr_actors.wire.name_service import Status
+from rr_actors.supervision.given_up import give_up
+from rr_actors.supervision.name_entries import Entries, manager_of, registrars_of
+from rr_actors.wire.name_service import Presence
 
-logger = logging.getLogger("rr_actors.supervision")
+logger = Log("rr_actors.supervision")
 
 SWEEP_DELAY_S = 0.05
 """Seconds from a death to the search for processes outside its group. Mostly the successor has started by then."""
@@ -55,7 +58,7 @@ FENCE_S = 1.0
 DEATHS = 3
 """How many deaths of earlier runs a child hears of: as many as a load may cause before it fails."""
 
-_STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
+_STATUS = {"running": None, "starting": Presence.STARTING, "restarting": Presence.STARTING, "stopped": Presence.STOPPED}
 
 
 class Supervision:
@@ -90,7 +93,9 @@ class Supervision:
         self._lives: dict[int, Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # of the last start of each child
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._named: tuple[Supervisor | None, frozenset[str]] = None, frozenset()  # a specification, its children's ids
         self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
+        self._giving_up: dict[str, asyncio.Task[Any]] = {}  # registrars that are gone, until their catalogs say so
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
 
@@ -153,7 +158,7 @@ class Supervision:
                 life = Life(action, self.path_of(action.id))
                 self._lives[action.run] = life
                 self._specs[action.id] = action.spec
-                self.entries.mark(life.spec, life.path, Status.STARTING, self._deaths(life))
+                self.entries.mark(life.spec, life.path, Presence.STARTING, self._deaths(life))
                 self._task(self._start(life, action.delay_s))
             case StopChild():
                 life = self._lives.get(action.run)
@@ -175,13 +180,17 @@ class Supervision:
         if delay_s > 0:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(life.told_to_stop.wait(), delay_s)
+        names = registrars_of(life.spec, life.path)
+        if giving_up := [task for name in names if (task := self._giving_up.get(name)) is not None]:
+            await asyncio.wait(giving_up)  # it has their catalogs
         if life.told_to_stop.is_set():
             return
         life.began = time.monotonic()
         try:
             life.run = self._new_run(life)
             ready = await life.run.start()
-        except Exception as error:
+        except Exception as failure:
+            error = failure if type(failure) is StartFailed else await described_error(failure)
             if not life.told_to_stop.is_set():
                 now = time.monotonic()
                 decision = restarts.decide_start_failed(self.tree, life.id, life.number, error, now, _chance())
@@ -205,20 +214,27 @@ class Supervision:
                     self._task(run.stop("brutal_kill", final=True))
                 run = ProcessRun(self._node, life.spec, life.path, self._died)
             run.on_end = on_end
+            run.on_death_in_callback = functools.partial(self._died_in_callback, life)
             return run
         return LocalRun(self._node, life.spec, life.path, self._target_of(life.spec), on_end)
 
     def _lay_out_next(self) -> None:
         """Make the processes of the next children while others start, and discard processes that are not needed now."""
-        due = [child for child in self.tree.children.values() if child.phase is Phase.DUE][:LAID_OUT]
+        due = Children.of(self.tree.children).first(LAID_OUT, Phase.DUE)
         for child in due:
             spec = child.start_spec
             if spec.placement == "process" and child.id not in self._laid_out:
                 run = self._laid_out[child.id] = ProcessRun(self._node, spec, self.path_of(child.id), self._died)
                 run.lay_out()
-        coming = {child.id for child in due} | {life.id for life in self._lives.values() if life.run is None}
-        for id in [id for id in self._laid_out if id not in coming]:
+        coming = {child.id for child in due}
+        for id in [id for id in self._laid_out if id not in coming and not self._is_to_start(id)]:
             self._task(self._laid_out.pop(id).stop("brutal_kill", final=True))
+
+    def _is_to_start(self, id: str) -> bool:
+        """Return whether the child's present start has no Run yet."""
+        child = self.tree.children.get(id)
+        life = None if child is None else self._lives.get(child.run)
+        return life is not None and life.run is None
 
     async def _stop(self, action: StopChild, life: Life | None) -> None:
         if life is None or life.run is None:
@@ -236,7 +252,7 @@ class Supervision:
         except Exception as error:
             logger.critical("supervisor %s: %s could not be stopped; killed", self.path, life.path, exc_info=error)
             run.kill()
-            return Exit("killed", f"could not be stopped: {type(error).__name__}: {error}")
+            return Exit("killed", f"could not be stopped: {text_of(error)}")
 
     def _is_final(self, id: str) -> bool:
         """Return whether a child that is being stopped will not be started again."""
@@ -247,7 +263,12 @@ class Supervision:
     def _ends_with_supervisor(self, id: str) -> bool:
         """Return whether the supervisor is stopping and will not have this child at its next start."""
         stopping = self.tree.mode in (Mode.STOPPING, Mode.STOPPED)
-        return self.final or (stopping and id not in {child.id for child in self.tree.spec.children})
+        return self.final or (stopping and id not in self._ids_of(self.tree.spec))
+
+    def _ids_of(self, spec: Supervisor) -> frozenset[str]:
+        if self._named[0] is not spec:
+            self._named = spec, frozenset(child.id for child in spec.children)
+        return self._named[1]
 
     # -- ends of children ------------------------------------------------------------------------------------------
 
@@ -266,6 +287,16 @@ class Supervision:
             self._retire(self.entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, exit)
 
+    def _died_in_callback(self, life: Life, runs: str) -> None:
+        logger.warning(
+            "supervisor %s: the last process of %s died while callbacks of its resources ran: this restart does not"
+            " count. They were: %s",
+            self.path,
+            life.path,
+            runs,
+        )
+        self.apply(restarts.decide_uncounted(self.tree, life.id, life.number))
+
     def _has_ended(self, life: Life, exit: Exit) -> None:
         decision = restarts.decide_exit(self.tree, life.id, life.number, exit, time.monotonic(), _chance())
         self._apply_and_forget(life, decision)
@@ -275,10 +306,11 @@ class Supervision:
         if life is not None:
             self._lives.pop(life.number, None)
 
-    def _task(self, coroutine: Coroutine[Any, Any, object]) -> None:
+    def _task(self, coroutine: Coroutine[Any, Any, object]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)  # the loop itself keeps only weak references
         task.add_done_callback(self._task_done)
+        return task
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         self._tasks.discard(task)
@@ -295,12 +327,13 @@ class Supervision:
         record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)
         self._node.emit(record.event, **record.facts())
-        status = Status.GONE if report.state is None else _STATUS[report.state]
+        status = Presence.GONE if report.state is None else _STATUS[report.state]
         if spec is None or status is None:
             return
-        if status is Status.STOPPED and self._ends_with_supervisor(report.id):
-            status = Status.GONE
-        self._retire(self.entries.mark(spec, path, status, _why(record)))
+        if status is Presence.STOPPED and self._ends_with_supervisor(report.id):
+            status = Presence.GONE
+        closed = {name for name in registrars_of(spec, path) if self._node.status_of(name) is Presence.GONE}
+        self._retire(self.entries.mark(spec, path, status, _why(record)), closed)
 
     def _deaths(self, life: Life) -> str:
         """Say how earlier runs died. The child's registrar names that in the errors of loads that they interrupted."""
@@ -308,11 +341,26 @@ class Supervision:
             return ""
         return "; ".join(self.history.deaths(life.path, DEATHS))
 
-    def _retire(self, registrars: list[str]) -> None:
-        """Have all providers release what these registrars held, unless the children stop for good anyway."""
+    def _retire(self, registrars: list[str], closed: Collection[str] = ()) -> None:
+        """Have all providers release what these registrars held, unless the children stop for good anyway.
+
+        Those in `closed` have released it themselves, when they were closed.
+        """
         if not self.final:
             for registrar in registrars:
-                self._task(self._node.retire(registrar))
+                self._giving_up[registrar] = self._task(self._give_up(registrar, closed=registrar in closed))
+
+    async def _give_up(self, registrar: str, *, closed: bool) -> None:
+        try:
+            if not closed:
+                await give_up(self._node, registrar)
+        except RrError as error:
+            logger.warning("%s: its catalog still says what it held: %s", registrar, error)
+            closed = True
+        finally:
+            if closed:
+                await self._node.bury(registrar)
+            self._giving_up.pop(registrar, None)
 
     # -- leftovers of dead processes -------------------------------------------------------------------------------
 
@@ -323,8 +371,14 @@ class Supervision:
     async def _sweep(self) -> None:
         self._sweeping = None
         workers = self._node.dispatcher.workers
-        swept = await workers.run(self._node.spawner.sweep)
-        with contextlib.suppress(OSError):  # a file that stays is removed with the run directory
+        try:
+            swept = await workers.run(self._node.spawner.sweep)
+        except (Unavailable, OSError) as error:  # the next sweep finds them, or the end of the system
+            if not workers.closed:
+                what = "what dead children left behind is not searched now"
+                logger.warning("supervisor %s: %s: %s", self.path, what, error)
+            return
+        with contextlib.suppress(OSError, Unavailable):  # a file that stays is removed with the run directory
             await workers.run(self._node.transport.sweep)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)

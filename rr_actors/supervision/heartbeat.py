@@ -4,7 +4,8 @@ The loop itself answers, so a user's callback may take any time. A process that 
 blocks its loop does not answer. The answer has the trouble that Health finds in that process.
 
 A supervisor that itself stood still (SIGSTOP for the whole process group, a suspended machine, a debugger) does not
-count that time: the child may have stood still with it.
+count that time: the child may have stood still with it. Nor does time count in which the child's loop was ready to run,
+and other processes had all processors.
 """
 
 from __future__ import annotations
@@ -32,12 +33,16 @@ class Heartbeat:
         ping: sends the question.
         kill: called with the reason, at the end of the heartbeat: there was no answer for `limit_s`, or two answers in
             a row had a trouble, which may pass by itself after the first.
+        starved_s: returns how many seconds the child's loop has waited for a processor since its start.
     """
 
-    def __init__(self, limit_s: float, ping: Callable[[], None], kill: Callable[[str], None]) -> None:
+    def __init__(
+        self, limit_s: float, ping: Callable[[], None], kill: Callable[[str], None], starved_s: Callable[[], float]
+    ) -> None:
         self._limit_s = limit_s
         self._ping = ping
         self._kill = kill
+        self._starved_s = starved_s
         self._answer: asyncio.Future[str] | None = None
         self._asking = asyncio.get_running_loop().create_task(self._ask())
 
@@ -55,8 +60,12 @@ class Heartbeat:
         while True:
             await asyncio.sleep(self._limit_s / 2)
             answer = self._answer = asyncio.get_running_loop().create_future()
+            before = self._starved_s()
             self._ping()
-            await wait_while_running(answer, self._limit_s)
+            left_s = self._limit_s
+            while not answer.done() and left_s > self._limit_s * _LAST_LOOK:
+                await wait_while_running(answer, left_s)
+                before, left_s = (now := self._starved_s()), now - before
             if not answer.done():  # uvloop runs timers before it reads: an answer may be there, unread
                 await asyncio.sleep(self._limit_s * _LAST_LOOK)
             if not answer.done():

@@ -5,18 +5,17 @@ A child itself writes that it is UP. Its supervisor writes every other status, s
 
 from __future__ import annotations
 
-import logging
-
 from rr_actors.base.checks import invalid
 from rr_actors.base.errors import NameTaken, RrError
 from rr_actors.base.names import CLIENTS
+from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.declarations import class_names
 from rr_actors.registrar.manager import Manager
 from rr_actors.supervision.core.specs import ChildSpec, starting_with
-from rr_actors.wire.name_service import Directory, Status, actor_key, registrar_key
+from rr_actors.wire.name_service import Directory, Presence, actor_key, registrar_key
 from rr_actors.wire.unix_sockets import pid_of
 
-logger = logging.getLogger("rr_actors.supervision")
+logger = Log("rr_actors.supervision")
 
 
 class Entries:
@@ -25,7 +24,7 @@ class Entries:
     def __init__(self, directory: Directory) -> None:
         self._directory = directory
 
-    def mark(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> list[str]:
+    def mark(self, spec: ChildSpec, path: str, status: Presence, why: str = "") -> list[str]:
         """Mark a child, its registrar and all below it with a status. Return the registrars if the status is GONE.
 
         An error is logged: the directory may be gone, with the system.
@@ -35,18 +34,18 @@ class Entries:
                 self._mark_one(child, where, status, why)
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
-        return registrars_of(spec, path) if status is Status.GONE else []
+        return registrars_of(spec, path) if status is Presence.GONE else []
 
     def announce(self, spec: ChildSpec, path: str) -> None:
         """Mark the top of a tree, which has no supervisor, and all below it as STARTING, or raise ConfigError."""
         for where, child in starting_with(spec, path):
-            self._mark_one(child, where, Status.STARTING)
+            self._mark_one(child, where, Presence.STARTING)
 
-    def _mark_one(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> None:
+    def _mark_one(self, spec: ChildSpec, path: str, status: Presence, why: str = "") -> None:
         self._directory.mark(actor_key(path), status, why)
         if (manager := manager_of(spec)) is not None:
             name = path.rpartition("/")[2]
-            if status is Status.STARTING:  # others find it by its classes: `load(Cameras.open_camera, ...)`
+            if status is Presence.STARTING:  # others find it by its classes: `load(Cameras.open_camera, ...)`
                 self._directory.put_classes(name, class_names(manager))
             self._directory.mark(registrar_key(name), status, why)
 
@@ -55,20 +54,23 @@ class Entries:
 
         Raises:
             NameTaken: one does; it is left alone.
-            InvalidSpec: one has a client's name.
+            InvalidSpec: one has a client's name, or a renamed_from.
         """
+        for where in renamed_managers(spec, path):
+            expected = "None in a child that is added at run time: the others have loaded from it under its old id"
+            raise invalid(f"start_child: {path}", "renamed_from", expected, where)
         names = registrars_of(spec, path)
         check_managers(names, f"start_child: {path}")
         for name in names:
             entry = self._directory.lookup(registrar_key(name))
-            if entry is not None and entry.status not in (Status.GONE, Status.DORMANT):
+            if entry is not None and entry.status not in (Presence.GONE, Presence.DORMANT):
                 text = f"start_child: {path}: a registrar {name!r} is in the system already; choose another id"
                 raise NameTaken(text, name=name)
 
     def pids_below(self, path: str) -> list[int]:
         """Return the ids of the processes of the actors below `path`."""
         entries = [self._directory.lookup(key) for key in self._directory.actors_below(path)]
-        pids = {pid_of(entry.address) for entry in entries if entry is not None and entry.status is Status.UP}
+        pids = {pid_of(entry.address) for entry in entries if entry is not None and entry.status is Presence.UP}
         return [pid for pid in pids if pid is not None]
 
     def forget_dynamic(self, spec: ChildSpec, path: str, managers: set[str]) -> list[str]:
@@ -84,7 +86,7 @@ class Entries:
         try:
             for key in self._directory.actors_below(path):
                 if key not in known:
-                    self._directory.mark(key, Status.GONE)
+                    self._directory.mark(key, Presence.GONE)
         except RrError as error:
             logger.error("%s: what was below it could not be marked gone in the directory: %s", path, error)
         return [manager.rpartition("/")[2] for manager in managers - static]
@@ -102,6 +104,21 @@ def check_managers(names: list[str], where: str) -> None:
         if name.startswith(CLIENTS):
             expected = f"a manager's id that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
             raise invalid(where, "id", expected, name)
+
+
+def renamed_managers(spec: ChildSpec, path: str) -> dict[str, str]:
+    """Return the earlier ids of managers among the child at `path` and all that start with it, by their present ids.
+
+    Raises:
+        InvalidSpec: a child that has an earlier id is no manager.
+    """
+    found: dict[str, str] = {}
+    for where, child in starting_with(spec, path):
+        if child.renamed_from is not None:
+            if manager_of(child) is None:
+                raise invalid(where, "renamed_from", "None, as only managers leave something", child.renamed_from)
+            found[where.rpartition("/")[2]] = child.renamed_from
+    return found
 
 
 def registrars_of(spec: ChildSpec, path: str) -> list[str]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, cast
@@ -15,12 +13,12 @@ from pykka import ActorDeadError
 from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors.actor import ExitReport, LoopActor
-from rr_actors.actors.messaging.ask_cycles import activity
+from rr_actors.actors.messaging.ask_cycles import INSTEAD, activity, check_end
 from rr_actors.actors.messaging.futures import fail
 from rr_actors.actors.messaging.mailbox import is_stop
 from rr_actors.actors.refs import ActorRef, local_of, ref_to
 from rr_actors.actors.remote.hub import urn_of_path
-from rr_actors.base.checks import examined, invalid
+from rr_actors.base.checks import NoSupervisor, SupervisorCall, examined, invalid
 from rr_actors.base.errors import (
     ActorUnavailable,
     InvalidName,
@@ -32,21 +30,26 @@ from rr_actors.base.errors import (
     exact_text,
     is_a,
     shown,
+    text_of,
 )
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import trace_of
+from rr_actors.registrar.engine.server import check_not_own, serving
+from rr_actors.runtime.processes.process import check_descriptors
 from rr_actors.supervision.child_runs import Target
 from rr_actors.supervision.core import child_calls
 from rr_actors.supervision.core.child_calls import Counts
 from rr_actors.supervision.core.rendering import describe_settings
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, count_processes
 from rr_actors.supervision.core.state import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
 from rr_actors.supervision.event_history import Records
+from rr_actors.supervision.hosted import Place, check_hostable
 from rr_actors.supervision.import_guard import check_children_can_import
-from rr_actors.system.hosting.hosted import Place, check_hostable
-from rr_actors.wire.name_service import Directory, Status, actor_key
+from rr_actors.wire.name_service import Directory, Presence, actor_key
 
-logger = logging.getLogger("rr_actors.supervision")
+logger = Log("rr_actors.supervision")
 
 CALL_TIMEOUT_S = 60.0
 _LOOK_S = 1.0  # to ask each supervisor that an error names
@@ -107,6 +110,7 @@ class SupervisorActor(LoopActor):
 
     async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
         if not self._all_down.done():  # it may have been asked to stop
+            check_descriptors(count_processes(self._spec), self._supervision.path)
             self._supervision.start()
         await self._all_up
 
@@ -114,8 +118,8 @@ class SupervisorActor(LoopActor):
         self._supervision.stop(final=self._final)
         ending = await self._all_down
         if ending.error is not None:
-            text = "".join(traceback.format_exception(ending.error))
-            self._report = ExitReport("shutdown", str(ending.error), ending.error, text)
+            text = trace_of(ending.error)
+            self._report = ExitReport("shutdown", text_of(ending.error).partition(": ")[2], ending.error, text)
 
     async def on_failure(self, *_: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Stop the children after a defect of this class: none must run without a supervisor."""
@@ -329,8 +333,13 @@ class SupervisorRef:
 
         Raises:
             NotFound: there is no such child.
+            UsageError: code of that child made the call, or of one below it, and would wait for itself.
         """
-        self._ask(child_calls.Change("terminate_child", self._id_of(id)))
+        child = self._id_of(id)
+        path, what = f"{self.path}/{child}", f"supervisor {self.path!r}: terminate_child({child!r})"
+        check_end(urn_of_path(path), what)
+        check_not_own(what, lambda me: f"{serving(me).path}/".startswith(f"{path}/"), INSTEAD)
+        self._ask(child_calls.Change("terminate_child", child))
 
     def restart_child(self, id: str | pykka.ActorRef[Any]) -> ActorRef[Any] | None:
         """Start a stopped child. Return its reference when it is ready, or None if its on_start returned IGNORE.
@@ -367,7 +376,7 @@ class SupervisorRef:
             path, _, id = path.rpartition("/")
             new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(child_calls.ChildUpdated(id, new))
 
-    def _ask(self, call: child_calls.SupervisorCall) -> Any:
+    def _ask(self, call: SupervisorCall) -> Any:
         asker = _asker_below(self.path)
         if asker is not None and _starts_here(self._ref):
             raise _too_early(self.path, asker)
@@ -377,7 +386,7 @@ class SupervisorRef:
             if asker is None:
                 raise
             raise _too_early(self.path, asker) from error
-        except (ActorDeadError, child_calls.NoSupervisor) as error:
+        except (ActorDeadError, NoSupervisor) as error:
             known = tuple(_supervisors(self.path.partition("/")[0]))
             raise NotFound(f"supervisor {self.path!r}: {error}{_listed(known)}", id=self.path, known=known) from error
 
@@ -412,7 +421,7 @@ def supervisor_at(path: str, directory: Directory) -> SupervisorRef:
         entry = directory.lookup(actor_key(path))
     except InvalidName:
         entry = None
-    if entry is not None and entry.status is not Status.GONE:
+    if entry is not None and entry.status is not Presence.GONE:
         return SupervisorRef(path)
     known = tuple(_supervisors(path.partition("/")[0]))
     what = "there is none of this path" if entry is None else f"it is gone{entry.because}"

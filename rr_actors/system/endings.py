@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
-import logging
 import signal
 import warnings
 import weakref
@@ -15,11 +14,12 @@ from types import FrameType, TracebackType
 from typing import Any, Self
 
 from rr_actors.base.errors import UsageError
+from rr_actors.base.reporting.log import Log
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import current
 from rr_actors.runtime.shielding import is_interruptible
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 # Signals: by them an operating system, a container or a terminal tells a program to end.
 

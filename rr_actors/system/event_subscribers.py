@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import functools
 import itertools
-import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
 
 from rr_actors.base.errors import RrError, UsageError, exact_text, shown
+from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.engine.node import Node
+from rr_actors.registrar.links.recorder import RECORDED
+from rr_actors.registrar.model.effects import Happening
 from rr_actors.runtime.backlogs import Backlog
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.user_loop import name_of
-from rr_actors.system.hosting.node import Node
-from rr_actors.system.hosting.recorder import RECORDED
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 T = TypeVar("T")
 
@@ -57,27 +59,41 @@ class ChildEvent(_ChildEvent, total=False):
     up_s: float
 
 
-class ResourceEvent(TypedDict):
-    """Something that happened to a resource.
+class _ResourceEvent(TypedDict):
+    """The keys that every ResourceEvent has."""
 
-    `registrar` is its provider, and `server` the id of its server. `detail` is the status ("FATAL unplugged"), the
-    error of a load or unload that failed, or else "".
-    """
-
-    event: Literal["loaded", "load_failed", "unloaded", "unload_failed", "status"]
+    event: Happening
     registrar: str
     server: str
     resource_id: str
+    request: str
     detail: str
 
 
+class ResourceEvent(_ResourceEvent, total=False):
+    """Something that happened to a resource.
+
+    `registrar` is its provider, `server` the id of its server, and `request` its request as JSON, cut if it is long.
+    `detail` is the status ("FATAL unplugged"), the new priority ("priority 5", "standby"), the error of a load,
+    unload or pause that failed, or else "". That of "revoked" is the reason.
+
+    Only a "status" has the other keys. `source` is the server where it began. `status_id` is the same for all resources
+    that it reaches. `heard_by` names the registrars that hold this resource for themselves, "app, planner".
+    """
+
+    status_id: str
+    source: str
+    heard_by: str
+
+
 class ProgressEvent(TypedDict):
-    """A load callback has reported how far it has come. `registrar` and `server` are as in a ResourceEvent."""
+    """A load callback has reported how far it has come. The keys of the resource are as in a ResourceEvent."""
 
     event: Literal["progress"]
     registrar: str
     server: str
     resource_id: str
+    request: str
     fraction: float
     text: str
 
@@ -144,6 +160,13 @@ class Subscribers:
         self._node = node
         self._say_whether_watched()
 
+    def end(self, wait_s: float) -> None:
+        """Leave a system that has stopped. Let the subscribers hear what waits, for `wait_s` seconds; drop the rest."""
+        deadline = time.monotonic() + wait_s
+        for backlog in list(self._backlogs.values()):
+            backlog.close(deadline - time.monotonic())
+        self.leave()
+
     def leave(self) -> None:
         """Forget the node, so that nobody hears any more: the system has stopped, or this is a forked child."""
         self._node = None
@@ -173,7 +196,8 @@ class Subscribers:
 
         def end() -> None:
             those.pop(number, None)
-            self._backlogs.pop(number, None)
+            if (backlog := self._backlogs.pop(number, None)) is not None:
+                backlog.close()
             self._say_whether_watched()
 
         try:

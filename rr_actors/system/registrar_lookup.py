@@ -8,23 +8,47 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Callable, Collection, Iterable, Sequence
+import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from msgspec.structs import replace
 
 from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
-from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
+from rr_actors.base.errors import CatalogError, CatalogLocked, ConfigError, NameTaken, RrError, is_a
 from rr_actors.base.names import CLIENTS, check_name
-from rr_actors.registrar.model.rows import OWED, Change, Content, Drop, Held, Peer, Put, Resource
-from rr_actors.registrar.registrar import Registrar
+from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.engine.node import Node
+from rr_actors.registrar.model.rows import (
+    TABLE_OF,
+    Change,
+    Content,
+    Drop,
+    Held,
+    Notice,
+    Peer,
+    Put,
+    Query,
+    Resource,
+    Row,
+    content_of,
+)
+from rr_actors.registrar.registrar import Registrar, registrar_of
 from rr_actors.registrar.remote_registrar import RegistrarHandle
-from rr_actors.storage.opening import open_store, read_rows
+from rr_actors.storage.opening import move_catalog, read_rows, remove_unneeded
 from rr_actors.storage.witness import Witness, tell_of_missing
-from rr_actors.system.hosting.node import Node
-from rr_actors.wire.name_service import Status
+from rr_actors.supervision.given_up import change, contents, give_up
+from rr_actors.wire.name_service import Presence
 
-logger = logging.getLogger("rr_actors")
+_LOCKED_S = 5.0  # the processes of a killed run end by themselves
+_LOOK_AGAIN_S = 0.05
+_DORMANT = (
+    "registrar %s is dormant: nobody has opened it since its process died; %s. Open it, or release() what it holds; if"
+    " its manager has another id now, that one's ChildSpec needs renamed_from=%r; if it has none any more,"
+    " release(force=True) forgets what it serves"
+)
+
+logger = Log("rr_actors")
 
 
 def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object) -> Registrar:
@@ -48,12 +72,12 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
 
 
 async def _open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
-    if node.status_of(name) in (Status.UP, Status.STARTING, Status.STOPPED):
+    if node.status_of(name) in (Presence.UP, Presence.STARTING, Presence.STOPPED):
         system = node.info.name
         text = f"registrar {name!r}: the name is taken in system {system!r}; close that one, or choose another"
         raise NameTaken(text, name=name)
     actor = await node.open_registrar(name, config)
-    registrar = Registrar(actor)
+    registrar = Registrar(node, actor)
     await node.settle(actor)
     node.serve_registrar(actor)
     return registrar
@@ -70,37 +94,129 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
         UnknownRegistrar: the system has no registrar of this name.
     """
     check_name(name, "registrar name")
-    actor = node.registrars.get(name)
-    if actor is not None and actor.audience is not None:
-        return actor.audience.holder
-    if node.status_of(name) in (None, Status.GONE, Status.DORMANT):
+    registrar = registrar_of(node.registrars.get(name))
+    if registrar is not None:
+        return registrar
+    if node.status_of(name) in (None, Presence.GONE, Presence.DORMANT):
         raise node.directory.no_registrar(name)
     return RegistrarHandle(node, name, patient=patient, owner=owner)
 
 
-def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> list[str]:
+def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> dict[str, str]:
     """Return the registrars whose catalog on disk holds or serves something, or cannot be read, and all of clients.
 
-    Blocks.
+    Each has a text that says what it serves and holds. Log it for each that is no client's, as a warning if it serves
+    something, and remove the catalogs
+    that have nothing to be missed. Blocks.
 
     Args:
         except_for: names of registrars that are about to be opened.
     """
-    found: list[str] = []
+    found: dict[str, str] = {}
     tell_of_missing(state_dir)
-    placed = {name: config.registrar(name).catalog_path(state_dir) for name in config.registrars}
-    others = set(state_dir.glob(f"*/{CATALOG_FILE}")) - {*placed.values()}
-    for name, catalog in sorted(({catalog.parent.name: catalog for catalog in others} | placed).items()):
-        if name in except_for or not os.path.exists(catalog):  # False, too, if it cannot be looked at
+    for name, catalog in _catalogs(config, state_dir).items():
+        if name in except_for:
             continue
         try:
             rows = read_rows(catalog)
-            if name.startswith(CLIENTS) or any(isinstance(row, Held | Peer | Resource) for row in rows):
-                found.append(name)
+            peers = [config.registrar(row.id).catalog_path(state_dir) for row in rows if isinstance(row, Peer)]
+            there = any(isinstance(row, Held | Resource | Notice) for row in rows)
+            if there or name.startswith(CLIENTS) or any(_has_something(peer, name) for peer in peers):
+                found[name] = contents(rows)
+                if not name.startswith(CLIENTS):  # one that only holds is mostly the application's, which opens it next
+                    serves = any(isinstance(row, Resource) for row in rows)
+                    logger.log(logging.WARNING if serves else logging.INFO, _DORMANT, name, found[name], name)
+            elif config.registrar(name).location is None:
+                remove_unneeded(catalog, Witness(state_dir, name))
         except CatalogError as error:
             logger.warning("%s: not read: %s", name, error)
-            found.append(name)
+            found[name] = "its catalog cannot be read"
     return found
+
+
+def _catalogs(config: SystemConfig, state_dir: Path) -> dict[str, Path]:
+    """Return the catalogs on disk, by the names of their registrars, which are sorted."""
+    placed = {name: config.registrar(name).catalog_path(state_dir) for name in config.registrars}
+    others = set(state_dir.glob(f"*/{CATALOG_FILE}")) - {*placed.values()}
+    found = sorted(({catalog.parent.name: catalog for catalog in others} | placed).items())
+    return {name: catalog for name, catalog in found if os.path.exists(catalog)}  # not if it cannot be looked at
+
+
+def take_over(config: SystemConfig, state_dir: Path, renamed: Mapping[str, str]) -> None:
+    """Give what registrars left on disk to those that have their place now, once. Blocks.
+
+    Nobody may have a catalog open. The record of the old name (Witness) is removed last: if a crash comes before, the
+    next start goes on.
+
+    Args:
+        renamed: old names, by the new ones.
+
+    Raises:
+        CatalogLocked: a process of a killed run still has it, also after some seconds.
+        CatalogError: the new one has something, too, or files cannot be read or written.
+    """
+    deadline = time.monotonic() + _LOCKED_S
+    for name, old in renamed.items():
+        while True:
+            try:
+                _take_over(config, state_dir, name, old)
+                break
+            except CatalogLocked:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(_LOOK_AGAIN_S)
+
+
+def _take_over(config: SystemConfig, state_dir: Path, name: str, old: str) -> None:
+    before, after = (config.registrar(one).catalog_path(state_dir) for one in (old, name))
+    theirs = Witness(state_dir, old)
+    if theirs.known() is None and not os.path.lexists(before):
+        return
+    if before.parent != after.parent and os.path.lexists(before):
+        remove_unneeded(after, Witness(state_dir, name))
+        move_catalog(before, after)
+    changes = functools.partial(_in_the_name_of, name, old)
+    if os.path.lexists(after):
+        change(config.registrar(name), state_dir, changes, formerly=old)
+    for peer, catalog in _catalogs(config, state_dir).items():
+        if peer not in (name, old):
+            try:
+                if changes(content_of(read_rows(catalog)), 0):
+                    change(config.registrar(peer), state_dir, changes)
+            except CatalogLocked:
+                raise
+            except CatalogError as error:
+                logger.warning("%s: it goes on knowing %s by its old name %s: %s", peer, name, old, error)
+    theirs.forget(0)
+    logger.info("registrar %s: has taken over what %s left", name, old)
+
+
+def _in_the_name_of(name: str, old: str, content: Content, _epoch: int) -> list[Change]:
+    """Return the changes that give the rows of a catalog a registrar's new name."""
+
+    def renamed(text: str) -> str:
+        """Return a registrar's name, or a server's "registrar/server", with the new name."""
+        registrar, slash, server = text.partition("/")
+        return f"{name}{slash}{server}" if registrar == old else text
+
+    rows: list[tuple[Row, Row]] = [
+        *((row, replace(row, registrar=renamed(row.registrar))) for row in content["held"].values()),
+        *((row, replace(row, origin=renamed(row.origin))) for row in content["queries"].values()),
+        *(
+            (row, replace(row, origin=renamed(row.origin), source=renamed(row.source)))
+            for row in content["notices"].values()
+        ),
+        *((row, replace(row, id=renamed(row.id))) for row in content["peers"].values()),
+        *((row, replace(row, id=renamed(row.id))) for row in content["server_types"].values()),
+    ]
+    changed = [(before, now) for before, now in rows if now != before]
+    return [it for before, now in changed for it in (Drop(TABLE_OF[type(before)], before.id), Put(now))]
+
+
+def _has_something(catalog: Path, origin: str) -> bool:
+    """Return whether a provider's catalog has a query of `origin`, or a notice for it."""
+    rows = read_rows(catalog) if os.path.exists(catalog) else ()
+    return any(isinstance(row, Query | Notice) and row.origin == origin for row in rows)
 
 
 async def give_up_clients(node: Node, names: Iterable[str]) -> None:
@@ -114,65 +230,3 @@ async def give_up_clients(node: Node, names: Iterable[str]) -> None:
                 await give_up(node, name, erase=True)
             except RrError as error:  # a damaged catalog, for instance: the system starts all the same
                 logger.warning("%s: what it holds is not released, and it stays dormant: %s", name, error)
-
-
-async def give_up(node: Node, name: str, *, erase: bool = False) -> None:
-    """Have the providers of a dormant registrar release what it holds, and delete that from its catalog. On the loop.
-
-    What providers hold that are down stays in the catalog, as owed. They read in the directory that the registrar is
-    gone, if the application lives until they are back; else its next start finds the registrar dormant again.
-
-    Args:
-        erase: remove the catalog from disk.
-
-    Raises:
-        CatalogError: its catalog cannot be opened.
-    """
-    config, state_dir = node.config.registrar(name), Path(node.info.state_dir)
-    await node.dispatcher.workers.run(owe, config, state_dir)
-    told = await node.retire(name)
-    down = {other for other, status in node.statuses().items() if status is not Status.UP or other not in told}
-    await node.dispatcher.workers.run(functools.partial(forget, config, state_dir, down=down, erase=erase))
-
-
-def owe(config: RegistrarConfig, state_dir: Path) -> None:
-    """Mark all that a registrar holds which nobody has open as owed: if it is opened again, it releases that. Blocks.
-
-    Raises:
-        CatalogError: its catalog cannot be opened or written.
-    """
-    _change(config, state_dir, lambda content: [Put(replace(row, hold=OWED)) for row in content["held"].values()])
-
-
-def forget(config: RegistrarConfig, state_dir: Path, *, down: Collection[str] = (), erase: bool = False) -> None:
-    """Delete what a registrar holds that nobody has open, and its providers, from its catalog. Blocks.
-
-    Args:
-        down: the providers whose rows stay. So do the rows of the registrar itself, if it is one of its consumers.
-        erase: remove the catalog from disk, too.
-
-    Raises:
-        CatalogError: its catalog cannot be opened or written.
-    """
-
-    def changes(content: Content) -> list[Change]:
-        staying = {*down, *({query.origin for query in content["queries"].values()} & {config.name})}
-        held = [row.id for row in content["held"].values() if row.registrar not in staying]
-        peers = [name for name in content["peers"] if name not in staying]
-        return [*(Drop("held", id) for id in held), *(Drop("peers", name) for name in peers)]
-
-    _change(config, state_dir, changes, erase=erase)
-
-
-def _change(
-    config: RegistrarConfig, state_dir: Path, changes: Callable[[Content], Sequence[Change]], *, erase: bool = False
-) -> None:
-    durability = "power" if config.durability == "power" else "process"
-    path, witness = config.catalog_path(state_dir), Witness(state_dir, config.name)
-    store = open_store(path, durability=durability, on_damage=config.on_damage, witness=witness)
-    try:
-        store.commit(changes(store.load()))
-    except BaseException:
-        store.close()
-        raise
-    store.close(erase=erase)

@@ -2,42 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import pykka
 
 from rr_actors.base.errors import NotFound, RrError, shown
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.supervision.supervisor import SupervisorRef
-from rr_actors.system.hosting.node import Node
 from rr_actors.system.registrar_lookup import registrar_in
-from rr_actors.wire.name_service import Status
+from rr_actors.wire.name_service import Presence
 
 _NO_ANSWER = (RrError, pykka.Timeout)
 """What a supervisor raises that is stopped or being respawned, or whose process does not answer in time."""
 
 
-def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
+def describe_supervisor(supervisor: SupervisorRef, said: Callable[[Exception], str] = str) -> dict[str, Any]:
     """Return a supervisor and all below it: id, path, settings, and its children in the order of their start.
 
-    One that does not answer has an "error" and no children.
+    One that does not answer, within the time limit of `supervisor`, has an "error" and no children.
+
+    Args:
+        said: returns the text of an error.
     """
     here = {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"}
     try:
         described = supervisor.describe()
     except _NO_ANSWER as error:
-        return here | {"error": str(error), "children": []}
-    children = [_describe_child(supervisor.path, child) for child in described["children"]]
+        return here | {"error": said(error), "children": []}
+    children = [_describe_child(supervisor, child, said) for child in described["children"]]
     return here | described | {"children": children}
 
 
-def _describe_child(above: str, child: dict[str, Any]) -> dict[str, Any]:
+def _describe_child(
+    above: SupervisorRef, child: dict[str, Any], said: Callable[[Exception], str] = str
+) -> dict[str, Any]:
     """Return a child as its supervisor describes it; a running supervisor, with all below it."""
-    child["path"] = f"{above}/{child['id']}"
+    child["path"] = f"{above.path}/{child['id']}"
     if child["type"] == "supervisor" and child["state"] == "running":
-        return describe_supervisor(SupervisorRef(child["path"])) | child
+        return describe_supervisor(SupervisorRef(child["path"], timeout_s=above.timeout_s), said) | child
     return child
 
 
@@ -59,7 +65,7 @@ def describe_at(place: SupervisorRef) -> dict[str, Any]:
         return described
     for child in children:
         if child["id"] == id:
-            return _describe_child(above, child)
+            return _describe_child(SupervisorRef(above), child)
     there = ", ".join(child["id"] for child in children) or "none"
     raise NotFound(f"supervisor {above} has no child {shown(id)} (it has: {there})", id=place.path)
 
@@ -92,7 +98,7 @@ def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
     described: dict[str, dict[str, Any]] = {}
     for name, status in node.statuses().items():
         described[name] = {"state": str(status)}
-        if status is Status.UP:
+        if status is Presence.UP:
             try:
                 described[name].update(describe_registrar(registrar_in(node, name, patient=False)))
             except RrError as error:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import contextvars
 import functools
-import logging
 import os
 import signal
 import threading
@@ -22,6 +22,7 @@ from rr_actors.base.checks import examined, invalid
 from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     AlreadyStarted,
+    CatalogLocked,
     InvalidName,
     InvalidSpec,
     NotFound,
@@ -35,9 +36,13 @@ from rr_actors.base.errors import (
     shown,
 )
 from rr_actors.base.names import CLIENTS, check_name
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
+from rr_actors.hosting import forwarded_logs
+from rr_actors.hosting.process_node import SystemInfo
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import check_not_own, serving
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.runtime.backlogs import Backlog
@@ -46,6 +51,7 @@ from rr_actors.runtime.event_loop import (
     Course,
     Dispatcher,
     acquire,
+    check_asyncio,
     check_may_block,
     forget_in_children,
     leave_in_children,
@@ -55,28 +61,30 @@ from rr_actors.runtime.processes.process import keep_standard_fds
 from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.workers import Workers
+from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.supervision.core.rendering import Tree
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.event_history import TreeLog
+from rr_actors.supervision.given_up import give_up
+from rr_actors.supervision.hosted import Hosted, check_hostable, prepare
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
-from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of
+from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of, renamed_managers
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
-from rr_actors.system.hosting import forwarded_logs
-from rr_actors.system.hosting.hosted import Hosted, check_hostable, prepare
-from rr_actors.system.hosting.node import Node, SystemInfo
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings
-from rr_actors.system.registrar_lookup import give_up, give_up_clients, left_behind, open_registrar, registrar_in
+from rr_actors.system.registrar_lookup import give_up_clients, left_behind, open_registrar, registrar_in, take_over
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.web_process import WebPage
-from rr_actors.wire.name_service import StateDir, Status, absolute_path, actor_key, open_state_dir, registrar_key
+from rr_actors.wire.name_service import Presence, StateDir, absolute_path, actor_key, open_state_dir, registrar_key
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 _LOOK_S = 1.0
+_EVENTS_S = 1.0  # for subscribers to hear the last events, at a stop
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
 _systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
@@ -142,7 +150,8 @@ class System:
         self._top = self.root.id  # the paths of this tree begin with it
         self._lock = threading.RLock()  # held by the thread that starts or stops the system
         self._starting: _Starting | None = None
-        self._stopping: Course[None] | None = None
+        self._winding: asyncio.Task[None] | None = None  # of a stop
+        self._hurries = False  # whether the stop was interrupted
         self._state: StateDir | None = None
         self._node: Node | None = None
         self._tree: Hosted | None = None
@@ -166,6 +175,7 @@ class System:
         Raises:
             StartFailed: a child did not become ready. The children that had started are stopped again.
             CatalogLocked: another running system uses this state directory.
+            CatalogError: what a child with a `renamed_from` left under that id cannot be taken over.
             ConfigError: the state directory cannot be used.
             AlreadyStarted: the system is running.
             UsageError: a module that a child process needs is still being imported, or the call would hang here.
@@ -200,12 +210,14 @@ class System:
             self._starting = starting
             try:
                 self._state = state = open_state_dir(path)
+                self._log = TreeLog(state.folder)
                 self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
                 place = str(state.path), str(state.run_dir), state.key
-                info = SystemInfo(self.name, *place, self.config, forwarded_logs.levels())
+                info = SystemInfo(self.name, *place, self.config, state.place, forwarded_logs.levels())
                 self._ended = Flag()
                 self._end = None
                 self._why_stopped = _NOT_RUNNING
+                self._hurries = False
                 self._dead_letters = Collection()
                 leave_in_children(self, System._leave_to_parent)
                 starting.wait(dispatcher.course(self._start(info)))
@@ -213,9 +225,10 @@ class System:
                 steps = Steps()  # the caller must hear of the first failure
                 steps.take("giving back what it used", self._give_back)
                 steps.report(logger, f"system {self.name!r}: its start failed, and not everything is given back")
-                if isinstance(error, (OSError, MemoryError)) and (wanted := wanted_by(error)):
-                    raise StartFailed(f"system {self.name!r} did not start: {wanted}", id=self.name) from error
-                raise
+                if isinstance(error, SupervisionError | CatalogLocked) or not (wanted := wanted_by(error)):
+                    raise
+                text = f"system {self.name!r} did not start: {wanted}"
+                raise StartFailed(text, id=self.name, wanted=wanted) from error
             finally:
                 self._starting = None
             _systems[str(state.path)] = self
@@ -251,12 +264,14 @@ class System:
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
         # The running parts hold the system weakly, so that a dropped system is noticed.
-        node = Node(info, self._top, on_event=weakly(self._publish))
+        node = Node(
+            info, self._top, on_event=weakly(self._publish), open_catalog=open_catalog, remove_unneeded=remove_catalogs
+        )
         self._node = node
         self._subscribers.attend(node)
         try:
             await node.start()
-        except Exception:  # for instance no descriptors are left; after a cancelled start the node ends with its loop
+        except BaseException:  # no descriptors are left, or the start is given up
             await node.close()
             raise
         if self._state is not None:
@@ -265,13 +280,15 @@ class System:
             spec = as_child_spec(self.root)
             in_tree = set(registrars_of(spec, self._top))
             Entries(node.directory).announce(spec, self._top)
+            renamed = renamed_managers(spec, self._top)
+            await node.dispatcher.workers.run(take_over, self.config, Path(info.state_dir), renamed)
             dormant = await node.dispatcher.workers.run(left_behind, self.config, Path(info.state_dir), in_tree)
-            for name in dormant:
-                node.directory.mark(registrar_key(name), Status.DORMANT)
+            for name, contents in dormant.items():
+                node.directory.mark(registrar_key(name), Presence.DORMANT, contents)
             await give_up_clients(node, dormant)
             if self.config.console:
                 shut_down = weakly(self._shut_down)
-                self._console = Console(self, node, self._subscribers, self._recordings, shut_down)
+                self._console = Console(self, node, self._subscribers, self._recordings, self._log, shut_down)
                 await self._console.open()
             self._tree = prepare(node, SupervisorActor, self._top, weakly(self._tree_ended))
             await self._start_tree(self._tree)
@@ -328,9 +345,7 @@ class System:
             if node is None or dispatcher is None:
                 return
             steps = Steps()
-            self._stopping = dispatcher.course(self._stop(node, limit_s))
-            steps.take("stopping what runs", self._stopping.wait)
-            self._stopping = None
+            steps.take("stopping what runs", dispatcher.course(self._stop(node, limit_s)).wait)
             steps.take("giving back what it used", self._give_back)
             self._end = self._end or report
             self._ended.set()
@@ -348,20 +363,30 @@ class System:
             logger.exception("system %s: a console has shut it down", self.name)
 
     def _stop_at_once(self) -> None:
-        if (stopping := self._stopping) is not None:
-            stopping.give_up()
+        self._hurries = True  # the stop may not have begun
+        if (dispatcher := self._dispatcher) is not None:
+            with contextlib.suppress(Unavailable):
+                dispatcher.call(self._hurry)
+
+    def _hurry(self) -> None:
+        if self._winding is not None:
+            self._winding.cancel()
 
     async def _stop(self, node: Node, limit_s: float) -> None:
         steps = Steps()
         console, self._console = self._console, None
         if console is not None:
             console.stopping = True
+        self._winding = asyncio.ensure_future(self._wind_up(node, limit_s, steps))
+        if self._hurries:
+            self._hurry()
         try:
-            await self._wind_up(node, limit_s, steps)
+            await self._winding
         except asyncio.CancelledError:  # the thread that stops the system was interrupted
             await self._wind_up(node, 0.0, steps)
             raise
         finally:
+            self._winding = None
             if console is not None:
                 await steps.take_async("closing the console", console.close())
             await steps.take_async("closing the process's part of it", node.close())
@@ -370,6 +395,9 @@ class System:
 
     async def _wind_up(self, node: Node, limit_s: float, steps: Steps) -> None:
         node.stopping = f"system {self.name!r} is being stopped"
+        for name, status in node.statuses().items():
+            if status is Presence.DORMANT and (entry := node.find(name)) is not None:
+                logger.warning("system %s: stops, and registrar %s stays dormant%s", self.name, name, entry.because)
         opened = [name for name, actor in node.registrars.items() if actor.on_failure is None]  # by no manager
         for name in reversed(opened):
             await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
@@ -385,7 +413,8 @@ class System:
         for page in pages:
             steps.take("ending a web page", page.stop)
         steps.take("ending the recordings", self._recordings.close)
-        steps.take("ending the subscriptions", self._subscribers.leave)
+        may_wait = self._dispatcher is not None and self._dispatcher.may_block()
+        steps.take("ending the subscriptions", self._subscribers.end, _EVENTS_S if may_wait else 0.0)
         self._logs = None
         if self._dispatcher is not None:
             self._dispatcher = None
@@ -400,12 +429,14 @@ class System:
     def _leave_to_parent(self) -> object:
         """Forget all that runs, in a forked child, and return it for event_loop.py to keep: it is the parent's."""
         left = (self._node, self._tree, self._console, self._dispatcher, self._state, self._pages)
+        if self._console is not None:
+            self._console.leave_to_parent()
         for page in self._pages:
             page.forget()
         self._pages = []
         for registrar in self._node.registrars.values() if self._node is not None else ():
             registrar.leave_to_parent()
-        self._starting = self._stopping = None
+        self._starting = self._winding = None
         self._lock = threading.RLock()  # another thread may have held it at the fork
         if self._state is not None:
             _systems.pop(str(self._state.path), None)
@@ -428,7 +459,12 @@ class System:
     async def __aenter__(self) -> Self:
         """Start the system as start() does, without blocking the event loop; if cancelled, give the start up."""
         starting = self._check_start()
-        await _in_thread(functools.partial(self._start_now, starting), starting.give_up)
+        try:
+            await _in_thread(functools.partial(self._start_now, starting), starting.give_up)
+        except asyncio.CancelledError:
+            if starting.succeeded:  # cancelled as the start ended: nobody else would stop the system
+                await self.__aexit__()
+            raise
         return self
 
     async def __aexit__(self, *exc: object) -> None:
@@ -498,10 +534,10 @@ class System:
         if self._node is not None:  # the threads that wait for a part of it hear of its end
             node = self._node
             why = report.detail or report.reason
-            node.directory.mark(actor_key(self._top), Status.GONE, why)
+            node.directory.mark(actor_key(self._top), Presence.GONE, why)
             for name in registrars_of(as_child_spec(self.root), self._top):
                 if name not in node.registrars:
-                    node.directory.mark(registrar_key(name), Status.GONE, why)
+                    node.directory.mark(registrar_key(name), Presence.GONE, why)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
         self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
@@ -541,12 +577,17 @@ class System:
 
     def dormant(self) -> list[str]:
         """Return the registrars that hold or serve something, whose process died, and that nobody has opened again."""
-        return [name for name, status in self._running().statuses().items() if status is Status.DORMANT]
+        return [name for name, status in self._running().statuses().items() if status is Presence.DORMANT]
 
-    def release(self, name: str) -> None:
+    def release(self, name: str, *, force: bool = False) -> None:
         """Release everything that a dormant registrar holds; a provider that is down does so when it is back.
 
-        If the application ends before that, its next start finds the registrar dormant again.
+        Those that hold what it serves hear FATAL, and hold it no more. It goes on until the registrar is opened: under
+        its name, or by the `renamed_from` of a ChildSpec. If the application ends before all is released, its next
+        start finds the registrar dormant again.
+
+        Args:
+            force: forget what the registrar serves, too. No unload callback runs: whatever they would end stays.
 
         Raises:
             UsageError: the registrar is not dormant.
@@ -556,7 +597,7 @@ class System:
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
             raise UsageError(f"registrar {shown(name)}: not dormant; the dormant ones are: {there}")
-        node.dispatcher.run(give_up(node, name))
+        node.dispatcher.run(give_up(node, name, clear=force))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
@@ -715,10 +756,12 @@ class System:
         stats: dict[str, dict[str, int]] = {}
         for name, status in node.statuses().items():
             try:
-                stats[name] = registrar_in(node, name, patient=False).stats() if status is Status.UP else {}
+                stats[name] = registrar_in(node, name, patient=False).stats() if status is Presence.UP else {}
             except RrError:  # the registrar has ended just now
                 stats[name] = {}
-        tree = describe_supervisor(self.supervisor())
+        tree: dict[str, Any] = {"path": self._top, "state": "stopped"}
+        if self._end is None:  # what has ended is not asked: that would make a dead letter
+            tree = describe_supervisor(self.supervisor())
         return [*figures_of(tree, stats, self.dead_letters().count), *self._counters.figures()]
 
     def _publish(self, event: Facts) -> None:
@@ -730,6 +773,8 @@ class System:
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
+        elif "path" in event:
+            self._log.take(event)
         self._subscribers.tell(event)
 
     def _take_log(self, workers: Workers, event: Facts) -> None:
@@ -755,16 +800,40 @@ def _say_log_lost(error: BaseException, event: Facts | None) -> None:
 
 
 async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:
-    """Run fn() in a thread until it has ended; if cancelled, call give_up(), and wait for the end."""
-    running = asyncio.ensure_future(asyncio.to_thread(fn))
-    try:
-        await asyncio.shield(running)
-    except asyncio.CancelledError:
-        give_up()
-        await asyncio.wait((running,))
-        if not running.cancelled():
-            running.exception()  # retrieved: mostly it says that fn() was given up
-        raise
+    """Run fn() in a thread of its own until it has ended; if cancelled, call give_up(), and wait for the end.
+
+    The application's executor may be full of calls that wait for this one.
+
+    Raises:
+        UsageError: no event loop of asyncio runs in this thread.
+    """
+    check_asyncio("async with System")
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+    errors: list[BaseException] = []
+    context = contextvars.copy_context()
+
+    def run() -> None:
+        try:
+            context.run(fn)
+        except BaseException as error:
+            errors.append(error)
+        with contextlib.suppress(RuntimeError):  # the application's loop was closed meanwhile
+            loop.call_soon_threadsafe(ended.set)
+
+    threading.Thread(target=run, name="rr-system", daemon=True).start()
+    cancelled: asyncio.CancelledError | None = None
+    while not ended.is_set():
+        try:
+            await ended.wait()
+        except asyncio.CancelledError as error:  # at a second one, the work is ending already
+            if cancelled is None:
+                give_up()
+            cancelled = error
+    if cancelled is not None:
+        raise cancelled
+    if errors:
+        raise errors[0]
 
 
 def _free_top(id: str) -> str:
@@ -803,6 +872,10 @@ def _check_tree(supervisor: Supervisor, path: str) -> None:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
     names = registrars_of(as_child_spec(supervisor), path)
     check_managers(names, f"Supervisor {path}")
+    for id, old in renamed_managers(as_child_spec(supervisor), path).items():
+        if old in names:
+            expected = f"an id that no other manager has, as what {old!r} left is to be that of {id!r}"
+            raise invalid(f"Supervisor {path}", "renamed_from", expected, old)
     for name in names:
         if names.count(name) > 1:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib.machinery
 import subprocess
-import sys
 import time
 from typing import Self
 
 from rr_actors.base.checks import missing_library
 from rr_actors.base.errors import Unavailable, shown
+from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.lifeline import is_readable, kill_group
 
 _LIBRARIES = ("nicegui", "typer", "rich")
@@ -33,7 +33,7 @@ class WebPage:
                 raise missing_library(library, "serve_web", "web")
         where = ["--state", state_dir, "--host", host, "--port", str(port), "--child"]
         self._program = subprocess.Popen(
-            [sys.executable, "-m", "rr_actors", "web", *where],
+            [interpreter.python("serve_web"), "-m", "rr_actors", "web", *where],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             bufsize=0,

@@ -1,10 +1,11 @@
-"""`python -m rr_actors.testing`: the same as `rr-actors chaos`, without the libraries of the command line."""
+"""`python -m rr_actors.testing`, which `rr-actors chaos` runs: a system of its own that is harmed and checked."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from rr_actors.base.errors import UsageError
@@ -13,32 +14,31 @@ from rr_actors.testing.run import Options, run
 _WHAT = "Run a system of its own, kill and harm its processes at random, and check every promise in the end."
 
 
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="rr-actors chaos", description=_WHAT, argument_default=argparse.SUPPRESS)
+
+    def option(name: str, kind: Callable[[str], object], what: str, field: str | None = None) -> None:
+        parser.add_argument(f"--{name}", type=kind, dest=field or name, metavar=name.upper(), help=what)
+
+    option("kills", int, f"end after this number of SIGKILLs: {Options.kills}")
+    option("seconds", float, "end after this number of seconds, if that is sooner")
+    option("seed", int, "the seed of the faults; by default a new one")
+    option("state-dir", Path, "keep the state here; by default in a temporary directory", "state_dir")
+    option("json", Path, "also write the report to this file")
+    option("soak", float, "do no harm: watch this many seconds of load for growth", "soak_s")
+    option("churn", float, "of a soak: the mean seconds between replaced managers", "churn_s")
+    option("pace", float, f"the mean number of seconds between two faults: {Options.pace_s:g}", "pace_s")
+    option("patience", float, f"seconds that one fault or one check may take: {Options.patience_s:g}", "patience_s")
+    return parser
+
+
 def main() -> int:
     """Run chaos with this process's arguments; return 1 if a promise was broken, or could not be checked."""
-    parser = argparse.ArgumentParser(prog="python -m rr_actors.testing", description=_WHAT)
-    parser.add_argument("--kills", type=int, default=Options.kills, help="end after so many SIGKILLs: %(default)s")
-    parser.add_argument("--seconds", type=float, default=None, help="end after so many seconds, if that is sooner")
-    parser.add_argument("--seed", type=int, default=None, help="of what happens when; by default a new one")
-    parser.add_argument("--state-dir", type=Path, default=None, help="kept afterwards; by default a temporary one")
-    parser.add_argument("--json", type=Path, default=None, help="write the report here, too")
-    parser.add_argument("--soak", type=float, default=None, help="no harm: so many seconds of load, watched for growth")
-    parser.add_argument("--churn", type=float, default=None, help="of a soak: mean seconds until a manager is replaced")
-    parser.add_argument("--pace", type=float, default=Options.pace_s, help="mean seconds between faults: %(default)s")
-    parser.add_argument(
-        "--patience", type=float, default=Options.patience_s, help="seconds for one deed or one check: %(default)s"
-    )
-    given = parser.parse_args()
+    parser = _parser()
+    given = vars(parser.parse_args())
+    report_file: Path | None = given.pop("json", None)
     try:
-        options = Options.of(
-            kills=given.kills,
-            seconds=given.seconds,
-            seed=given.seed,
-            state_dir=given.state_dir,
-            soak_s=given.soak,
-            churn_s=given.churn,
-            pace_s=given.pace,
-            patience_s=given.patience,
-        )
+        options = Options(**given)
     except UsageError as error:
         parser.error(str(error))
     try:
@@ -47,8 +47,8 @@ def main() -> int:
         _show("interrupted; everything is stopped")
         return 130
     sys.stdout.write(report.text() + "\n")
-    if given.json is not None:
-        given.json.write_text(report.json())
+    if report_file is not None:
+        report_file.write_text(report.json())
     return 0 if report.passed else 1
 
 

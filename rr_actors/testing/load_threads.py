@@ -7,6 +7,7 @@ import threading
 import time
 import uuid
 from collections import Counter
+from typing import NamedTuple
 
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.engine.status import Status
@@ -18,27 +19,37 @@ from rr_actors.testing.report import Tally
 from rr_actors.testing.victim_managers import PATIENCE_S, Want
 
 _STATES = (State.OK, State.UPDATE, State.WARNING, State.ERROR, State.FATAL)
-_TOLD = "told-"  # the beginning of a consumer's messages; a registrar's begin otherwise
+_AFTER_FATAL = (State.FATAL, State.UPDATE)
+_TOLD = "told"  # a consumer's messages are "told-NANOSECONDS-ID", with when its call began; a registrar's are others
+
+
+class Sent(NamedTuple):
+    """A status that a consumer has sent successfully, and when the call returned (time.monotonic_ns())."""
+
+    message: str
+    state: State
+    returned_ns: int
 
 
 class Consumer:
     """One thread that uses a registrar of this process, which other threads use, too.
 
     Attributes:
-        app: the registrar.
-        held: the queries that it holds by its registrar's answers, each with the messages that it sent successfully.
+        system, app: the system, and the registrar.
+        tally: where violations are noted.
+        held: the queries that it holds by its registrar's answers, each with the statuses that it sent successfully.
     """
 
     def __init__(self, system: System, app: Registrar, servers: tuple[str, ...], seed: int, tally: Tally) -> None:
-        self._system = system
+        self.system = system
         self.app = app
         self._servers = servers
         self._plan = random.Random(seed)
-        self._tally = tally
+        self.tally = tally
         self._stopped = threading.Event()
         self._lock = threading.Lock()
-        self._heard: dict[str, Counter[str]] = {}  # by query: each message, and how often it was heard
-        self.held: list[tuple[Query, list[str]]] = []
+        self._heard: dict[str, list[Status]] = {}  # by query
+        self.held: list[tuple[Query, list[Sent]]] = []
         self._thread = threading.Thread(target=self._run, name=f"consumer of {app.name}", daemon=True)
 
     def start(self) -> None:
@@ -53,23 +64,51 @@ class Consumer:
         """Wait for the thread's last operation; note a violation if it runs after `deadline` (time.monotonic())."""
         self._thread.join(max(0.0, deadline - time.monotonic()))
         if self._thread.is_alive():
-            self._tally.violation(f"{self._thread.name}: a call hangs")
+            self.tally.violation(f"{self._thread.name}: a call hangs")
+
+    def load(self, server: str, want: Want, timeout_s: float) -> None:
+        """Load, and hold the query."""
+        self.held.append((self.app.load(server, want, on_status=self.hear, timeout_s=timeout_s), []))
+
+    def send(self, place: int, state: State) -> None:
+        """Send a status of the resource of the query at this place of `held`."""
+        query, sent = self.held[place]
+        message = f"{_TOLD}-{time.monotonic_ns()}-{uuid.uuid4().hex}"
+        self.system.registrar(query.registrar).send_status(query.resource_id, Status(state, message))
+        sent.append(Sent(message, state, time.monotonic_ns()))
+
+    def hear(self, status: Status) -> None:
+        """Note a status, as the callback of each load."""
+        if status.message.startswith(_TOLD):
+            with self._lock:
+                self._heard.setdefault(status.query_id, []).append(status)
 
     def check_heard(self) -> None:
-        """Check that each held query heard every status that was sent successfully, and none of them twice."""
+        """Check that each held query heard every status that was sent successfully, and none of them twice.
+
+        A query hears no OK, WARNING or ERROR of its resource after the resource's own FATAL. So it need not have heard
+        one if its call had not returned when the call with such a FATAL began. A status that is marked as repeated may
+        be the first that a query hears of it: its provider may have died between the commit and the sending.
+        """
         for query, sent in self.held:
             heard = self._check_twice(query.id)
-            for message in sent:
-                if message not in heard:
-                    self._tally.violation(f"{self.app.name}: query {query.id} never heard of {message}")
+            messages = {status.message for status in heard}
+            fatal = (one for one in heard if one.state is State.FATAL and one.source == query.server_id)
+            first_ns = min((int(one.message.split("-")[1]) for one in fatal), default=None)
+            for one in sent:
+                passed_over = first_ns is not None and one.returned_ns > first_ns and one.state not in _AFTER_FATAL
+                if one.message not in messages and not passed_over:
+                    of = [f"{other.state} {other.message}" for other in heard]
+                    text = f"query {query.id} never heard of {one.state} {one.message}, only of {of}"
+                    self.tally.violation(f"{self.app.name}: {text}")
 
-    def _check_twice(self, query_id: str) -> Counter[str]:
-        """Check that a query heard no message twice, and return the messages, which are then forgotten."""
+    def _check_twice(self, query_id: str) -> list[Status]:
+        """Check that a query heard no status twice, and return what it heard, which is then forgotten."""
         with self._lock:
-            heard = self._heard.pop(query_id, Counter[str]())
-        for message, count in heard.items():
+            heard = self._heard.pop(query_id, [])
+        for message, count in Counter(status.message for status in heard if not status.repeated).items():
             if count > 1:
-                self._tally.violation(f"{self.app.name}: query {query_id} heard of {message} {count} times")
+                self.tally.violation(f"{self.app.name}: query {query_id} heard of {message} {count} times")
         return heard
 
     def release(self) -> None:
@@ -78,7 +117,7 @@ class Consumer:
             try:
                 query.unload(timeout_s=PATIENCE_S)
             except RrError as error:
-                self._tally.violation(f"{self.app.name}: query {query.id} not released: {error!r}")
+                self.tally.violation(f"{self.app.name}: query {query.id} not released: {error!r}")
 
     def _run(self) -> None:
         while not self._stopped.wait(self._plan.uniform(0.0, 0.02)):
@@ -88,11 +127,11 @@ class Consumer:
             try:
                 what = self._do(kind)
             except RrError as error:
-                self._tally.error(kind, type(error).__name__)
+                self.tally.error(kind, type(error).__name__)
             except Exception as error:
-                self._tally.violation(f"{self.app.name}: {kind} raised {error!r}")
+                self.tally.violation(f"{self.app.name}: {kind} raised {error!r}")
             else:
-                self._tally.operation(kind, time.monotonic() - started, what)
+                self.tally.operation(kind, time.monotonic() - started, what)
 
     def _next(self) -> str:
         chance = self._plan.random()
@@ -107,16 +146,12 @@ class Consumer:
             case "load" | "hasty load":
                 timeout_s = PATIENCE_S if kind == "load" else self._plan.choice([0.001, 0.01, 0.1])
                 server, want = self._plan.choice(self._servers), Want(self._plan.randrange(30))
-                query = self.app.load(server, want, on_status=self._hear, timeout_s=timeout_s)
-                self.held.append((query, []))
+                self.load(server, want, timeout_s)
                 return server
             case "status":
-                query, sent = self._plan.choice(self.held)
-                message = f"{_TOLD}{uuid.uuid4().hex}"
-                state = self._plan.choices(_STATES, (40, 10, 30, 15, 5))[0]
-                self._system.registrar(query.registrar).send_status(query.resource_id, Status(state, message))
-                sent.append(message)
-                return query.server_id
+                place = self._plan.randrange(len(self.held))
+                self.send(place, self._plan.choices(_STATES, (40, 10, 30, 15, 5))[0])
+                return self.held[place][0].server_id
             case _:
                 query, _ = self.held.pop(self._plan.randrange(len(self.held)))
                 try:
@@ -124,8 +159,3 @@ class Consumer:
                 finally:
                     self._check_twice(query.id)
                 return query.server_id
-
-    def _hear(self, status: Status) -> None:
-        if not status.repeated and status.message.startswith(_TOLD):
-            with self._lock:
-                self._heard.setdefault(status.query_id, Counter())[status.message] += 1

@@ -12,11 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rr_actors.base.errors import CatalogDamaged, CatalogError, RrError
-from rr_actors.registrar.model.messages import PROTOCOL
 from rr_actors.storage.opening import read_rows
 from rr_actors.testing.report import KILLS, Tally
 from rr_actors.testing.victim_managers import cut_links
 from rr_actors.testing.victim_system import CREWS, ROOT_MAKERS, Plant
+from rr_actors.wire.handshake import PROTOCOL
 
 _FULL_BYTES = 16 * 1024
 """The largest size of a process's files on a full disk. The SQLite file of its catalog is larger, so nothing can be
@@ -191,7 +191,7 @@ class Monkey:
             self._plant.start_again(name)
 
     def _spoil(self, name: str, catalog: Path) -> str | None:
-        if not catalog.exists() or catalog.with_name("catalog.sqlite3-wal").exists():
+        if not catalog.exists() or [*catalog.parent.glob("catalog.sqlite3-wal"), *catalog.parent.glob("*.journal.*")]:
             return None  # the manager was killed before it had closed its catalog
         good = catalog.read_bytes()
         bad = self._spoil_byte(good, catalog)

@@ -7,7 +7,7 @@ import random
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from traceback import format_exception
 
@@ -31,56 +31,41 @@ _STALLED_DEEDS = 50  # a third of the deeds kill nothing
 
 @dataclass(frozen=True)
 class Options:
-    """The options of a run; Options.of() describes and checks them."""
+    """The options of a run.
+
+    Attributes:
+        kills: end after this number of SIGKILLs.
+        seconds: end after this number of seconds, if that is sooner.
+        seed: the seed of the faults; by default a new one.
+        state_dir: must be empty or missing; it is kept. None: a temporary directory.
+        soak_s: for this number of seconds, measure growth instead of harming the system.
+        churn_s: in a soak, the mean seconds between two managers that are killed, restarted, or added and removed.
+        pace_s: mean seconds between two deeds of the monkey.
+        patience_s: seconds that one deed or one check may take; after that the run stands still.
+
+    Raises:
+        UsageError: a value is out of range, or the directory is not empty.
+    """
 
     kills: int = 100
     seconds: float | None = None
-    seed: int = 0
+    seed: int = field(default_factory=lambda: random.SystemRandom().randrange(1_000_000))
     state_dir: Path | None = None
     soak_s: float | None = None
     churn_s: float | None = None
     pace_s: float = 0.15
     patience_s: float = 180.0
 
-    @classmethod
-    def of(
-        cls,
-        *,
-        kills: int = 100,
-        seconds: float | None = None,
-        seed: int | None = None,
-        state_dir: Path | None = None,
-        soak_s: float | None = None,
-        churn_s: float | None = None,
-        pace_s: float = 0.15,
-        patience_s: float = 180.0,
-    ) -> Options:
-        """Check the values of a command line, and make the options.
-
-        Args:
-            kills: end after this number of SIGKILLs.
-            seconds: end after this number of seconds, if that is sooner.
-            seed: the seed of the faults. None: a new one.
-            state_dir: must be empty or missing; it is kept. None: a temporary directory.
-            soak_s: for this number of seconds, measure growth instead of harming the system.
-            churn_s: in a soak, the mean seconds between two managers that are killed, restarted, or added and removed.
-            pace_s: mean seconds between two deeds of the monkey.
-            patience_s: seconds that one deed or one check may take; after that the run stands still.
-
-        Raises:
-            UsageError: a value is out of range, or the directory is not empty.
-        """
-        numbers = {"kills": kills, "seconds": seconds, "soak": soak_s, "churn": churn_s, "pace": pace_s}
-        numbers["patience"] = patience_s
-        for name, value in numbers.items():
+    def __post_init__(self) -> None:
+        for name in ("kills", "seconds", "soak_s", "churn_s", "pace_s", "patience_s"):
+            value = getattr(self, name)
             if value is not None and not value > 0:
-                raise UsageError(f"chaos: {name}: expected a number above 0, got {value}")
-        if churn_s is not None and soak_s is None:
+                raise UsageError(f"chaos: {name.removesuffix('_s')}: expected a number above 0, got {value}")
+        if self.churn_s is not None and self.soak_s is None:
             raise UsageError("chaos: churn: expected a soak with it, got none")
-        if state_dir is not None and state_dir.is_dir() and any(state_dir.iterdir()):
-            raise UsageError(f"chaos: {state_dir}: expected an empty directory or none, got one that holds something")
-        seed = random.SystemRandom().randrange(1_000_000) if seed is None else seed
-        return cls(kills, seconds, seed, state_dir, soak_s, churn_s, pace_s, patience_s)
+        place = self.state_dir
+        if place is not None and place.is_dir() and any(place.iterdir()):
+            raise UsageError(f"chaos: {place}: expected an empty directory or none, got one that holds something")
 
 
 def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Report:

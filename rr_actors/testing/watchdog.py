@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable
+
+from rr_actors.base.reporting.tracebacks import stacks_of_threads
 
 
 class Interrupted(Exception):
@@ -80,7 +81,7 @@ class Watch:
 def _stacks() -> list[str]:
     names = {thread.ident: thread.name for thread in threading.enumerate()}
     found: list[str] = []
-    for ident, frame in sys._current_frames().items():  # pyright: ignore[reportPrivateUsage]  # documented
+    for ident, frame in stacks_of_threads().items():
         lines = "".join(traceback.format_stack(frame)).rstrip()
         found.append(f"thread {names.get(ident, ident)}:\n{lines}")
     return found

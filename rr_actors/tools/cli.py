@@ -13,6 +13,9 @@ from typing import NoReturn
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import CatalogError, RrError, UsageError
 from rr_actors.system.console.console_client import NotRunning
+from rr_actors.tools.log_lines import printable
+
+_INTERRUPTED = 130  # as a shell has it
 
 
 def main() -> None:
@@ -25,13 +28,23 @@ def main() -> None:
         app(standalone_mode=True)
     except RrError as error:
         _leave(f"rr-actors: {error}", _code(error))
+    except KeyboardInterrupt:  # while the modules of the commands are imported
+        sys.exit(_INTERRUPTED)
+    except SystemExit as end:
+        if not isinstance(end.__context__, BrokenPipeError):  # of which typer makes exit code 1
+            raise
+        _close_output()
     except BrokenPipeError:
-        # The output's reader has closed it. Python would raise the error again when it flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        _close_output()
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _leave(f"rr-actors: {where}{error.strerror or error}")
+
+
+def _close_output() -> NoReturn:
+    """End with exit code 0, as the output's reader has closed it; else Python would raise again when it flushes."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(0)
 
 
 def _code(error: RrError) -> int:
@@ -41,5 +54,5 @@ def _code(error: RrError) -> int:
 
 
 def _leave(message: str, code: int = 2) -> NoReturn:
-    sys.stderr.write(message.replace("\n", " ") + "\n")
+    sys.stderr.write(printable(message.replace("\n", " ")) + "\n")
     sys.exit(code)

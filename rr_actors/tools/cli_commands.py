@@ -1,31 +1,56 @@
-"""The commands of `rr-actors` that read a state directory or run chaos, and their output."""
+"""The commands of `rr-actors` that need no running system, with their output: `inspect`, `doctor` and others."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import keyword
+import os
+import re
 import sys
-from collections.abc import Mapping
-from importlib import metadata
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
 
+import msgspec
 import typer
+from rich.cells import cell_len, set_cell_size
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Column, Table
 from rich.tree import Tree
 from typer.core import TyperGroup
 
-from rr_actors.base.errors import UsageError
-from rr_actors.registrar.model.rows import Held
+from rr_actors.base import __version__
+from rr_actors.base.errors import UsageError, shown
+from rr_actors.registrar.model.rows import Held, priority_of
+from rr_actors.registrar.pages import priority_text
 from rr_actors.system.console.console_client import find_console
-from rr_actors.testing.run import Options
-from rr_actors.testing.run import run as run_chaos
+from rr_actors.tools.doctor import examine
 from rr_actors.tools.inspection import Contents, check_state, read_state, readable
+from rr_actors.tools.log_lines import printable
+
+LOOK = "Look at a running system"
+CHANGE_RESOURCES = "Change its resources"
+CHANGE_TREE = "Run, change and stop it"
+RECORD = "Record what happens"
+LOOK_LATER = "Look into a state directory, whether its system runs or not"
+PROJECT = "This machine, and projects"
+_GROUPS = (LOOK, CHANGE_RESOURCES, CHANGE_TREE, RECORD, LOOK_LATER, PROJECT)
 
 
 class _Commands(TyperGroup):
-    """The commands. An option before the command is an error that says where options stand."""
+    """The commands, in groups. An option before the command is an error that says where options stand."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        commands: list[Any] = [self.get_command(ctx, name) for name in self.list_commands(ctx)]
+        for group in _GROUPS:
+            rows = [
+                (command.name, command.help.partition("\n\n")[0].partition(". ")[0].rstrip("."))
+                for command in commands
+                if command.rich_help_panel == group
+            ]
+            with formatter.section(group):
+                formatter.write_dl(rows)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:
@@ -41,6 +66,9 @@ app = typer.Typer(
     name="rr-actors", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
 )
 _PIPED_WIDTH = 200
+_NARROWEST = 80  # columns of a table: a narrower terminal wraps its lines, as cut cells would show only dots
+_LEAST = 16  # columns that stay of the column that gives way
+_PIPED = 40  # columns to which it is padded where there is no terminal
 
 StateDir = Annotated[Path | None, typer.Argument(help="The system's state directory. Default: that of --state.")]
 StateOption = Annotated[
@@ -49,12 +77,13 @@ StateOption = Annotated[
         "--state", envvar="RR_STATE", metavar="DIR", help="The system's state directory. Default: the one that runs."
     ),
 ]
+JsonOption = Annotated[bool, typer.Option("--json", help="For programs instead of people.")]
 
 
-@app.command()
+@app.command(rich_help_panel=PROJECT)
 def version() -> None:
     """Print the version."""
-    Console().print(metadata.version("rr-actors"), highlight=False)
+    Console().print(__version__, highlight=False)
 
 
 def _version_wanted(wanted: bool) -> None:
@@ -101,29 +130,24 @@ def _tell_damage(state: Mapping[str, Contents]) -> None:
     """
     damaged = {name: contents.damage for name, contents in state.items() if contents.damage}
     for name, damage in damaged.items():
-        typer.echo(f"{name}: cannot be read: {damage}", err=True)
+        say(f"{name}: cannot be read: {damage}", err=True)
     if damaged:
         raise typer.Exit(1)
 
 
-@app.command()
-def inspect(
-    state_dir: StateDir = None,
-    state_option: StateOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-) -> None:
+@app.command(rich_help_panel=LOOK_LATER)
+def inspect(state_dir: StateDir = None, state_option: StateOption = None, as_json: JsonOption = False) -> None:
     """Show every registrar's resources, the queries on them, and the queries that it holds elsewhere."""
     state = read_state(_found(state_dir, state_option))
     if as_json:
         typer.echo(json.dumps({name: _plain(contents) for name, contents in state.items()}, indent=2))
         return
-    console = _console()
     for contents in state.values():
-        _show(console, contents)
+        _show(contents)
     _tell_damage(state)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK_LATER)
 def tree(state_dir: StateDir = None, state_option: StateOption = None) -> None:
     """Show each registrar's own queries, and below them the resources that they depend on."""
     state = read_state(_found(state_dir, state_option))
@@ -131,7 +155,7 @@ def tree(state_dir: StateDir = None, state_option: StateOption = None) -> None:
     holders = {name: [held for held in contents.held.values() if not held.parent] for name, contents in state.items()}
     for name, roots in holders.items():
         if roots:
-            shown = Tree(f"[bold]{escape(name)}[/]")
+            shown = Tree(f"[bold]{_text(name)}[/]")
             for held in sorted(roots, key=lambda held: held.seq):
                 _grow(shown, held, state)
             console.print(shown)
@@ -140,13 +164,13 @@ def tree(state_dir: StateDir = None, state_option: StateOption = None) -> None:
         typer.echo("nobody holds anything")
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK_LATER)
 def check(state_dir: StateDir = None, state_option: StateOption = None) -> None:
     """Check the catalogs against each other; exit code 1 if they disagree."""
     found = _found(state_dir, state_option)
     violations = check_state(found)
     for violation in violations:
-        typer.echo(violation)
+        say(violation)
     if violations:
         raise typer.Exit(1)
     state = read_state(found)
@@ -154,96 +178,124 @@ def check(state_dir: StateDir = None, state_option: StateOption = None) -> None:
     typer.echo(f"{len(state)} catalogs, {queries} queries: they agree")
 
 
-@app.command()
-def chaos(
-    kills: Annotated[int, typer.Option(help="End after this number of SIGKILLs.")] = Options.kills,
-    seconds: Annotated[float | None, typer.Option(help="End after this number of seconds, if that is sooner.")] = None,
-    seed: Annotated[int | None, typer.Option(help="The seed of the faults. Default: a new one.")] = None,
-    state_dir: Annotated[Path | None, typer.Option(help="Keep the state here. Default: a temporary directory.")] = None,
-    report_file: Annotated[Path | None, typer.Option("--json", help="Also write the report to this file.")] = None,
-    soak: Annotated[float | None, typer.Option(help="Do no harm: watch this many seconds of load for growth.")] = None,
-    churn: Annotated[float | None, typer.Option(help="Of a soak: the mean seconds between replaced managers.")] = None,
-    pace: Annotated[float, typer.Option(help="The mean number of seconds between two faults.")] = Options.pace_s,
-    patience: Annotated[float, typer.Option(help="Seconds that one fault or one check may take.")] = Options.patience_s,
+@app.command(rich_help_panel=PROJECT, epilog="Example: rr-actors doctor --state /var/lib/robot")
+def doctor(
+    state: Annotated[
+        Path, typer.Option("--state", envvar="RR_STATE", metavar="DIR", help="Where a system's state is, or will be.")
+    ] = Path("rr_state"),
+    as_json: JsonOption = False,
 ) -> None:
-    """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
-    options = Options.of(
-        kills=kills,
-        seconds=seconds,
-        seed=seed,
-        state_dir=state_dir,
-        soak_s=soak,
-        churn_s=churn,
-        pace_s=pace,
-        patience_s=patience,
-    )
-    console = Console(stderr=True)
-    if console.is_terminal:
-        with console.status("starting") as status:
-            report = run_chaos(options, show=lambda line: status.update(escape(line)))
+    """Say what this machine lacks or limits of what a system needs, each with what to do; exit code 1 if it lacks any.
+
+    It starts a small system beside the state, and stops it.
+    """
+    findings = examine(state)
+    if as_json:
+        typer.echo(json.dumps(msgspec.to_builtins(findings)))
     else:
-        report = run_chaos(options, show=typer.echo)
-    typer.echo(report.text())
-    if report_file is not None:
-        report_file.write_text(report.json())
-    if not report.passed:
+        for one in findings:
+            say(f"{one.level:7}{one.what:24}{one.found}")
+            if one.todo:
+                say(f"{'':7}-> {one.todo}")
+    if any(one.level == "lacks" for one in findings):
         raise typer.Exit(1)
 
 
-def _show(console: Console, contents: Contents) -> None:
-    console.print(f"[bold]{escape(contents.name)}[/]  [dim]{escape(str(contents.path))}[/]", highlight=False)
+_TEMPLATES = Path(__file__).parent / "new_project"
+
+
+@app.command(rich_help_panel=PROJECT, epilog="Example: rr-actors new robot")
+def new(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="The project's: lower-case letters, digits and single hyphens.")
+    ],
+) -> None:
+    """Make a small project: two managers, an application, a test that kills one, a systemd unit, a Dockerfile."""
+    module = name.replace("-", "_")
+    if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
+        raise UsageError(f"NAME: expected lower-case letters, digits and single hyphens, got {shown(name)}")
+    if keyword.iskeyword(module) or importlib.util.find_spec(module) is not None:
+        raise UsageError(f"NAME: expected no word of Python and no name of an installed module, got {shown(name)}")
+    Path(name).mkdir()
+    for template in sorted(_TEMPLATES.rglob("*.txt")):
+        path, text = (
+            text.replace("_NAME_", name).replace("_MODULE_", module)
+            for text in (str(template.relative_to(_TEMPLATES)), template.read_text())
+        )
+        target = Path(name, path.removesuffix(".txt"))
+        target.parent.mkdir(exist_ok=True)
+        target.write_text(text)
+    typer.echo(f"made {name}: see {name}/README.md, or: cd {name}; python -m pytest; python -m {module}")
+
+
+@app.command(
+    rich_help_panel=PROJECT,
+    add_help_option=False,
+    context_settings={"ignore_unknown_options": True, "allow_extra_args": True},
+)
+def chaos(context: typer.Context) -> None:
+    """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-P", "-m", "rr_actors.testing", *context.args])
+
+
+def _show(contents: Contents) -> None:
+    typer.echo(f"{typer.style(printable(contents.name), bold=True)}  {printable(str(contents.path))}")
     if contents.damage:
-        console.print(f"  [red]{escape(contents.damage)}[/]")
+        say(f"  {contents.damage}")
     if contents.stored_servers:
-        console.print(f"  servers kept by value: {escape(', '.join(sorted(contents.stored_servers)))}")
+        say(f"  servers kept by value: {', '.join(sorted(contents.stored_servers))}")
     if contents.resources:
-        console.print(_resources(contents))
+        _say_resources(contents)
     if contents.held:
-        console.print(_held(contents))
+        _say_held(contents)
     if contents.notices:
-        console.print(f"  {len(contents.notices)} status notices on their way")
-    console.print()
+        typer.echo(f"  {len(contents.notices)} status notices on their way")
+    typer.echo()
 
 
-def _resources(contents: Contents) -> Table:
-    table = Table(_id("resource"), "server", "request", "response", "phase", "state", "held by")
-    for resource in sorted(contents.resources.values(), key=lambda resource: resource.id):
-        holders = ", ".join(query.origin for query in contents.holders(resource.id))
-        table.add_row(
+def _say_resources(contents: Contents) -> None:
+    heads = ("resource", "server", "request", "response", "phase", "state", "held by")
+    rows = [
+        (
             resource.id,
-            escape(resource.server),
-            escape(readable(resource.request)),
-            escape(readable(resource.response)),
+            resource.server,
+            readable(resource.request),
+            readable(resource.response),
             resource.phase,
             resource.state,
-            escape(holders) or "[dim]nobody[/]",
+            ", ".join(query.origin for query in contents.holders(resource.id)) or "nobody",
         )
-    return table
+        for resource in sorted(contents.resources.values(), key=lambda resource: resource.id)
+    ]
+    say_table(heads, rows, gives_way=("response", "request", "held by"))
 
 
-def _held(contents: Contents) -> Table:
-    table = Table(_id("query"), "at", "request", _id("for resource"), "hold", "state")
-    for held in sorted(contents.held.values(), key=lambda held: held.seq):
-        table.add_row(
+def _say_held(contents: Contents) -> None:
+    heads = ("query", "at", "request", "for resource", "hold", "state", "priority")
+    rows = [
+        (
             held.id,
-            escape(f"{held.registrar}/{held.server}"),
-            escape(readable(held.request)),
-            held.parent or "[dim]itself[/]",
+            f"{held.registrar}/{held.server}",
+            readable(held.request),
+            held.parent or "itself",
             held.hold,
             held.state,
+            priority_text(priority_of(held.priority)),
         )
-    return table
+        for held in sorted(contents.held.values(), key=lambda held: held.seq)
+    ]
+    say_table(heads, rows, gives_way=("request",), right=("priority",))
 
 
-def _id(header: str) -> Column:
-    """Return a column of ids, which is never cut: a part of an id is of no use."""
-    return Column(header, overflow="fold", min_width=16)
+def _text(text: str) -> str:
+    return escape(printable(text))
 
 
 def _grow(above: Tree, held: Held, state: dict[str, Contents], way: frozenset[str] = frozenset()) -> None:
     """Add a held query and, below it, its resource's queries. `way`: the queries above, in case damage made a ring."""
     what = f"{held.registrar}/{held.server}  {readable(held.request)}"
-    branch = above.add(f"{escape(what)}  [dim]{held.hold}[/] {held.state}")
+    branch = above.add(f"{_text(what)}  [dim]{held.hold}[/] {held.state}")
     provider = state.get(held.registrar)
     query = provider.queries.get(held.id) if provider else None
     if provider and query and held.id not in way:
@@ -265,7 +317,8 @@ def _plain(contents: Contents) -> dict[str, Any]:
                 "state": resource.state,
                 "message": resource.message,
                 "queries": [
-                    {"id": q.id, "origin": q.origin, "parent": q.parent} for q in contents.holders(resource.id)
+                    {"id": q.id, "origin": q.origin, "parent": q.parent, "priority": priority_of(q.priority)}
+                    for q in contents.holders(resource.id)
                 ],
                 "depends_on": [part.id for part in contents.parts(resource.id)],
             }
@@ -280,9 +333,83 @@ def _plain(contents: Contents) -> dict[str, Any]:
                 "parent": held.parent,
                 "hold": held.hold,
                 "state": held.state,
+                "priority": priority_of(held.priority),
             }
             for held in contents.held.values()
         ],
         "stored_servers": sorted(contents.stored_servers),
         "notices": len(contents.notices),
     }
+
+
+# -- printing: what users write may contain any character, and controls no terminal ----------------------------------
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print a text as one line."""
+    typer.echo(printable(text), err=err)
+
+
+def say_lines(text: str, before: str = "") -> None:
+    """Print each line of a text, with the text `before` in front of it."""
+    for line in text.splitlines():
+        say(before + line)
+
+
+def say_json(value: object) -> None:
+    """Print a value as one line of JSON."""
+    typer.echo(json_text(json.dumps(msgspec.to_builtins(value), ensure_ascii=False)))
+
+
+def json_text(line: str) -> str:
+    """Return a line of JSON in which escapes replace the characters that could control a terminal."""
+    if line.isprintable():
+        return line
+    return "".join(char if char.isprintable() else json.dumps(char)[1:-1] for char in line)
+
+
+def say_table(
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    gives_way: Sequence[str],
+    right: Sequence[str] = (),
+    wide: bool = False,
+) -> None:
+    """Print a table as wide as the terminal, but at least 80 columns; without a terminal, as wide as needed.
+
+    Args:
+        gives_way: the heads of the columns whose cells are shortened in the middle where the terminal is too narrow,
+            in this order.
+        right: the heads of the columns of numbers.
+        wide: shorten nothing; the terminal wraps the lines.
+    """
+    cells = [[printable(cell) for cell in row] for row in (heads, *rows)]
+    widths = [max(map(_width, column)) for column in zip(*cells, strict=True)]
+    terminal = sys.stdout.isatty() and not wide
+    room = max(os.get_terminal_size(sys.stdout.fileno()).columns, _NARROWEST) if terminal else 0
+    for yielding in map(heads.index, gives_way):
+        least = min(widths[yielding], _LEAST if terminal else _PIPED)
+        over = sum(widths) + 2 * (len(widths) - 1) - room
+        widths[yielding] = max(least, widths[yielding] - max(over, 0))
+        if terminal:
+            for row in cells:
+                row[yielding] = _shortened(row[yielding], widths[yielding])
+    for number, row in enumerate(cells):
+        line = "  ".join(
+            f"{' ' * (width - _width(cell))}{cell}" if head in right else f"{cell}{' ' * (width - _width(cell))}"
+            for head, cell, width in zip(heads, row, widths, strict=True)
+        ).rstrip()
+        typer.echo(typer.style(line, bold=True) if number == 0 else line)
+
+
+def _width(text: str) -> int:
+    return len(text) if text.isascii() else cell_len(text)
+
+
+def _shortened(text: str, width: int) -> str:
+    """Return a text of at most `width` cells: its beginning and its end."""
+    if _width(text) <= width:
+        return text
+    ahead = width // 2
+    return f"{set_cell_size(text, ahead)}…{set_cell_size(text[::-1], width - 1 - ahead)[::-1]}"

@@ -2,38 +2,58 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
+import math
 import signal
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import RrError, UsageError, shown
-from rr_actors.supervision.event_history import Record
+from rr_actors.base.errors import NotRunning, RrError, UsageError, few, shown
+from rr_actors.base.names import short_ids
+from rr_actors.registrar.model.rows import HIGHEST, LOWEST
+from rr_actors.registrar.pages import ResourceRow
+from rr_actors.supervision.event_history import Record, left_records, records_of
+from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import ConsoleClient, find_console
-from rr_actors.system.event_subscribers import kinds_for_all
+from rr_actors.system.console.console_view import Command
+from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools import graphs
-from rr_actors.tools.cli_commands import StateOption, app
-from rr_actors.tools.explanations import ago, event_line, explain, missed_line, record_line
+from rr_actors.tools.cli_commands import (
+    CHANGE_RESOURCES,
+    CHANGE_TREE,
+    LOOK,
+    JsonOption,
+    StateOption,
+    app,
+    say,
+    say_json,
+    say_lines,
+    say_table,
+)
+from rr_actors.tools.explanations import explain
 from rr_actors.tools.process_usage import usage_of
+from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
+from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, wait_for
 from rr_actors.tools.tree_runner import run_tree
 
 __all__ = ["app"]
 
 _GRACE_S = 10.0  # for an answer, added to the time limit of the command
+_UNLOAD_S = 60.0  # for the unload callbacks, after a grace
+_LATEST = 10  # records of a child that its status shows
 _SHOWN = 200  # rows of a list, unless more are asked for
 _COMPLETED = 50
-_NARROWEST = 80  # columns of a table: a narrower terminal wraps its lines, as cut cells would show only dots
+_TICK_S = 0.1  # while nothing happens, lines that are settled are printed so often
 
 
 # -- options that commands share -------------------------------------------------------------------------------------
@@ -54,8 +74,8 @@ def _completing(list_them: Callable[[ConsoleClient, str], list[str]]) -> Callabl
 
 
 def _children(client: ConsoleClient, incomplete: str) -> list[str]:
-    paths = [row.path for row in client.children().rows if row.depth]
-    return paths if "/" in incomplete else [path.rpartition("/")[2] for path in paths]
+    rows = [row for row in client.children().rows if row.depth]
+    return [row.path if "/" in incomplete else row.id for row in rows]
 
 
 def _servers(client: ConsoleClient, _incomplete: str) -> list[str]:
@@ -70,6 +90,10 @@ def _resources(client: ConsoleClient, incomplete: str) -> list[str]:
     return [row.id for row in client.resources(match=incomplete, limit=_COMPLETED).rows]
 
 
+def _children_or_resources(client: ConsoleClient, incomplete: str) -> list[str]:
+    return _children(client, incomplete) + _resources(client, incomplete)
+
+
 def _queries(client: ConsoleClient, incomplete: str) -> list[str]:
     return [row.id for row in client.queries(match=incomplete, limit=_COMPLETED).rows]
 
@@ -78,7 +102,6 @@ def _targets(client: ConsoleClient, incomplete: str) -> list[str]:
     return list(dict.fromkeys(_resources(client, incomplete) + _queries(client, incomplete)))
 
 
-JsonOption = Annotated[bool, typer.Option("--json", help="For programs instead of people.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say what would be done.")]
 Timeout = Annotated[
     float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=c.TIMEOUT_LIMIT_S, help="How long it may take.")
@@ -89,70 +112,72 @@ ChildArgument = Annotated[
 ]
 
 
+Output = Annotated[
+    Literal["json", "wide", "name"] | None,
+    typer.Option(
+        "--output", "-o", help="json: as --json; wide: shorten nothing; name: a name that commands take a line."
+    ),
+]
+
+
 def _client(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleClient:
     return ConsoleClient(find_console(state), timeout_s=timeout_s + _GRACE_S)
 
 
-def _carry_out(state: Path | None, command: c.Command, as_json: bool = False, timeout_s: float = 60.0) -> c.Done:
+def _carry_out(state: Path | None, command: Command[c.Done], as_json: bool = False, timeout_s: float = 60.0) -> c.Done:
     """Send a command to the running system, and print what it has done."""
     with _client(state, timeout_s) as client:
-        done = client.ask(command, c.Done)
-    typer.echo(_json({"done": done.text, **done.facts}) if as_json else done.text)
+        done = client.ask(command)
+    if as_json:
+        say_json({"done": done.text, **done.facts})
+    else:
+        say(done.text)
     return done
-
-
-def _json(value: object) -> str:
-    return json.dumps(msgspec.to_builtins(value), ensure_ascii=False)
-
-
-def _table(*columns: str, right: tuple[str, ...] = ()) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", no_wrap=True)
-    return table
-
-
-def _show(table: Table) -> None:
-    """Print a table as wide as the terminal, but at least 80 columns; without a terminal, as wide as needed."""
-    if sys.stdout.isatty():
-        Console(width=max(Console().width, _NARROWEST)).print(table)
-        return
-    console = Console(width=10_000)
-    with console.capture() as captured:
-        console.print(table)
-    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
 # -- looking ---------------------------------------------------------------------------------------------------------
 
 
-@app.command(epilog="Example: rr-actors ps --json | jq '.[] | select(.state != \"running\")'")
-def ps(state: StateOption = None, as_json: JsonOption = False) -> None:
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors ps --json | jq '.[] | select(.state != \"running\")'")
+def ps(
+    output: Output = None,
+    sort_by: Annotated[
+        Literal["up", "restarts", "cpu", "memory"] | None, typer.Option("--sort-by", help="The most first.")
+    ] = None,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
     """Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its start) and memory."""
     with _client(state) as client:
         rows = client.children().rows
     usages = {row.pid: usage_of(row.pid) for row in rows if row.pid is not None}
-    if as_json:
-        typer.echo(_json([_child_facts(row, usages) for row in rows]))
+    if sort_by is not None:
+        key = {"up": "up_s", "cpu": "cpu_percent", "memory": "memory_bytes"}.get(sort_by, sort_by)
+        rows = sorted(rows, key=lambda row: _child_facts(row, usages)[key] or 0, reverse=True)
+    if as_json or output == "json":
+        say_json([_child_facts(row, usages) for row in rows])
         return
-    table = _table(
-        "child", "state", "pid", "up", "restarts", "cpu", "memory", "", right=("pid", "up", "restarts", "cpu")
-    )
+    if output == "name":
+        say_lines("\n".join(row.path for row in rows))
+        return
+    heads = ("child", "state", "pid", "up", "restarts", "cpu", "memory", "")
+    table: list[tuple[str, ...]] = []
     seen: set[int] = set()
     for row in rows:
         usage = usages.get(row.pid) if row.pid is not None and row.pid not in seen else None
         seen.add(row.pid or 0)
-        table.add_row(
-            Text("  " * row.depth + row.path.rpartition("/")[2]),
+        cells = (
+            "  " * row.depth + row.id if sort_by is None else row.path,
             row.state,
             "" if row.pid is None else str(row.pid),
             "" if row.up_s is None else ago(row.up_s),
             str(row.restarts),
             "" if usage is None else f"{usage.cpu_percent:.1f} %",
             "" if usage is None else f"{usage.memory_bytes / 2**20:.0f} MiB",
-            Text(row.error or row.strategy),
+            row.error or row.strategy,
         )
-    _show(table)
+        table.append(cells)
+    say_table(heads, table, gives_way=("",), right=("pid", "up", "restarts", "cpu"))
 
 
 def _child_facts(row: c.ChildRow, usages: dict[int, Any]) -> dict[str, Any]:
@@ -161,99 +186,226 @@ def _child_facts(row: c.ChildRow, usages: dict[int, Any]) -> dict[str, Any]:
     return {name: getattr(row, name) for name in row.__struct_fields__} | used
 
 
-@app.command(epilog="Example: rr-actors resources /dev/video --registrar cameras")
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors resources /dev/video --registrar cameras")
 def resources(
     match: Annotated[
         str, typer.Argument(help="Only those with this text in their id, server, request or status.")
     ] = "",
     registrar: Annotated[str, typer.Option(help="Only this one's.", autocompletion=_completing(_registrars))] = "",
     limit: Limit = _SHOWN,
+    status: Annotated[
+        list[str] | None, typer.Option(help="Only those in this state, OK or loading for instance; may be repeated.")
+    ] = None,
+    holder: Annotated[
+        str, typer.Option(help="Only those that this registrar holds.", autocompletion=_completing(_registrars))
+    ] = "",
+    sort_by: Annotated[
+        Literal["resource", "state", "holders"] | None, typer.Option("--sort-by", help="The most holders first.")
+    ] = None,
+    wide: Annotated[bool, typer.Option("--wide", help="Shorten no request to fit the terminal.")] = False,
+    output: Output = None,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the resources of the running system, and who holds each."""
+    chooses = bool(status or holder or sort_by)
     with _client(state) as client:
-        page = client.resources(registrar, match, limit)
-    if as_json:
-        typer.echo(_json(page.rows))
+        page = client.resources(registrar, match, sys.maxsize if chooses else limit)
+    if chooses:
+        page = _chosen(page, {one.lower() for one in status or ()}, holder, sort_by, limit)
+    if as_json or output == "json":
+        say_json(page.rows)
         return
-    table = _table("resource", "server", "request", "state", "holders", "held by")
+    if not page.rows:
+        chosen = match or registrar or status or holder
+        say("no resource matches" if chosen else "there are no resources", err=True)
+    if output == "name":
+        say_lines("\n".join(f"{row.server} {row.request}" for row in page.rows))
+        return
+    table: list[tuple[str, ...]] = []
+    ids = short_ids(row.id for row in page.rows)
     for row in page.rows:
-        held_by = ", ".join(dict.fromkeys(holder.origin for holder in row.holders))
         shown_state = row.state if row.phase == "loaded" else f"{row.phase} {row.message}".rstrip()
-        table.add_row(row.id, row.server, Text(row.request), Text(shown_state), str(row.holder_count), Text(held_by))
-    _show(table)
+        name = f"{row.server} {row.request}"
+        table.append((name, shown_state, row.needed, str(row.holder_count), row.held_by, ids[row.id]))
+    if table:
+        heads = ("resource", "state", "priority", "holders", "held by", "id")
+        say_table(heads, table, gives_way=("resource",), right=("priority", "holders"), wide=wide or output == "wide")
     if page.total > len(page.rows):
-        typer.echo(f"{page.total - len(page.rows)} more: choose with MATCH, or raise --limit", err=True)
+        say(f"{page.total - len(page.rows)} more: choose with MATCH, or raise --limit", err=True)
     for note in page.notes:
-        typer.echo(f"not asked: {note}", err=True)
+        say(f"not asked: {note}", err=True)
 
 
-@app.command(epilog="Example: rr-actors events --follow --event exited --event restarted --json")
+def _chosen(page: c.Resources, states: set[str], holder: str, sort_by: str | None, limit: int) -> c.Resources:
+    """Return the rows of these states and this holder, in order. Of a resource's holders the first 20 are known."""
+    rows = [
+        row
+        for row in page.rows
+        if (not states or row.condition.lower() in states)
+        and (not holder or any(one.origin == holder for one in row.holders))
+    ]
+    keys: dict[str, Callable[[ResourceRow], Any]] = {
+        "resource": lambda row: (row.server, row.request),
+        "state": lambda row: row.condition,
+        "holders": lambda row: -row.holder_count,
+    }
+    if sort_by is not None:
+        rows.sort(key=keys[sort_by])
+    return c.Resources(len(rows), rows[:limit], page.notes)
+
+
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors usage --sort-by memory_bytes --registrar programs")
+def usage(
+    match: Annotated[
+        str, typer.Argument(help="Only those with this text in their id, server, request or status.")
+    ] = "",
+    registrar: Annotated[str, typer.Option(help="Only this one's.", autocompletion=_completing(_registrars))] = "",
+    sort_by: Annotated[
+        str, typer.Option("--sort-by", metavar="NUMBER", help="The most of it first: cpu or memory_bytes, say.")
+    ] = "",
+    limit: Limit = _SHOWN,
+    output: Output = None,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what each resource uses now, CPU and memory for instance, of servers that can say it."""
+    with _client(state) as client:
+        page = client.usages(registrar, match)
+    rows = [row for row in page.rows if row.usage or row.failure]
+    names = list(dict.fromkeys(name for row in rows for name in row.usage))
+    if sort_by:
+        if sort_by not in names:
+            raise UsageError(f"--sort-by: expected one of {', '.join(names) or 'no numbers'}, got {shown(sort_by)}")
+        rows.sort(key=lambda row: row.usage.get(sort_by, -math.inf), reverse=True)
+    total, rows = len(rows), rows[:limit]
+    if as_json or output == "json":
+        say_json([msgspec.structs.asdict(row) for row in rows])
+        return
+    if output == "name":
+        say_lines("\n".join(f"{row.server} {row.request}" for row in rows))
+        return
+    ids = short_ids(row.id for row in rows)
+    table = [
+        (f"{row.server} {row.request}", *(_amount(name, row.usage.get(name)) for name in names), ids[row.id])
+        for row in rows
+        if row.usage
+    ]
+    if table:
+        heads = ("resource", *(name.removesuffix("_bytes") for name in names), "id")
+        say_table(heads, table, gives_way=("resource",), right=heads[1:-1], wide=output == "wide")
+    elif not rows:
+        say("no resource says what it uses", err=True)
+    if total > len(rows):
+        say(f"{total - len(rows)} more: choose with MATCH, or raise --limit", err=True)
+    for row in rows:
+        if row.failure:
+            say(f"not known: {row.name} ({ids[row.id]}): {row.failure}", err=True)
+    for note in page.notes:
+        say(f"not asked: {note}", err=True)
+
+
+def _amount(name: str, number: float | None) -> str:
+    """Return the text for one number of a usage."""
+    if number is None:
+        return ""
+    return f"{number / 2**20:.0f} MiB" if name.endswith("_bytes") else f"{number:.6g}"
+
+
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors events --follow --event exited --event restarted --json")
 def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what happens, until Ctrl-C.")] = False,
     event: Annotated[list[str] | None, typer.Option(help="Only events of this kind; may be repeated.")] = None,
-    about: Annotated[str, typer.Option(help="Only those with this text in a fact: a path, server, id ...")] = "",
+    about: Annotated[str, typer.Option(help="Only those with this text in their line.")] = "",
+    child: Annotated[
+        str, typer.Option(help="Only of this child and all below it.", autocompletion=_completing(_children))
+    ] = "",
+    server: Annotated[
+        str, typer.Option(help="Only of this server or registrar.", autocompletion=_completing(_servers))
+    ] = "",
     count: Annotated[int | None, typer.Option(min=1, help="End after so many.")] = None,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the latest events of the tree; with --follow show new events, also those of resources."""
-    kinds = event or []
-    known = kinds_for_all()
-    if unknown := [kind for kind in kinds if kind not in known]:
-        raise UsageError(f"--event: expected one of {', '.join(known)}, got {shown(unknown[0])}")
-    with _client(state) as client:
-        if not follow:
-            records = _history(client, "", c.PAGE_LIMIT)
-            chosen = [one for one in records if (not kinds or one.event in kinds) and c.mentions(one.facts(), about)]
-            for record in chosen[-(count or 20) :]:
-                _say_record(record, as_json)
+    """Show the latest events of the tree; with --follow show new events, also those of resources.
+
+    A status that spreads over many resources is one line, with the number of those that it has reached. Events that say
+    the same are one line with their number. With --json each event is a line.
+    """
+    wanted = EventFilter.of(event or [], child, server, about)
+    if not follow:
+        happened = [event_of(record) for record in _history(state, "", c.PAGE_LIMIT)]
+        if as_json:
+            chosen = [one for one in happened if wanted.accepts(EventLine.of(one))]
+            _say_facts(chosen[-(count or 20) :])
             return
-        left = count
-        for part in client.follow(c.Follow(kinds, about)):
-            if isinstance(part, c.Missed):
-                _say_missed(part, as_json)
-                continue
-            for one in part.events[:left]:
-                _say_event(one, as_json)
-            left = None if left is None else left - len(part.events)
-            if left is not None and left <= 0:
-                return
-    typer.echo("the system has ended", err=True)
-
-
-def _history(client: ConsoleClient, child: str, limit: int) -> list[Record]:
-    found = client.ask(c.ListHistory(child, limit), c.Happenings)
-    if found.left_out:
-        typer.echo(f"{found.left_out} older records are not shown: they are too long for one answer", err=True)
-    return found.records
-
-
-def _say_event(event: c.Event, as_json: bool) -> None:
-    if as_json:
-        typer.echo(_json({"seq": event.seq, "at": event.at, "event": event.event, **event.facts}))
+        known = EventLines()
+        for one in happened:
+            known.take(one)
+        for line in known.lines(wanted)[-(count or 20) :]:
+            say(str(line))
         return
-    typer.echo(event_line(event))
+    with _client(state) as client:
+        left = sys.maxsize if count is None else count
+        for lines in _following(client, wanted, as_json):
+            for line in lines[:left]:
+                say_json(line) if as_json else say(str(line))
+            left -= len(lines)
+            if left <= 0:
+                return
+    say("the system has ended", err=True)
+
+
+def _following(client: ConsoleClient, wanted: EventFilter, as_json: bool) -> Iterator[list[Any]]:
+    """Yield what happens from now on: facts, or lines to which nothing more will be added."""
+    known = EventLines()
+    for part in client.follow(c.Follow(sorted(wanted.kinds)), _TICK_S):
+        if isinstance(part, c.Missed):
+            _say_missed(part, as_json)
+        elif as_json:
+            yield [_facts(one) for one in part.events if wanted.accepts(EventLine.of(one))]
+        else:
+            for one in part.events:
+                known.take(one)
+            yield list(filter(wanted.accepts, known.take_settled()))
+    yield list(filter(wanted.accepts, known.take_settled(all_of_them=True)))
+
+
+def _facts(event: c.Event) -> dict[str, Any]:
+    seq = {"seq": event.seq} if event.seq else {}
+    return {**seq, "event": event.event, "at": event.at, **event.facts}
+
+
+def _say_facts(events: list[c.Event]) -> None:
+    for event in events:
+        say_json(_facts(event))
+
+
+def _history(state: Path | None, child: str, limit: int) -> list[Record]:
+    """Return the records of a running system, or those that it has left in its state directory."""
+    try:
+        with _client(state) as client:
+            found = client.ask(questions.ListHistory(child, limit))
+    except NotRunning:
+        records = left_records(state) if state is not None else []
+        if not records:
+            raise
+        records = records_of(records, child)[-limit:]
+        say(f"no system runs in {state}: this is what it has left", err=True)
+        return records
+    if found.left_out:
+        say(f"{found.left_out} older records are not shown: they are too long for one answer", err=True)
+    return found.records
 
 
 def _say_missed(missed: c.Missed, as_json: bool) -> None:
     if as_json:
-        typer.echo(
-            _json({"missed": missed.count, "seq": missed.seq, "total": missed.tree.total, "tree": missed.tree.rows})
-        )
+        say_json({"missed": missed.count, "seq": missed.seq, "total": missed.tree.total, "tree": missed.tree.rows})
     else:
-        typer.echo(missed_line(missed))
+        say(missed_line(missed))
 
 
-def _say_record(record: Record, as_json: bool) -> None:
-    if as_json:
-        typer.echo(_json({"event": record.event, "at": record.at, **record.facts()}))
-    else:
-        typer.echo(record_line(record))
-
-
-@app.command(epilog="Example: rr-actors history root/cameras")
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors history root/cameras")
 def history(
     child: Annotated[str, typer.Argument(metavar="[ID]", autocompletion=_completing(_children))] = "",
     limit: Limit = 100,
@@ -261,26 +413,28 @@ def history(
     as_json: JsonOption = False,
 ) -> None:
     """Show the starts and exits of a child and all below it, or of all children, with reasons."""
-    with _client(state) as client:
-        records = _history(client, child, min(limit, c.PAGE_LIMIT))
+    records = _history(state, child, min(limit, c.PAGE_LIMIT))
+    if as_json:
+        _say_facts([event_of(record) for record in records])
+        return
     for record in records:
-        _say_record(record, as_json)
-        if record.traceback and not as_json:
-            typer.echo("".join(f"    {line}\n" for line in record.traceback.rstrip().splitlines()), nl=False)
+        say(event_line(event_of(record)))
+        if record.traceback:
+            say_lines(record.traceback.rstrip(), "    ")
 
 
-@app.command("dead-letters", epilog="Example: rr-actors dead-letters --limit 5")
+@app.command("dead-letters", rich_help_panel=LOOK, epilog="Example: rr-actors dead-letters --limit 5")
 def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
     """Show how many messages could not be delivered, and the newest of them."""
     with _client(state) as client:
-        letters = client.ask(c.ListDeadLetters(min(limit, c.PAGE_LIMIT)), c.Letters)
+        letters = client.ask(questions.ListDeadLetters(min(limit, c.PAGE_LIMIT)))
     if as_json:
-        typer.echo(_json({"count": letters.count, "letters": letters.letters}))
+        say_json({"count": letters.count, "letters": letters.letters})
     else:
-        typer.echo(str(DeadLetters(letters.count, letters.letters)))
+        say_lines(str(DeadLetters(letters.count, letters.letters)))
 
 
-@app.command(epilog="Example: rr-actors top --state rr_state")
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors top --state rr_state")
 def top(state: StateOption = None) -> None:
     """Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys."""
     with needing("top", "top"):  # the other verbs work without it
@@ -288,7 +442,7 @@ def top(state: StateOption = None) -> None:
     watch(state)
 
 
-@app.command(epilog="Example: rr-actors web --port 8080")
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors web --port 8080")
 def web(
     state: StateOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 for a free one.")] = 0,
@@ -299,24 +453,27 @@ def web(
     """Serve a live web page of a running system: its tree, its resources, the last minutes; print its address."""
     with needing("web", "web"):  # the other verbs work without it
         from rr_actors.tools.web.web_server import serve
-    serve(state, lab=lab, host=host, port=port, is_child=child, say=typer.echo)
+    serve(state, lab=lab, host=host, port=port, is_child=child, say=say)
 
 
-@app.command(epilog="Example: rr-actors why 01a2085d3f7c")
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors why 01a2085d3f7c")
 def why(
     id: Annotated[
         str,
-        typer.Argument(help="The id of a query or resource, or its beginning.", autocompletion=_completing(_targets)),
+        typer.Argument(
+            help="The id of a query or resource, its beginning or end, or a resource's name.",
+            autocompletion=_completing(_targets),
+        ),
     ],
     state: StateOption = None,
 ) -> None:
     """Say who holds a resource, for whom, since when, and what it waits for."""
     with _client(state) as client:
         for line in explain(client, id):
-            typer.echo(line)
+            say(line)
 
 
-@app.command(epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
 def graph(
     format: Annotated[
         Literal["mermaid", "dot", "svg", "png"],
@@ -334,15 +491,54 @@ def graph(
         page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
     draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
     drawn = draw(rows, page.rows, of)
-    typer.echo(graphs.png(drawn) if format == "png" else drawn, nl=format != "png")
+    if format == "png":
+        typer.echo(graphs.png(drawn), nl=False)
+    else:
+        say_lines(drawn)
     if page.total > len(page.rows):
-        typer.echo(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
+        say(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
+
+
+@app.command(
+    rich_help_panel=LOOK, epilog="Example: rr-actors wait 'cameras/camera \"/dev/video0\"' --for OK --timeout 10"
+)
+def wait(
+    target: Annotated[
+        str,
+        typer.Argument(
+            help="A child's id or path; or a resource's name, or its id, or the beginning or end of that.",
+            autocompletion=_completing(_children_or_resources),
+        ),
+    ],
+    wanted: Annotated[
+        str,
+        typer.Option(
+            "--for",
+            metavar="STATE",
+            help=f"Of a child: {', '.join(CHILD_STATES)}; of a resource: {', '.join(RESOURCE_STATES)}; or {GONE}. "
+            "Default: that the child runs, or the resource is loaded.",
+        ),
+    ] = "",
+    timeout_s: Timeout = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if in vain."""
+    began = time.monotonic()
+    done, seen = wait_for(lambda: _client(state), target, wanted, timeout_s)
+    waited_s = round(time.monotonic() - began, 1)
+    if as_json:
+        say_json({"target": target, "state": seen, "waited_s": waited_s, "done": done})
+    else:
+        say(f"{target}: {seen} after {waited_s:g} s", err=not done)
+    if not done:
+        raise typer.Exit(1)
 
 
 # -- driving ---------------------------------------------------------------------------------------------------------
 
 
-@app.command(epilog="Example: rr-actors load cameras/camera '\"/dev/video0\"' --hold")
+@app.command(rich_help_panel=CHANGE_RESOURCES, epilog="Example: rr-actors load cameras/camera '\"/dev/video0\"' --hold")
 def load(
     server: Annotated[str, typer.Argument(help="REGISTRAR/SERVER.", autocompletion=_completing(_servers))],
     request: Annotated[str, typer.Argument(metavar="REQUEST-AS-JSON", help="The request: '\"front\"', '{\"x\": 1}'.")],
@@ -355,6 +551,7 @@ def load(
             "--as", metavar="NAME", help="Hold it in this registrar's name.", autocompletion=_completing(_registrars)
         ),
     ] = "",
+    priority: Annotated[str, typer.Option(help="From -1000 to 1000, or `standby`.")] = "0",
     timeout_s: Timeout = 30.0,
     state: StateOption = None,
     as_json: JsonOption = False,
@@ -362,18 +559,47 @@ def load(
 ) -> None:
     """Load a resource and show its response; without --hold or --as it is released again at once."""
     keep = hold or bool(holder)
-    command = c.Load(server, request, holder, keep, timeout_s, dry_run)
+    command = commands.Load(server, request, holder, keep, timeout_s, dry_run, _priority("--priority", priority))
     done = _carry_out(state, command, as_json, timeout_s)
     if "response" in done.facts and not as_json:
-        typer.echo(json.dumps(done.facts["response"], ensure_ascii=False))
+        say_json(done.facts["response"])
 
 
-@app.command(epilog="Example: rr-actors unload 01a2085d3f7c")
+@app.command(
+    rich_help_panel=CHANGE_RESOURCES,
+    epilog="Example: rr-actors priority 01a2085d3f7c standby",
+    context_settings={"ignore_unknown_options": True},  # a negative number is no option
+)
+def priority(
+    id: Annotated[
+        str, typer.Argument(help="The id of a query, its beginning or end.", autocompletion=_completing(_targets))
+    ],
+    value: Annotated[str, typer.Argument(metavar="PRIORITY", help="From -1000 to 1000, or `standby`.")],
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Give a query of any holder a priority; what its resource depends on follows."""
+    _carry_out(state, commands.GivePriority(id, _priority("PRIORITY", value), dry_run), as_json)
+
+
+def _priority(what: str, text: str) -> int | None:
+    if text == "standby":
+        return None
+    with contextlib.suppress(ValueError):
+        if LOWEST <= (number := int(text)) <= HIGHEST:
+            return number
+    raise UsageError(f"{what}: expected a whole number from {LOWEST} to {HIGHEST}, or standby, got {shown(text)}")
+
+
+@app.command(rich_help_panel=CHANGE_RESOURCES, epilog="Example: rr-actors unload 01a2085d3f7c")
 def unload(
     id: Annotated[
         str,
         typer.Argument(
-            help="The id of a query, or its beginning; with --force a resource's.", autocompletion=_completing(_targets)
+            help="The id of a query, its beginning or end, or a resource's name; with --force also a resource's id, or "
+            "a server that is not registered.",
+            autocompletion=_completing(_targets),
         ),
     ],
     force: Annotated[bool, typer.Option("--force", help="Take the resource away from all its holders.")] = False,
@@ -383,35 +609,106 @@ def unload(
     dry_run: DryRun = False,
 ) -> None:
     """Release a query of any holder; with --force take a resource away from all its holders, which hear FATAL."""
-    _carry_out(state, c.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
+    _carry_out(state, commands.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
 
 
-@app.command(epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'")
+@app.command(
+    rich_help_panel=CHANGE_RESOURCES,
+    epilog="Example: rr-actors revoke 'cameras/camera \"/dev/video0\"' 'low battery' --grace 10",
+)
+def revoke(
+    id: Annotated[
+        str,
+        typer.Argument(
+            help="The resource's id, its beginning or end, or its name.", autocompletion=_completing(_resources)
+        ),
+    ],
+    why: Annotated[str, typer.Argument(help="The reason, which its holders hear.")],
+    grace_s: Annotated[
+        float,
+        typer.Option(
+            "--grace", metavar="SECONDS", min=0.0, max=c.TIMEOUT_LIMIT_S, help="After them it is unloaded by force."
+        ),
+    ] = 5.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Take a resource away from its holders in its owner's name: what depends on it ends first, or replaces it."""
+    _carry_out(state, commands.Revoke(id, why, grace_s, dry_run), as_json, grace_s + _UNLOAD_S)
+
+
+@app.command(
+    rich_help_panel=CHANGE_RESOURCES,
+    epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'",
+)
 def status(
     target: Annotated[
         str,
         typer.Argument(
-            metavar="SERVER/RESOURCE",
-            help="The resource's id, or its beginning, after its server.",
-            autocompletion=_completing(_resources),
+            metavar="CHILD|SERVER/RESOURCE",
+            help="A child's id or path; or a resource's id, its beginning or end, after its server; or its name.",
+            autocompletion=_completing(_children_or_resources),
         ),
     ],
-    said: Annotated[str, typer.Argument(metavar="STATE", help="OK, UPDATE, WARNING, ERROR or FATAL.")],
+    said: Annotated[str, typer.Argument(metavar="[STATE]", help="OK, UPDATE, WARNING, ERROR or FATAL.")] = "",
     message: Annotated[str, typer.Argument(help="For people.")] = "",
     state: StateOption = None,
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Send a resource's status in its owner's name to its holders, and to the resources that depend on it."""
+    """Show how a child or a resource is; with STATE, send a resource's status to its holders in its owner's name."""
+    if not said:
+        _show_status(state, target, as_json)
+        return
     states = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
     if said.upper() not in states:
         raise UsageError(f"STATE: expected {', '.join(states)}, got {shown(said)}")
-    before, _, id = target.rpartition("/")
+    before, _, id = target.rpartition("/") if " " not in target else ("", "", target)
     registrar = before.partition("/")[0]
-    _carry_out(state, c.SendStatus(id, cast("Any", said.upper()), message, registrar, dry_run), as_json)
+    _carry_out(state, commands.SendStatus(id, cast("Any", said.upper()), message, registrar, dry_run), as_json)
 
 
-@app.command(epilog="Example: rr-actors kill cameras --signal SIGSTOP")
+def _show_status(state: Path | None, target: str, as_json: bool) -> None:
+    """Show a child with its latest history, or explain a resource; exit code 1 if a child does not run."""
+    with _client(state) as client:
+        rows = [row for row in client.children().rows if target in (row.path, row.id)]
+        if not rows:
+            lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
+            say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
+            return
+        if len(rows) > 1:
+            raise UsageError(f"{shown(target)}: several children have this id: {few(row.path for row in rows)}")
+        (row,) = rows
+        served = [one for one in client.registrars().rows if one.name == row.id]
+        records = client.ask(questions.ListHistory(row.path, _LATEST)).records
+    facts = _child_facts(row, {row.pid: usage_of(row.pid)} if row.pid is not None else {})
+    if as_json:
+        say_json(facts | {"registrars": served, "history": [_facts(event_of(record)) for record in records]})
+    else:
+        say_lines("\n".join(_child_lines(row, facts, served)))
+        say_lines("\n".join(event_line(event_of(record)) for record in records), "    ")
+    if row.state != "running":
+        raise typer.Exit(1)
+
+
+def _child_lines(row: c.ChildRow, facts: dict[str, Any], served: list[c.RegistrarRow]) -> Iterator[str]:
+    yield f"{row.path}: {row.state}{f', {row.error}' if row.error else ''}"
+    if row.pid is not None:
+        up = "" if row.up_s is None else f", up for {ago(row.up_s)}"
+        yield f"    process {row.pid}{up}, {row.restarts} restart{'' if row.restarts == 1 else 's'}"
+    if facts["memory_bytes"] is not None:
+        yield f"    {facts['cpu_percent']:.1f} % of a core, {facts['memory_bytes'] / 2**20:.0f} MiB"
+    if row.strategy:
+        yield f"    {row.strategy}"
+    for one in served:
+        counts = ", ".join(f"{count} {name}" for name, count in one.counts.items() if count)
+        yield f"    registrar {one.name}: {one.status}, serves {', '.join(one.servers) or 'nothing'}"
+        if counts:
+            yield f"        {counts}"
+
+
+@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors kill cameras --signal SIGSTOP")
 def kill(
     child: ChildArgument,
     signal_name: Annotated[str, typer.Option("--signal", "-s", help="A signal's name or number.")] = "SIGKILL",
@@ -420,7 +717,7 @@ def kill(
     dry_run: DryRun = False,
 ) -> None:
     """Send a signal to a child's process; if the child ends, its supervisor handles that as any end."""
-    _carry_out(state, c.Kill(child, _signal_number(signal_name), dry_run), as_json)
+    _carry_out(state, commands.Kill(child, _signal_number(signal_name), dry_run), as_json)
 
 
 def _signal_number(text: str) -> int:
@@ -432,23 +729,23 @@ def _signal_number(text: str) -> int:
     return signal.Signals[name].value
 
 
-@app.command(epilog="Example: rr-actors terminate root/inner/cameras")
+@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors terminate root/inner/cameras")
 def terminate(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
     """Stop a child in order. It stays stopped until restart; a temporary child is forgotten."""
-    _carry_out(state, c.Terminate(child, dry_run), as_json)
+    _carry_out(state, commands.Terminate(child, dry_run), as_json)
 
 
-@app.command(epilog="Example: rr-actors restart cameras")
+@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors restart cameras")
 def restart(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
     """Start a child again. If it runs, it is stopped in order first."""
-    _carry_out(state, c.Restart(child, dry_run), as_json)
+    _carry_out(state, commands.Restart(child, dry_run), as_json)
 
 
-@app.command(epilog="Example: rr-actors start lidar.toml --under root/sensors")
+@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors start lidar.toml --under root/sensors")
 def start(
     spec: Annotated[
         Path, typer.Argument(metavar="SPEC.toml", help="actor = 'module:class', id = ...; or a supervisor.")
@@ -465,16 +762,28 @@ def start(
         text = spec.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{spec}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    _carry_out(state, c.StartChild(text, under, str(spec), dry_run), as_json)
+    _carry_out(state, commands.StartChild(text, under, str(spec), dry_run), as_json)
 
 
-@app.command(epilog="Example: rr-actors shutdown --state rr_state")
-def shutdown(state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False) -> None:
+@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors shutdown --state rr_state")
+def shutdown(
+    wait: Annotated[bool, typer.Option("--wait", help="End when all children have stopped.")] = False,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
     """Stop the whole system in order, as its own stop() does. A program that waits for the system's end goes on."""
-    _carry_out(state, c.ShutDown(dry_run), as_json)
+    if not wait or dry_run:
+        _carry_out(state, commands.ShutDown(dry_run), as_json)
+        return
+    with _client(state) as client:
+        happens = client.follow(c.Follow())
+        _carry_out(state, commands.ShutDown(), as_json)
+        for _ in happens:  # until the system's console ends, after its children
+            pass
 
 
-@app.command(epilog="Example: rr-actors run robot.toml --state /var/lib/robot --log debug")
+@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors run robot.toml --state /var/lib/robot --log debug")
 def run(
     tree: Annotated[Path, typer.Argument(metavar="TREE.toml", help="The tree, as Supervisor.from_toml reads it.")],
     state: Annotated[

@@ -1,35 +1,46 @@
-"""Explanations: sentences that say who holds a resource, for whom, since when, and why it waits; events as lines."""
+"""Explanations: sentences that say who holds a resource, for whom, since when, and why it waits."""
 
 from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
-from rr_actors.base.errors import UnknownQuery, shown
+from rr_actors.base.errors import UnknownQuery, UsageError, few, shown
+from rr_actors.base.names import short_id, short_ids
+from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
 from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
-from rr_actors.supervision.event_history import Record
 from rr_actors.system.console.console_client import ConsoleClient
-from rr_actors.system.console.console_messages import Event, Find, Found, Missed
+from rr_actors.system.console.console_messages import Found
+from rr_actors.system.console.console_questions import Find
+from rr_actors.system.recording.event_texts import ago
 
+_MOST = 5  # things that one beginning of an id may name
 _DEEP = 8  # resources above one another
 _ID = re.compile(r"[0-9a-f]{12}7[0-9a-f]{19}")
+_NAMES_KEPT = 10_000
+_names: dict[str, str] = {}  # of resources, by their ids
 _EARLIEST_S = 1_600_000_000.0  # an id that is no UUIDv7 gives another time
 
 
 def explain(client: ConsoleClient, id: str) -> list[str]:
-    """Return sentences about the query or resource whose id is, or begins with, `id`.
+    """Return sentences about the query or resource whose id or name is `id`, or whose id begins or ends so.
 
     Raises:
         UnknownQuery: no registrar has such an id.
+        UsageError: more than five ids have `id` in them.
     """
-    found = client.ask(Find(id), Found)
+    found = client.ask(Find(id))
     if not found.queries and not found.resources:
         hint = "; ".join(found.notes) or "rr-actors resources lists those that there are"
         raise UnknownQuery(f"{shown(id)}: no query and no resource has this id ({hint})", query_id=id)
+    if len(found.queries) + len(found.resources) > _MOST:
+        ids = short_ids(row.id for row in (*found.resources, *found.queries))
+        several = few(f"{ids[row.id]} ({row.name})" for row in (*found.resources, *found.queries))
+        raise UsageError(f"{shown(id)}: several ids have this in them: {several}; give more of the id")
     lines: list[str] = []
     for query in found.queries:
-        lines += _of_query(query)
+        lines += _of_query(client, query)
     for resource in found.resources:
         lines += _of_resource(client, resource)
     return [*lines, *(f"Not asked: {note}" for note in found.notes)]
@@ -43,40 +54,16 @@ def since(id: str) -> float | None:
     return at if at > _EARLIEST_S else None
 
 
-def ago(seconds: float) -> str:
-    """Return a time span for people: "5 s", "3 min", "2 h 10 min", "4 days"."""
-    minutes = round(seconds / 60)  # rounded before it is divided: else there would be "1 h 60 min"
-    if round(seconds) < 60:
-        return f"{seconds:.0f} s"
-    if minutes < 60:
-        return f"{minutes} min"
-    if minutes < 2 * 24 * 60:
-        return f"{minutes // 60} h {minutes % 60} min"
-    return f"{seconds / 86_400:.0f} days"
-
-
-def event_line(event: Event) -> str:
-    """Return an event of the feed as a line for people: its time, kind, subject, and the facts that are not empty."""
-    facts = {key: value for key, value in event.facts.items() if key not in ("kind", "traceback", "ready_s", "up_s")}
-    subject = facts.pop("path", None) or facts.pop("server", "")
-    rest = " ".join(f"{key}={value}" for key, value in facts.items() if value not in ("", None) and key != "registrar")
-    return f"{_clock(event.at)}  {event.event:<12} {subject}  {rest}".rstrip()
-
-
-def missed_line(missed: Missed) -> str:
-    """Return a sentence that says how many events a reader of the feed has missed."""
-    return f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow"
-
-
-def record_line(record: Record, above: str = "") -> str:
-    """Return a record of the history as a line for people, without its traceback; its path from `above` on."""
-    path = record.path.removeprefix(above).removeprefix("/")
-    facts = str(record).partition(" ")[2].removeprefix(f"path={record.path}").strip()
-    return f"{_clock(record.at)}  {record.event:<12} {path}{'  ' if path else ''}{facts}"
-
-
-def _clock(at: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(at)) + f".{int(at % 1 * 1000):03}"
+def name_of_resource(ask: Callable[[Find], Found], id: str, registrar: str) -> str:
+    """Return the name of a registrar's resource; it is asked for once, because a resource keeps its name."""
+    if (name := _names.get(id)) is None:
+        found = [row.name for row in ask(Find(id, registrar)).resources if row.id == id]
+        name = found[0] if found else f"resource {short_id(id)}"
+        if found:
+            if len(_names) >= _NAMES_KEPT:
+                _names.clear()
+            _names[id] = name
+    return name
 
 
 def _since(id: str) -> str:
@@ -86,24 +73,32 @@ def _since(id: str) -> str:
     return f" since {time.strftime('%H:%M:%S', time.localtime(at))} ({ago(max(0.0, time.time() - at))})"
 
 
-def _of_query(query: QueryRow) -> Iterator[str]:
-    whose = f"resource {query.parent} of {query.origin}" if query.parent else "itself"
-    what = f"{query.server} {query.request}"
+def _of_query(client: ConsoleClient, query: QueryRow) -> Iterator[str]:
+    whose = name_of_resource(client.ask, query.parent, query.origin) if query.parent else "itself"
+    said = f"Query {short_id(query.id)}: {query.origin}"
     match query.hold:
         case "pending":
-            yield f"Query {query.id}: {query.origin} has waited for {what}{_since(query.id)}, for {whose}."
+            yield f"{said} has waited for {query.name}{_since(query.id)}, for {whose}."
         case "owed":
-            yield f"Query {query.id}: {query.origin} has released {what}, and {query.server} does not know it yet."
+            yield f"{said} has released {query.name}, and {query.server} does not know it yet."
         case _:
-            yield f"Query {query.id}: {query.origin} holds {what}{_since(query.id)}, for {whose}."
+            yield f"{said} holds {query.name}{_since(query.id)}, for {whose}{_priority(query.priority)}."
 
 
 def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
     yield f"{_named(resource)} {_phase(resource)}"
-    if resource.message and resource.state:
+    if resource.message.startswith(WAITS_FOR_SERVER):
+        yield f"It {resource.message}."
+    elif resource.revoked:
+        yield f"It is revoked ({resource.message}): it is unloaded when its holders have let it go, or at the deadline."
+    elif resource.message and resource.phase in ("loaded", "unloading", "paused"):
         yield f"Its last status was {resource.state}: {resource.message}"
     if not resource.holder_count:
         yield "Nobody holds it."
+    elif resource.priority is None:
+        yield "Nobody needs it now: all its holders have it on standby."
+    elif resource.priority:
+        yield f"Its priority is {resource.priority}, the highest of its holders."
     for holder in resource.holders:
         yield from _of_holder(client, holder, "", {resource.id})
     if resource.holder_count > len(resource.holders):
@@ -113,7 +108,7 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
 
 
 def _named(resource: ResourceRow) -> str:
-    return f"{resource.server} {resource.request} (resource {resource.id})"
+    return f"{resource.name} ({short_id(resource.id)})"
 
 
 def _phase(resource: ResourceRow) -> str:
@@ -125,38 +120,56 @@ def _phase(resource: ResourceRow) -> str:
             far = f", {resource.message} so far" if resource.message else ""
             return f"is being loaded{_since(resource.id)}{again}{far}: its load callback has not returned."
         case "unloading":
+            if resource.message.startswith(WAITS_FOR_SERVER):
+                return "is to be unloaded."
             return "is being unloaded: its unload callback has not returned."
         case "unload_failed":
-            return f"could not be unloaded: its callback raised. Try again: rr-actors unload --force {resource.id}"
+            verb = f"`rr-actors unload --force {short_id(resource.id)}`"
+            again = f"{verb} tries again, or removes it if its callback runs no more."
+            return f"could not be unloaded: {resource.message}. {again}"
+        case "pausing":
+            return "is being paused, as nobody needs it now: its pause callback has not returned."
+        case "paused" if resource.state == "FATAL":
+            return "is paused, and FATAL: it does not run again."
+        case "paused":
+            return "is paused, as nobody needs it now. A load resumes it."
+        case "resuming":
+            return "is being resumed: its parts are, or its resume callback has not returned."
         case _:
             return f"is loaded{_since(resource.id)}, and {resource.state}."
 
 
 def _of_holder(client: ConsoleClient, holder: Holder, indent: str, below: set[str]) -> Iterator[str]:
     """Say that a holder holds the resource; if that is for another resource, say who holds the other one."""
+    if holder.unheard:
+        yield f"{indent}{holder.origin} has not dealt with {holder.unheard} of its statuses."
     if not holder.parent:
-        yield f"{indent}{holder.origin} holds it{_since(holder.query_id)}, for itself (query {holder.query_id})."
+        query = f"(query {short_id(holder.query_id)}){_priority(holder.priority)}"
+        yield f"{indent}{holder.origin} holds it{_since(holder.query_id)}, for itself {query}."
         return
-    above = client.ask(Find(holder.parent), Found).resources
-    what = _named(above[0]) if above else f"its resource {holder.parent}"
-    yield f"{indent}{holder.origin} holds it{_since(holder.query_id)}, for {what}."
+    above = client.ask(Find(holder.parent)).resources
+    what = _named(above[0]) if above else f"its resource {short_id(holder.parent)}"
+    yield f"{indent}{holder.origin} holds it{_since(holder.query_id)}, for {what}{_priority(holder.priority)}."
     if above and holder.parent not in below and len(below) < _DEEP:
         for other in above[0].holders:
             yield from _of_holder(client, other, indent + "  ", below | {holder.parent})
 
 
+def _priority(priority: int | None) -> str:
+    return ", on standby" if priority is None else f", with priority {priority}" if priority else ""
+
+
 def _of_part(client: ConsoleClient, part: str, indent: str, above: set[str]) -> Iterator[str]:
     """Say on which part a resource depends; if it waits for the part, say what that waits for."""
-    found = client.ask(Find(part), Found)
+    found = client.ask(Find(part))
     queries = [query for query in found.queries if query.id == part]
     if not queries:
         return
     query = queries[0]
-    what = f"{query.server} {query.request}"
     if query.hold != "pending":
-        yield f"{indent}It depends on {what} (query {query.id})."
+        yield f"{indent}It depends on {query.name} (query {short_id(query.id)})."
         return
-    yield f"{indent}It waits for {what}{_since(query.id)} (query {query.id})."
+    yield f"{indent}It waits for {query.name}{_since(query.id)} (query {short_id(query.id)})."
     for resource in found.resources:
         if resource.id in above or len(above) >= _DEEP:
             yield f"{indent}  {_named(resource)} waits for it in turn."

@@ -13,7 +13,6 @@ from rr_actors.supervision.core.rendering import Tree, dot_text, mermaid_text, s
 from rr_actors.system.console.console_messages import ChildRow
 
 Part = Literal["tree", "dependencies", "both"]
-_LABEL = 60  # characters of a request
 _HOLDER = "holder "  # no id of a resource begins so
 
 
@@ -76,7 +75,7 @@ def _nested(rows: list[ChildRow]) -> dict[str, Any]:
     """Return the tree of these rows as rendering.py takes it. Each supervisor comes before its children."""
     nodes: dict[str, dict[str, Any]] = {}
     for row in rows:
-        node: dict[str, Any] = {"id": row.path.rpartition("/")[2], "path": row.path, "type": row.type}
+        node: dict[str, Any] = {"id": row.id, "path": row.path, "type": row.type}
         node |= {"what": row.strategy, "state": row.state, "pid": row.pid, "restarts": row.restarts, "children": []}
         nodes[row.path] = node
         above = nodes.get(row.path.rpartition("/")[0])
@@ -114,8 +113,7 @@ def _by_registrar(resources: list[ResourceRow]) -> list[tuple[str, list[Resource
 
 
 def _label(resource: ResourceRow) -> str:
-    request = resource.request if len(resource.request) <= _LABEL else resource.request[: _LABEL - 1] + "…"
-    return f"{resource.server} {request}" + ("" if resource.condition == "OK" else f" [{resource.condition}]")
+    return resource.name + ("" if resource.condition == "OK" else f" [{resource.condition}]")
 
 
 def _mermaid_dependencies(resources: list[ResourceRow]) -> list[str]:

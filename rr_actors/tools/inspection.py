@@ -10,12 +10,15 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 from rr_actors.base.config import CATALOG_FILE
 from rr_actors.base.errors import CatalogError, ConfigError
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model.rows import (
+    RESTING,
     Held,
     Hold,
     Notice,
@@ -32,6 +35,9 @@ from rr_actors.registrar.model.rows import (
 from rr_actors.storage.opening import read_rows
 
 _SECOND_LOOK_S = 0.5
+
+
+_R = TypeVar("_R")
 
 
 class Contents:
@@ -51,11 +57,33 @@ class Contents:
 
     def holders(self, resource_id: str) -> list[Query]:
         """Return the queries on a resource, in the order of their ids, and so of their creation."""
-        return sorted((q for q in self.queries.values() if q.resource_id == resource_id), key=lambda query: query.id)
+        return self._holders.get(resource_id, [])
 
     def parts(self, resource_id: str) -> list[Held]:
         """Return the queries that a resource holds elsewhere, oldest first."""
-        return sorted((h for h in self.held.values() if h.parent == resource_id), key=lambda held: held.seq)
+        return self._parts.get(resource_id, [])
+
+    @cached_property
+    def taken(self) -> set[str]:
+        """The queries whose resource was taken away, and whose notice of that is not delivered yet."""
+        return {notice.query_id for notice in self.notices.values() if notice.released}
+
+    @cached_property
+    def _holders(self) -> dict[str, list[Query]]:
+        rows = sorted(self.queries.values(), key=lambda query: query.id)
+        return _grouped((query.resource_id, query) for query in rows)
+
+    @cached_property
+    def _parts(self) -> dict[str, list[Held]]:
+        rows = sorted(self.held.values(), key=lambda held: held.seq)
+        return _grouped((held.parent, held) for held in rows)
+
+
+def _grouped(pairs: Iterable[tuple[str, _R]]) -> dict[str, list[_R]]:
+    found: dict[str, list[_R]] = {}
+    for key, row in pairs:
+        found.setdefault(key, []).append(row)
+    return found
 
 
 def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
@@ -146,11 +174,12 @@ def _check_resources(contents: Contents) -> Iterator[str]:
     held = {query.resource_id for query in contents.queries.values()}
     for resource in contents.resources.values():
         what = f"{contents.name}/{resource.server}: resource {resource.id}"
-        if resource.phase is Phase.LOADED and resource.response is None:
+        loaded = resource.phase is Phase.LOADED or resource.phase in RESTING
+        if loaded and resource.response is None:
             yield f"{what} is {resource.phase} without a response"
         if resource.phase is Phase.QUEUED and resource.id not in held:
             yield f"{what} waits to be loaded and nobody wants it"
-        if resource.phase is Phase.LOADED and resource.state is not State.FATAL:
+        if loaded and resource.state is not State.FATAL:
             other = shared.setdefault((resource.server, resource.request), resource.id)
             if other != resource.id:
                 yield f"{what} is loaded for the same request as {other}"
@@ -178,20 +207,15 @@ def _check_held(contents: Contents, state: Mapping[str, Contents]) -> Iterator[s
             continue
         if provider is None:
             yield f"{what} is on {held.registrar}/{held.server}, a registrar without a catalog here"
-        elif held.id not in provider.queries and not _is_announced(held, provider):
+        elif held.id not in provider.queries and held.id not in provider.taken:
             yield f"{what} is unknown to its provider {held.registrar}/{held.server}"
-
-
-def _is_announced(held: Held, provider: Contents) -> bool:
-    """Return whether the provider took the query away, and its notice of that is not delivered yet."""
-    return any(notice.query_id == held.id and notice.released for notice in provider.notices.values())
 
 
 def _check_notices(contents: Contents) -> Iterator[str]:
     for notice in contents.notices.values():
         if is_own(notice) and notice.resource_id not in contents.resources:
             yield f"{contents.name}: notice {notice.id} is about resource {notice.resource_id}, which does not exist"
-        elif not is_own(notice) and not notice.released and notice.query_id not in contents.queries:
+        elif not is_own(notice) and notice.query_id not in contents.queries and notice.query_id not in contents.taken:
             yield f"{contents.name}: notice {notice.id} is about query {notice.query_id}, which does not exist"
 
 

@@ -39,9 +39,9 @@ class Lines(logging.Formatter):
         level = f"{record.levelname:<8}"
         if self._colour and (code := _COLOURS.get(record.levelname)):
             level = f"\x1b[{code}m{level}\x1b[0m"
-        line = f"{_clock(record)} {level} {_where(record):<16} {_readable(record.getMessage())}"
+        line = f"{_clock(record)} {level} {_where(record):<16} {printable(record.getMessage())}"
         trace = _trace(self, record)
-        return line + "".join(f"\n    {_readable(one)}" for one in trace.splitlines())
+        return line + "".join(f"\n    {printable(one)}" for one in trace.splitlines())
 
 
 class JsonLines(logging.Formatter):
@@ -83,5 +83,8 @@ def _trace(formatter: logging.Formatter, record: logging.LogRecord) -> str:
     return record.exc_text or ""
 
 
-def _readable(text: str) -> str:
+def printable(text: str) -> str:
+    """Return a text in which codes replace the characters that could control a terminal, newlines included."""
+    if text.isprintable():
+        return text
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)

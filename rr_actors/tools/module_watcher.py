@@ -6,15 +6,15 @@ why.
 
 from __future__ import annotations
 
-import logging
 import sys
 from pathlib import Path
 
 from rr_actors.base.errors import NotFound, RrError
+from rr_actors.base.reporting.log import Log
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
 
-logger = logging.getLogger("rr_actors.watch")
+logger = Log("rr_actors.watch")
 
 LOOK_S = 0.5
 """Seconds between two looks. A changed file is read when it has not changed again between two looks."""

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import typer
@@ -15,15 +15,17 @@ import typer
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.recording.recordings import Recording, RecordingFile, add, read_recording
-from rr_actors.tools.cli_commands import StateOption
-from rr_actors.tools.console_verbs import JsonOption, app
+from rr_actors.system.recording.timelines import read_timeline
+from rr_actors.tools.cli_commands import RECORD, JsonOption, StateOption, json_text, say, say_lines
+from rr_actors.tools.console_verbs import app
+from rr_actors.tools.web.timeline_file import html
 
 __all__ = ["app"]
 
 _LISTEN_S = 10.0
 
 
-@app.command(epilog="Example: rr-actors record crash.jsonl --seconds 30")
+@app.command(rich_help_panel=RECORD, epilog="Example: rr-actors record crash.jsonl --seconds 30")
 def record(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A new file, for `sequence` and rr.read_recording().")],
     seconds: Annotated[
@@ -44,10 +46,10 @@ def record(
         finally:
             sink.close()
     lost = f", {missed} missed" if missed else ""
-    typer.echo(f"recorded {count} entries in {file}{lost}")
+    say(f"recorded {count} entries in {file}{lost}")
 
 
-@app.command(epilog="Example: rr-actors sequence 01a2085d3f7c --file crash.jsonl > load.mmd")
+@app.command(rich_help_panel=RECORD, epilog="Example: rr-actors sequence 01a2085d3f7c --file crash.jsonl > load.mmd")
 def sequence(
     id: Annotated[str, typer.Argument(metavar="QUERY-OR-RESOURCE", help="Its id, or the beginning of it.")],
     file: Annotated[Path | None, typer.Option(help="A recording. Default: record the running system now.")] = None,
@@ -60,13 +62,29 @@ def sequence(
     """Draw the trace of a load, over all processes, as a Mermaid sequence diagram; with --json, print its entries."""
     recording = _recorded(state, seconds) if file is None else read_recording(file)
     if recording.missed:
-        typer.echo(f"{recording.missed} entries were missed, and are not in it", err=True)
+        say(f"{recording.missed} entries were missed, and are not in it", err=True)
     trace = recording.trace(id)
     if as_json:
         for entry in trace.entries:
-            typer.echo(_line(entry))
+            typer.echo(json_text(_line(entry)))
     else:
-        typer.echo(trace.sequence())
+        say_lines(trace.sequence())
+
+
+@app.command(rich_help_panel=RECORD, epilog="Example: rr-actors timeline crash.jsonl > crash.svg")
+def timeline(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A recording, or the history.jsonl of a state directory.")
+    ],
+    format: Annotated[
+        Literal["svg", "html"], typer.Option(help="html: one file, in which the picture is zoomed and moved.")
+    ] = "svg",
+) -> None:
+    """Draw what happened: a lane for each child, a bar for each life, marks for events and their reasons."""
+    drawn = read_timeline(file)
+    if drawn.missed:
+        say(f"{drawn.missed} entries were missed, and are not in it", err=True)
+    typer.echo(drawn.svg() if format == "svg" else html(drawn))
 
 
 def _recorded(state: Path | None, seconds: float) -> Recording:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import sys
 from pathlib import Path
 
 from rr_actors.base.config import SystemConfig
+from rr_actors.base.reporting.log import Log
 from rr_actors.supervision.core.specs import Supervisor
 from rr_actors.system.system import System
 from rr_actors.tools.log_lines import begin_logging
@@ -47,7 +47,7 @@ def run_tree(
         signal.signal(number, _told)
     try:
         with system:
-            logging.getLogger("rr_actors").info("system %s runs in %s (pid %d)", name, state_dir, os.getpid())
+            Log("rr_actors").info("system %s runs in %s (pid %d)", name, state_dir, os.getpid())
             if watch:
                 watcher = ModuleWatcher(system, root)
                 while not system.wait(LOOK_S):

@@ -17,9 +17,10 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.time_limits import left_until
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.handshake import DiallerHandshake
+from rr_actors.wire.segments import Segments
 from rr_actors.wire.transport import Hello
 from rr_actors.wire.unix_link import Wire
-from rr_actors.wire.unix_sockets import SocketDir
+from rr_actors.wire.unix_sockets import SocketDir, pid_of
 
 _CHUNK_BYTES = 65536
 _DONT_WAIT = int(socket.MSG_DONTWAIT)  # a plain number: an enum's member is converted in each call
@@ -34,16 +35,27 @@ class BlockingLink:
         address: the address of the transport to connect to.
         timeout_s: how long the handshake may take.
 
+    Attributes:
+        parcels: the large values of this connection.
+
     Raises:
         RrError: the error with which the other side refused. Unavailable: no transport listens at the address.
     """
 
     def __init__(
-        self, sockets: SocketDir, key: bytes, address: str, hello: Hello, wire: Wire, timeout_s: float
+        self,
+        sockets: SocketDir,
+        key: bytes,
+        address: str,
+        hello: Hello,
+        wire: Wire,
+        timeout_s: float,
+        segments: Segments,
     ) -> None:
         self._limit = wire.frame_limit_bytes
         self._reader: FrameReader[Any] = FrameReader(wire.decoder, self._limit)
         self._spin = AdaptiveSpin()
+        self.parcels = segments.parcels(pid_of(address))
         try:
             self._socket = sockets.connect(address)
         except (OSError, ValueError) as error:
@@ -167,6 +179,7 @@ class BlockingLink:
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
+        self.parcels.close()
 
 
 def _milliseconds_until(deadline: float) -> float | None:

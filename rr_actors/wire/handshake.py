@@ -25,11 +25,14 @@ from typing import TypeVar
 import msgspec
 
 from rr_actors.base.errors import ConfigError, NotSerializable, RrError, Unavailable
-from rr_actors.registrar.model.messages import PROTOCOL, Failure, error_of, failure_of
+from rr_actors.base.values.failure import Failure, error_of, failure_of
 from rr_actors.wire.frames import framed
 from rr_actors.wire.transport import Hello, Welcome
 
 T = TypeVar("T")
+
+PROTOCOL = 4
+"""Version of all messages that links carry; peers of another version are refused."""
 
 HELLO_LIMIT_BYTES = 4096
 REPLY_LIMIT_BYTES = 64 * 1024

@@ -6,14 +6,15 @@ A Receiver is never called from within the `send` or `flush` of another: the loo
 from __future__ import annotations
 
 import asyncio
-import logging
+import os
 from typing import Any
 
 from rr_actors.base.errors import RrError, Unavailable, UsageError
-from rr_actors.registrar.model.messages import error_of, failure_of
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.values.failure import error_of, failure_of
 from rr_actors.wire.transport import Accept, Attach, Hello, Link, Receiver, Welcome
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 
 class LocalTransport:
@@ -75,6 +76,7 @@ class LocalLink:
         self.hello = hello
         self.welcome = welcome
         self.peer = f"{peer} (this process)"
+        self.pid = os.getpid()
         self.closed = asyncio.Event()
         self._links = links
         self._loop = asyncio.get_running_loop()

@@ -24,7 +24,6 @@ import functools
 import hashlib
 import io
 import itertools
-import logging
 import os
 import re
 import stat
@@ -43,12 +42,13 @@ from rr_actors.base.errors import (
     shortened,
     shown,
 )
-from rr_actors.base.folder import Folder, NotOurs, make_directories
+from rr_actors.base.folder import Folder, NotOurs, Place, make_directories
 from rr_actors.base.names import check_name
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 _REGISTRAR = "r."  # the prefix of a registrar's entry
 _CLASSES = "c."  # the prefix of an entry with the classes of a manager
@@ -66,7 +66,7 @@ PATH_BYTES = 482
 A registrar with a longer name needs a shorter path; that is checked when its catalog is opened."""
 
 
-class Status(enum.StrEnum):
+class Presence(enum.StrEnum):
     """The state of a registrar or actor: UP at an address; STARTING or being respawned; STOPPED, can be restarted; GONE
     for good; DORMANT, a registrar whose process died and whose catalog nobody has open."""
 
@@ -77,7 +77,7 @@ class Status(enum.StrEnum):
     DORMANT = "dormant"
 
 
-class Entry(msgspec.Struct, frozen=True):
+class NameEntry(msgspec.Struct, frozen=True):
     """The entry of one name; the address is "" unless the status is UP, or STARTING with a running process.
 
     `why` is a text for people: the reason for STOPPED or GONE, or how the last processes died while STARTING; "" if
@@ -85,7 +85,7 @@ class Entry(msgspec.Struct, frozen=True):
     `once`: the actor is UP, and will not be started again when it ends.
     """
 
-    status: Status
+    status: Presence
     address: str
     why: str = ""
     once: bool = False
@@ -96,11 +96,11 @@ class Entry(msgspec.Struct, frozen=True):
         return f": {self.why}" if self.why else ""
 
 
-_AWAY = (Status.GONE, Status.DORMANT)
-_MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
-_UP = Status.UP.value + ":"
-_UP_ONCE = Status.UP.value + " once:"
-_OPENING = Status.STARTING.value + ":"
+_AWAY = (Presence.GONE, Presence.DORMANT)
+_MARKS = {status.value: NameEntry(status, "") for status in Presence if status is not Presence.UP}
+_UP = Presence.UP.value + ":"
+_UP_ONCE = Presence.UP.value + " once:"
+_OPENING = Presence.STARTING.value + ":"
 _WHY = " because "
 _WHY_BYTES = 900  # with the status in front of it, and "…"
 
@@ -135,10 +135,12 @@ class Directory:
     Args:
         run_dir: StateDir.run_dir.
         keeps: make the directory again if it was removed; only for a caller that knows that the system runs.
+        place: the state directory. Nothing is made while it is not in its place.
     """
 
-    def __init__(self, run_dir: Path, *, keeps: bool = False) -> None:
+    def __init__(self, run_dir: Path, *, keeps: bool = False, place: Place | None = None) -> None:
         self.run_dir = Path(run_dir)
+        self._place = place
         self._keeps = keeps
         self._draft = f".{os.urandom(4).hex()}."
         self._numbers = itertools.count()
@@ -147,6 +149,8 @@ class Directory:
         self._names = self._open()
 
     def _open(self) -> Folder:
+        if self._place is not None:
+            self._place.check()
         with _named_errors("make", self.run_dir / "names"):
             make_directories(self.run_dir)
             with Folder.at(self.run_dir) as run:
@@ -189,9 +193,9 @@ class Directory:
         """Write that `name` is STARTING and will be UP at `address`: its process runs."""
         self._put(name, _OPENING + address)
 
-    def mark(self, name: str, status: Status, why: str = "") -> None:
+    def mark(self, name: str, status: Presence, why: str = "") -> None:
         """Write a status in which `name` has no address, and `why`, of which at most 900 bytes are kept."""
-        if status is Status.UP:
+        if status is Presence.UP:
             raise UsageError(f"{name}: UP needs an address; use publish")
         self._put(name, f"{status.value}{_WHY}{_fitting(why)}" if why else status.value)
 
@@ -199,7 +203,7 @@ class Directory:
         if not name or name[0] == "." or "/" in name:
             raise UsageError(f"{name!r} is not a name for the directory: use registrar_key or actor_key", name=name)
         self._written[name] = content
-        with _named_errors("write", self.run_dir / "names" / name):
+        with _named_errors("write", f"{self.run_dir}/names/{name}"):
             try:
                 self._write(name, content)
             except FileNotFoundError:
@@ -211,6 +215,9 @@ class Directory:
     def _write(self, name: str, content: str) -> None:
         draft = f"{self._draft}{next(self._numbers)}"
         names = self._names
+        with contextlib.suppress(OSError):  # there is none yet
+            if os.readlink(name, dir_fd=names.fd) == content:  # a new link costs a hundred times as much as this look
+                return
         os.symlink(content, draft, dir_fd=names.fd)
         try:
             names.rename(draft, name)
@@ -218,7 +225,7 @@ class Directory:
             names.discard(draft)
             raise
 
-    def lookup(self, name: str) -> Entry | None:
+    def lookup(self, name: str) -> NameEntry | None:
         """Return the entry, or None if there is none. One system call."""
         names = self._names
         try:
@@ -226,14 +233,14 @@ class Directory:
         except OSError:  # no such entry, or no symbolic link
             return None
         if content.startswith(_UP):
-            return Entry(Status.UP, content[len(_UP) :])
+            return NameEntry(Presence.UP, content[len(_UP) :])
         if content.startswith(_OPENING):
-            return Entry(Status.STARTING, content[len(_OPENING) :])
+            return NameEntry(Presence.STARTING, content[len(_OPENING) :])
         if content.startswith(_UP_ONCE):
-            return Entry(Status.UP, content[len(_UP_ONCE) :], once=True)
+            return NameEntry(Presence.UP, content[len(_UP_ONCE) :], once=True)
         mark, _, why = content.partition(_WHY)
         entry = _MARKS.get(mark)
-        return entry if entry is None or not why else Entry(entry.status, "", why)
+        return entry if entry is None or not why else NameEntry(entry.status, "", why)
 
     def names(self) -> list[str]:
         """Return the names of all entries, sorted."""
@@ -277,7 +284,7 @@ class Directory:
         known = [other for other, found in entries.items() if found and found.status not in _AWAY]
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
         what = "there is none of this name in the system"
-        if entry is not None and entry.status is Status.GONE and entry.why:
+        if entry is not None and entry.status is Presence.GONE and entry.why:
             what += f" any more, it is gone for good{entry.because}"
         hint = did_you_mean(name, known) or ";"
         text = f"registrar {name!r}: {what}{hint} it has: {there or 'none'}"
@@ -299,15 +306,18 @@ class StateDir:
 
     Attributes:
         path: the absolute path of the directory.
+        place: the same, to look whether it is still there.
         run_dir: the directory for the names and sockets of this incarnation.
         key: 32 secret bytes, new each time; only the system's own processes get them.
+        folder: the directory, held open.
     """
 
     def __init__(self, folder: Folder, lock: io.FileIO) -> None:
         self.path = folder.path
+        self.place = folder.place
         self._lock = lock
         self.key = os.urandom(_KEY_BYTES)
-        self._folder = folder
+        self.folder = folder
         with _named_errors("use", self.path / "run"), folder.inner("run") as run:
             _lock_shared(folder.fd)
             _remove_incarnations(run)
@@ -323,11 +333,11 @@ class StateDir:
         """
         if self._lock.closed:
             return
-        found = self._folder.look(_LOCK)
+        found = self.folder.look(_LOCK)
         if found is not None and os.path.samestat(found, os.fstat(self._lock.fileno())):
             return
         _log.error("state directory %s: its lock, %s, was removed; it is taken again", self.path, _LOCK)
-        lost, self._lock = self._lock, _take_lock(self._folder)
+        lost, self._lock = self._lock, _take_lock(self.folder)
         lost.close()
 
     def close(self) -> None:
@@ -345,18 +355,20 @@ class StateDir:
         steps.end(f"state directory {self.path}: not closed altogether")
 
     def _clear(self) -> None:
+        if not self.folder.is_there():
+            return  # it was removed with all that is in it
         try:
-            with self._folder.inner("run") as run:
+            with self.folder.inner("run") as run:
                 _remove_incarnations(run)
         finally:
             with contextlib.suppress(OSError):  # a late process has written a file again: the next start removes it
-                os.rmdir("run", dir_fd=self._folder.fd)
+                os.rmdir("run", dir_fd=self.folder.fd)
 
     def forget(self) -> None:
         """Close the lock and the directories, and remove nothing. A forked child must not keep its parent's lock."""
         self._lock.close()
         self._run.close()
-        self._folder.close()
+        self.folder.close()
 
 
 def _lock_shared(fd: int) -> None:
@@ -492,7 +504,8 @@ def _remove_incarnations(run: Folder) -> None:
     import shutil  # brings bz2 and lzma, and only a start after a crash needs it
 
     for name in found:
-        shutil.rmtree(name, ignore_errors=True, dir_fd=run.fd)
+        # Not by its dir_fd, which it refuses in a program that has imported eventlet.
+        shutil.rmtree(f"/proc/self/fd/{run.fd}/{name}", ignore_errors=True)
         run.discard(name)  # if it was no directory
 
 

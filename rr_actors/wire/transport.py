@@ -40,6 +40,11 @@ class Link(Protocol):
     welcome: Welcome
 
     @property
+    def pid(self) -> int:
+        """The id of the process at the other end; 0 if it is not known."""
+        ...
+
+    @property
     def more(self) -> bool:
         """Whether another message, which arrived together with the current one, follows it at once."""
         ...

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import logging
 import os
 import socket
 import threading
@@ -15,10 +14,12 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import MailboxFull, NotSerializable, Unavailable
+from rr_actors.base.reporting.log import Log
 from rr_actors.wire.frames import GOODBYE, FrameReader, framed
 from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
+from rr_actors.wire.unix_sockets import Peer
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 BUFFER_LIMIT_BYTES = 64 * 1024 * 1024
 """How much may wait on one link for a peer that does not read."""
@@ -46,13 +47,15 @@ class UnixLink(asyncio.Protocol):
         wire: Wire,
         hello: Hello,
         welcome: Welcome,
-        peer: str,
+        peer: Peer,
+        name: str,
         start: bytes = b"",
     ) -> None:
-        """Make the link. It is in `links` while it is open, and writes `start` before any message."""
+        """Make the link with the `peer` of this name. It is in `links` while it is open; `start` is sent first."""
         self.hello = hello
         self.welcome = welcome
-        self.peer = peer
+        self.peer = peer.named(name)
+        self.pid = peer.pid
         self.closed = asyncio.Event()
         self._links = links
         self._transport = transport

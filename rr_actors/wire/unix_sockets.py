@@ -16,7 +16,9 @@ import msgspec
 
 from rr_actors.base.errors import ConfigError
 from rr_actors.base.folder import Folder
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
+from rr_actors.runtime.processes.lifeline import stopped
 
 _CREDENTIALS = struct.Struct("3i")  # process, user, group
 
@@ -32,6 +34,12 @@ def pid_of(name: str) -> int | None:
     """Return the id of the process that made a socket of this name; None if the name has another form."""
     found = _OF_PROCESS.fullmatch(name)
     return None if found is None else int(found[1])
+
+
+def paused(name: str) -> str:
+    """Return words for the process that made this socket if a signal has stopped it; "" for another."""
+    pid = pid_of(name)
+    return "" if pid is None else stopped(pid)
 
 
 def _is_there(pid: int) -> bool:
@@ -73,6 +81,45 @@ def peer_at(connected: socket.socket) -> Peer:
     raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     pid, uid, _ = _CREDENTIALS.unpack(raw)
     return Peer(pid, uid)
+
+
+REFUSALS_S = 10.0
+"""Seconds for which the connections that are refused after the first are counted, and then summed up in one line."""
+
+
+class Refusals:
+    """The log of refused connections: the first at once, and then one line in REFUSALS_S. On the loop."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._timer: asyncio.TimerHandle | None = None
+        self._unsaid = 0
+        self._last = ""
+
+    def note(self, text: str) -> None:
+        """Log a refusal, or count it."""
+        if self._timer is None:
+            self._log.error("%s", text)
+            self._timer = asyncio.get_running_loop().call_later(REFUSALS_S, self._sum_up)
+        else:
+            self._unsaid, self._last = self._unsaid + 1, text
+
+    def _sum_up(self) -> None:
+        self._timer = None
+        if self._unsaid:
+            self._say_rest()
+            self._timer = asyncio.get_running_loop().call_later(REFUSALS_S, self._sum_up)
+
+    def _say_rest(self) -> None:
+        count, self._unsaid = self._unsaid, 0
+        if count:
+            self._log.error("%d more connections were refused within %g s; the last: %s", count, REFUSALS_S, self._last)
+
+    def close(self) -> None:
+        """Sum up what is left."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._say_rest()
 
 
 class SocketDir:

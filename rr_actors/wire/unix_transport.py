@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,16 +17,18 @@ from typing import Any, cast
 import msgspec
 
 from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
+from rr_actors.wire.segments import Segments
 from rr_actors.wire.transport import Accept, Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_link import CLOSE_LIMIT_S, UnixLink, Wire
-from rr_actors.wire.unix_sockets import SocketDir, new_name, peer_of
+from rr_actors.wire.unix_sockets import Refusals, SocketDir, new_name, peer_of
 
-_log = logging.getLogger(__name__)
+_log = Log(__name__)
 
 HANDSHAKE_TIMEOUT_S = 5.0
 """How long the handshake of a peer may take."""
@@ -47,13 +48,21 @@ class UnixTransport:
         key: the system's 32 secret bytes.
         codecs: the message type of each kind of link (`Hello.kind`).
         frame_limit_bytes: the length of the longest message, on either side.
+        segments_limit_bytes: the memory that large values to other processes may take. Default: a quarter of all.
 
     Attributes:
+        segments: the shared memory for large values.
         address: the socket file's name in the socket directory.
     """
 
     def __init__(
-        self, socket_dir: Path, key: bytes, codecs: Mapping[str, Any], *, frame_limit_bytes: int = FRAME_LIMIT_BYTES
+        self,
+        socket_dir: Path,
+        key: bytes,
+        codecs: Mapping[str, Any],
+        *,
+        frame_limit_bytes: int = FRAME_LIMIT_BYTES,
+        segments_limit_bytes: int | None = None,
     ) -> None:
         self._sockets = SocketDir(socket_dir)
         self._key = check_key(key)
@@ -61,12 +70,14 @@ class UnixTransport:
             kind: Wire(msgspec.msgpack.Decoder(message_type), frame_limit_bytes)
             for kind, message_type in codecs.items()
         }
+        self.segments = Segments(segments_limit_bytes, frame_limit_bytes)
         self.address = new_name()
         self._server: asyncio.AbstractServer | None = None
         self._closed = False
         self._crowded = False
         self.accept: Accept | None = None
         self.strangers: dict[_Acceptor, None] = {}  # oldest first
+        self.refusals = Refusals(_log)
         self.diallers: set[_Dialler] = set()
         self.links: set[UnixLink] = set()
 
@@ -75,6 +86,7 @@ class UnixTransport:
         if self._server is not None or self._closed:
             raise UsageError(f"transport {self.address}: listens already, or is closed")
         self.accept = accept
+        self.segments.loop = asyncio.get_running_loop()
         self._server = await self._serve()
 
     async def _serve(self) -> asyncio.AbstractServer:
@@ -100,14 +112,15 @@ class UnixTransport:
         deadline = loop.time() + HANDSHAKE_TIMEOUT_S
         while True:
             handshake = DiallerHandshake(self._key, hello)
+            since = loop.time()
             connected = await self._dial(address, hello, deadline)
-            dialler = _Dialler(self, handshake, hello, attach, deadline)
+            dialler = _Dialler(self, handshake, hello, attach, since, deadline)
             try:
                 await loop.create_unix_connection(lambda dialler=dialler: dialler, sock=connected)
                 return await dialler.done
             except _TurnedAway as error:
                 if loop.time() + _RETRY_S >= deadline:
-                    raise Unavailable(f"{hello.to} closes each connection at once: too many others want one") from error
+                    raise Unavailable(f"{hello.to} closes each connection: too many others want one") from error
                 await asyncio.sleep(_RETRY_S)
             except BaseException:  # cancelled, or the peer's refusal
                 dialler.abandon()
@@ -115,7 +128,8 @@ class UnixTransport:
 
     def dial(self, address: str, hello: Hello, timeout_s: float) -> BlockingLink:
         """Open a connection for the calling thread alone. From any thread. Raises the errors of connect()."""
-        return BlockingLink(self._sockets, self._key, address, hello, self.wires[hello.kind], timeout_s)
+        wire = self.wires[hello.kind]
+        return BlockingLink(self._sockets, self._key, address, hello, wire, timeout_s, self.segments)
 
     async def _dial(self, address: str, hello: Hello, deadline: float) -> socket.socket:
         loop = asyncio.get_running_loop()
@@ -141,6 +155,7 @@ class UnixTransport:
         """Stop listening, send the queued messages (for a second at most), close all links, call `lost` for each."""
         self._closed = True
         steps = Steps()
+        self.refusals.close()
         if self._server is not None:
             steps.take("closing the socket", self._server.close)
             steps.take("removing the socket", self._sockets.unlink, self.address)
@@ -200,7 +215,11 @@ class UnixTransport:
 
 
 class _TurnedAway(Exception):
-    """The acceptor closed the connection before it sent anything."""
+    """The acceptor closed the connection to make room: before it sent anything, or after PATIENCE_S.
+
+    It closes one of somebody without its key at once. But where many connect, or where both sides wait for their core,
+    an honest handshake is old enough to make room for another.
+    """
 
 
 class _Acceptor(asyncio.Protocol):
@@ -261,7 +280,7 @@ class _Acceptor(asyncio.Protocol):
         welcome, attach = owner.accept(hello)
         start = self._handshake.welcome(welcome)  # goes before whatever attach sends
         link = UnixLink(
-            owner.links, self._transport, owner.wires[hello.kind], hello, welcome, self._peer.named(hello.origin), start
+            owner.links, self._transport, owner.wires[hello.kind], hello, welcome, self._peer, hello.origin, start
         )
         link.attach(attach)
         return link
@@ -274,7 +293,7 @@ class _Acceptor(asyncio.Protocol):
             self.abort()
 
     def _refuse_stranger(self, why: str) -> None:
-        _log.error("closing a connection of %s to %s: %s", self._peer, self._owner.address, why)
+        self._owner.refusals.note(f"closing a connection of {self._peer} to {self._owner.address}: {why}")
         self.abort()
 
     def abort(self) -> None:
@@ -294,7 +313,13 @@ class _Dialler(asyncio.Protocol):
     """
 
     def __init__(
-        self, owner: UnixTransport, handshake: DiallerHandshake, hello: Hello, attach: Attach, deadline: float
+        self,
+        owner: UnixTransport,
+        handshake: DiallerHandshake,
+        hello: Hello,
+        attach: Attach,
+        since: float,
+        deadline: float,
     ) -> None:
         self.hello = hello
         loop = asyncio.get_running_loop()
@@ -302,6 +327,7 @@ class _Dialler(asyncio.Protocol):
         self._owner = owner
         self._handshake = handshake
         self._attach = attach
+        self._since = since
         self._link: UnixLink | None = None
         self._transport: asyncio.Transport | None = None
         self._timer = loop.call_at(deadline, self._time_out)
@@ -335,7 +361,7 @@ class _Dialler(asyncio.Protocol):
         transport = cast(asyncio.Transport, self._transport)
         owner = self._owner
         wire = owner.wires[self.hello.kind]
-        link = UnixLink(owner.links, transport, wire, self.hello, welcome, self._peer.named(self.hello.to))
+        link = UnixLink(owner.links, transport, wire, self.hello, welcome, self._peer, self.hello.to)
         try:
             link.attach(self._attach)
         except Exception as error:
@@ -388,7 +414,7 @@ class _Dialler(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         if self.done.done():
             self._forget()
-        elif not self._handshake.greeted:
+        elif not self._handshake.greeted or asyncio.get_running_loop().time() >= self._since + PATIENCE_S:
             self.fail(_TurnedAway())
         else:
             self._fail("it closed the connection instead of answering: it has another key, or died")

@@ -12,6 +12,7 @@ import pytest
 from rr_actors.actors.remote.inbound import Asker
 from rr_actors.actors.remote.protocol import ASKS, Answered, Ask, Dead, Halt, Inquire, Tell, Watch
 from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.wire.segments import Segments
 from rr_actors.wire.transport import Hello
 from support import Calls, eventually
 from support_refs import open_home
@@ -47,7 +48,7 @@ class OutletLink:
 
 
 def asker_on(link: Any, dispatcher: Any = None) -> Asker:
-    return Asker(lambda _: None, dispatcher, link, lambda _: None)
+    return Asker(lambda _: None, dispatcher, link, lambda _: None, Segments(0).parcels(0))
 
 
 def test_whoever_has_the_answer_writes_it() -> None:

@@ -17,6 +17,7 @@ from rr_actors.actors.messaging import dead_letters
 from rr_actors.actors.messaging.dead_letters import EVENTS_A_SECOND, KEPT, Office
 from rr_actors.base.errors import TEXT_LIMIT
 from support import Calls, Gate, eventually
+from support_inside import node_of
 
 Start = Callable[..., rr.System]
 
@@ -259,7 +260,8 @@ def test_a_told_message_that_cannot_be_opened_is_one(start: Start) -> None:
 
 
 def test_a_message_that_is_too_long_for_its_connection_is_one(start: Start) -> None:
-    system = start(rr.ChildSpec(Worker, id="a"), config=rr.SystemConfig(frame_limit_bytes=100_000))
+    config = rr.SystemConfig(frame_limit_bytes=100_000, segments_limit_bytes=0)
+    system = start(rr.ChildSpec(Worker, id="a"), config=config)
     system.ref("a").tell(b"x" * 200_000)
 
     eventually(lambda: system.dead_letters().count == 1)
@@ -324,8 +326,7 @@ def test_what_other_processes_tell_does_not_wait_for_the_text_of_a_message_of_th
     system = start(rr.ChildSpec(Worker, id="a"))
     gone = Worker.start()
     gone.stop()
-    node = system._node  # pyright: ignore[reportPrivateUsage]
-    assert node is not None
+    node = node_of(system)
     node.dispatcher.call(lambda: dead_letters.office.record("somebody", [Slow()], "test", unheard=1))
     gate.wait_arrived()
     system.ref("a").ask(("tell", gone, "hello"))
@@ -344,8 +345,7 @@ def test_the_text_of_a_message_is_never_made_on_the_loop(system: rr.System) -> N
             threads.append(threading.current_thread().name)
             return "noted"
 
-    node = system._node  # pyright: ignore[reportPrivateUsage]
-    assert node is not None
+    node = node_of(system)
     node.dispatcher.call(lambda: dead_letters.office.record("somebody", [Noted()], "test", unheard=1))
 
     eventually(lambda: letters(system) == [("somebody", "noted", "test")])

@@ -21,6 +21,7 @@ from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire import thread_connections
 from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.segments import Segments
 from rr_actors.wire.transport import Hello
 from support import Gate, eventually
 from support_asks import FakeExchange, answered
@@ -61,6 +62,7 @@ class FakeTransport:
         self.hellos: list[Hello] = []
         self.exchange: Callable[[Any, float], Any] = lambda letter, _: answered(letter)
         self.refusal: Exception | None = None
+        self.segments = Segments(0)
 
     async def connect(self, address: str, hello: Hello, attach: Any, **_: Any) -> FakeLink:
         attach(self.link)

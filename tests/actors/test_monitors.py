@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import itertools
 import os
 import signal
 import threading
@@ -16,9 +17,12 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors.messaging import death_watch
+from rr_actors.actors.remote import hub
 from rr_actors.runtime import event_loop, user_loop
 from rr_actors.runtime.processes import lifeline
-from support import Calls, Gate, eventually, serve
+from rr_actors.wire.name_service import actor_key
+from support import Calls, Gate, eventually, serve, wait_gone
+from support_inside import node_of
 
 Start = Callable[..., rr.System]
 
@@ -523,8 +527,7 @@ def test_a_process_that_lives_but_cannot_be_reached_is_told_from_a_dead_one(star
     watched, calls = system.ref("a"), Calls()
     rr.monitor(watched, calls)
     watched.ask("pid")
-    node = system._node  # pyright: ignore[reportPrivateUsage]
-    assert node is not None
+    node = node_of(system)
     (line,) = node.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
 
     node.dispatcher.call(line.close)
@@ -538,8 +541,7 @@ def test_a_death_that_no_worker_can_wait_for_is_heard_of_as_a_lost_connection(
     system = start(rr.ChildSpec(Worker, id="a", restart="temporary"))
     calls = Calls()
     rr.monitor(system.ref("a"), calls)
-    node = system._node  # pyright: ignore[reportPrivateUsage]
-    assert node is not None
+    node = node_of(system)
     submit = node.dispatcher.workers.submit
 
     def refuse(fn: Any, *args: Any, **options: Any) -> None:
@@ -589,6 +591,102 @@ def test_a_process_that_was_stopped_before_it_could_answer_is_told_of_when_it_di
     os.kill(pid, signal.SIGKILL)
 
     assert [down.reason for down in calls.wait()] == ["killed"]
+
+
+def hold_connections(system: rr.System, monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Return an event for the next connection of this process that is to be made, and one that lets it be made."""
+    transport, asked, may_connect = node_of(system).transport, threading.Event(), threading.Event()
+    connect = transport.connect
+
+    async def late(*args: Any) -> Any:
+        asked.set()
+        await asyncio.to_thread(may_connect.wait)
+        return await connect(*args)
+
+    monkeypatch.setattr(transport, "connect", late)
+    return asked, may_connect
+
+
+@pytest.mark.parametrize(("how", "reason"), [("in order", "noproc"), ("killed", "killed")])
+@pytest.mark.parametrize("restart", ["temporary", "transient"])
+def test_only_a_process_that_was_killed_before_it_got_the_watch_was_killed(
+    start: Start, monkeypatch: pytest.MonkeyPatch, how: str, reason: str, restart: Any
+) -> None:
+    system = start(rr.ChildSpec(Worker, id="a", restart=restart))
+    calls = Calls()
+    pid = running_pid(system, "a") or 0
+    asked, may_connect = hold_connections(system, monkeypatch)
+    watching = threading.Thread(target=rr.monitor, args=(system.ref("a"), calls))
+    watching.start()
+    assert asked.wait(10)
+    if how == "killed":
+        os.kill(pid, signal.SIGKILL)
+    else:
+        system.supervisor().terminate_child("a")
+    wait_gone(pid)
+    may_connect.set()
+
+    assert [down.reason for down in calls.wait()] == [reason]
+    watching.join()
+
+
+def test_a_supervisor_that_is_late_to_say_how_a_process_ended_is_waited_for(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = start(rr.ChildSpec(Worker, id="a", restart="temporary"))
+    directory, calls = node_of(system).directory, Calls()
+    pid = running_pid(system, "a") or 0
+    up = directory.lookup(actor_key("root/a"))
+    asked, may_connect = hold_connections(system, monkeypatch)
+    lookup, looks, said = directory.lookup, itertools.count(), threading.Event()
+
+    def as_before(name: str) -> Any:
+        if name != actor_key("root/a") or said.is_set():
+            return lookup(name)
+        if next(looks) > 2 * hub.CUT_S / 0.01:  # far more often than in the time in which a link's end is looked into
+            said.set()
+        return up
+
+    watching = threading.Thread(target=rr.monitor, args=(system.ref("a"), calls))
+    watching.start()
+    assert asked.wait(10)
+    system.supervisor().terminate_child("a")
+    wait_gone(pid)
+    monkeypatch.setattr(directory, "lookup", as_before)
+    may_connect.set()
+
+    assert [down.reason for down in calls.wait()] == ["noproc"]
+    assert said.is_set()
+    watching.join()
+
+
+def test_a_monitor_is_there_when_monitor_returns_however_long_the_connection_takes(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = start(rr.ChildSpec(Worker, id="a", restart="temporary"))
+    asked, may_connect = hold_connections(system, monkeypatch)
+    looks, looked = itertools.count(), threading.Event()
+
+    def running(_address: str) -> str:
+        if next(looks) == 2:
+            looked.set()
+        return ""
+
+    monkeypatch.setattr(hub, "paused", running)
+    monkeypatch.setattr(hub, "WATCH_S", 0.01)
+    watching: list[rr.Monitor] = []
+    thread = threading.Thread(target=lambda: watching.append(rr.monitor(system.ref("a"))))
+    thread.start()
+    assert asked.wait(10)
+    assert looked.wait(10)
+    assert not watching
+    may_connect.set()
+    thread.join()
+    system.supervisor().terminate_child("a")
+
+    down = watching[0].wait(10)
+    assert down is not None
+    assert down.reason == "shutdown"
 
 
 def test_a_death_is_heard_of_also_when_all_workers_are_busy(start: Start) -> None:

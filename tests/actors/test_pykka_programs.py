@@ -31,6 +31,7 @@ from support_pykka import (
     start_another,
     write_at_exit,
 )
+from support_steps import steps_of
 
 Start = Callable[..., rr.System]
 
@@ -65,6 +66,20 @@ def test_the_registry_holds_what_was_started_by_hand_and_stop_all_leaves_the_sys
     for child in ("w0", "plain", "far"):
         assert system.ref(child).ask("alive") == "alive"
     assert system.supervisor().history() == restarts
+
+
+def test_an_actor_that_ends_is_compared_with_none_of_the_others() -> None:
+    def steps(others: int) -> int:
+        refs = [Worker.start() for _ in range(others + 1)]
+        try:
+            taken, _ = steps_of(lambda: pykka.ActorRegistry.unregister(refs[-1]))
+            assert pykka.ActorRegistry.get_all() == refs[:-1]
+        finally:
+            pykka.ActorRegistry.stop_all()
+            refs[-1].stop()
+        return taken
+
+    assert steps(200) == steps(1)
 
 
 def test_in_a_childs_process_the_registry_holds_what_the_child_has_started(start: Start) -> None:

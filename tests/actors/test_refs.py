@@ -28,7 +28,7 @@ from rr_actors.actors.remote import peer
 from rr_actors.actors.remote.hub import set_hub
 from rr_actors.base.errors import ActorUnavailable, MailboxFull, NotSerializable, Unavailable, UsageError
 from rr_actors.wire import unix_link
-from rr_actors.wire.name_service import StateDir, Status, open_state_dir
+from rr_actors.wire.name_service import Presence, StateDir, open_state_dir
 from support import Calls, Gate, eventually, hang
 from support_refs import (
     Home,
@@ -272,8 +272,8 @@ def _use_pipe(actor: Any) -> Any:
     return actor.other_end.recv()
 
 
-def test_a_message_over_the_frame_limit_is_refused_both_ways(tmp_path: Path) -> None:
-    home, state = open_home(tmp_path / "state", frame_limit_bytes=100_000)
+def test_without_shared_memory_a_message_over_the_frame_limit_is_refused(tmp_path: Path) -> None:
+    home, state = open_home(tmp_path / "state", frame_limit_bytes=100_000, segments_limit_bytes=0)
     try:
         home.start_other(a="Remote")
         ref = ref_to("root/a")
@@ -286,8 +286,12 @@ def test_a_message_over_the_frame_limit_is_refused_both_ways(tmp_path: Path) -> 
 
 
 def test_a_reply_over_the_frame_limit_is_the_askers_error(ours: ActorRef[Any]) -> None:
-    with pytest.raises(NotSerializable):
-        ours.ask(lambda _: b"x" * 20_000_000)
+    ours.ask(lambda actor: setattr(actor, "memfd_create", os.__dict__.pop("memfd_create")))  # no shared memory there
+    try:
+        with pytest.raises(NotSerializable):
+            ours.ask(lambda _: b"x" * 20_000_000)
+    finally:
+        ours.ask(lambda actor: setattr(os, "memfd_create", actor.memfd_create))
     assert ours.ask("alive") == "alive"
 
 
@@ -519,9 +523,13 @@ def test_an_actor_that_never_was_is_dead(home: Home) -> None:
 
 @pytest.mark.parametrize(
     ("status", "error"),
-    [(Status.STARTING, ActorUnavailable), (Status.STOPPED, pykka.ActorDeadError), (Status.GONE, pykka.ActorDeadError)],
+    [
+        (Presence.STARTING, ActorUnavailable),
+        (Presence.STOPPED, pykka.ActorDeadError),
+        (Presence.GONE, pykka.ActorDeadError),
+    ],
 )
-def test_the_directory_says_what_a_missing_actor_is(home: Home, status: Status, error: type[Exception]) -> None:
+def test_the_directory_says_what_a_missing_actor_is(home: Home, status: Presence, error: type[Exception]) -> None:
     home.mark("root/a", status)
     ref = ref_to("root/a")
     with pytest.raises(error, match="root/a"):
@@ -543,14 +551,14 @@ def test_open_asks_fail_when_the_process_is_killed_and_the_reference_works_again
             future.get(timeout=10)
     with pytest.raises(ActorUnavailable):
         ref.ask("still marked as up")
-    home.mark("root/a", Status.STARTING)
+    home.mark("root/a", Presence.STARTING)
     with pytest.raises(ActorUnavailable):
         ref.ask("starting")
     second = home.start_other(a="Remote")
     assert ref.ask("pid") == second.pid
     assert proxy.method(3).get(timeout=10) == 3
     home.kill(second)
-    home.mark("root/a", Status.GONE)
+    home.mark("root/a", Presence.GONE)
     with pytest.raises(pykka.ActorDeadError):
         ref.ask("gone")
 
@@ -558,7 +566,7 @@ def test_open_asks_fail_when_the_process_is_killed_and_the_reference_works_again
 def test_an_open_ask_fails_with_actor_dead_error_if_the_actor_is_gone_for_good(home: Home) -> None:
     other = home.start_other(a="Remote")
     future = ref_to("root/a").proxy().wait_for_ever()
-    home.mark("root/a", Status.GONE)
+    home.mark("root/a", Presence.GONE)
     home.kill(other)
     with pytest.raises(pykka.ActorDeadError):
         future.get(timeout=10)
@@ -602,7 +610,7 @@ def test_an_abandoned_actor_is_dead_for_everybody_else(home: Home) -> None:
     gate.wait_arrived()
     waiting = stuck.ask("behind", block=False)
     home.hub.remove("root/stuck", stuck, ExitReport("killed"))
-    home.mark("root/stuck", Status.GONE)
+    home.mark("root/stuck", Presence.GONE)
     with pytest.raises(pykka.ActorDeadError):
         waiting.get(timeout=10)
     with pytest.raises(pykka.ActorDeadError):

@@ -73,9 +73,9 @@ class Cameras(rr.Manager):
     def open_camera(self, device: str) -> int:
         return len(device)
 
-    @rr.server("none")  # error
-    def no_request(self) -> int:
-        return 0
+    @rr.server("zoom")
+    def zoom(self, device: str, factor: float = 1.0) -> int:
+        return len(device)
 
 
 def use(app: rr.Registrar) -> None:
@@ -84,6 +84,7 @@ def use(app: rr.Registrar) -> None:
     app.load("cameras/camera", "a", response_type=str).response.topic  # error
     app.load("cameras/camera", "a", block=False).response  # error
     app.load(3, "a")  # error
+    app.load(Cameras.zoom, "a")  # error
 """
 
 PROGRAMS = ("readme.py", "use.py", "every_name.py")

@@ -288,6 +288,67 @@ def test_a_value_that_cannot_travel_is_refused_where_it_is_sent_and_the_error_na
         encode({"a": value})
 
 
+class Shape:
+    """Its codec raises, or returns what cannot be sent."""
+
+    def __init__(self, act: Callable[[], Any]) -> None:
+        self.act = act
+
+
+rr.codec(Shape, lambda shape: shape.act(), lambda data: Shape(lambda: data))
+
+
+@dataclass
+class Drawing:
+    shape: Shape
+
+
+class Sealed(pydantic.BaseModel):
+    name: str = "x"
+
+    @pydantic.model_serializer
+    def seal(self) -> dict[str, str]:
+        raise OverflowError("the seal is broken")
+
+
+def raise_error(error: Exception) -> Any:
+    raise error
+
+
+@pytest.mark.parametrize("around", [lambda value: {"a": value}, lambda value: {"a": Drawing(value)}])
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda: raise_error(ValueError("not closed")), r"raised ValueError: not closed"),
+        (lambda: raise_error(TypeError("no corner")), r"raised TypeError: no corner"),
+        (lambda: raise_error(OverflowError("too large")), r"raised OverflowError: too large"),
+        (lambda: [object()], r"returned .*object"),
+        (lambda: 1 << 70, r"returned .*64 bits|returned .*ints"),
+    ],
+)
+def test_the_error_of_a_codecs_encode_is_in_the_refusal(around: Any, act: Any, says: str) -> None:
+    words = rf"request\.a.*: .*, got a test_values\.Shape, whose rr\.codec {says}"
+    with pytest.raises(rr.NotSerializable, match=words):
+        encode(around(Shape(act)))
+
+
+def test_the_error_of_a_models_own_code_is_in_the_refusal() -> None:
+    with pytest.raises(rr.NotSerializable, match=r"request\.a: .*Sealed, whose own code raised .*the seal is broken"):
+        encode({"a": Sealed()})
+
+
+@pytest.mark.parametrize(
+    "moment",
+    [
+        datetime.datetime.max.replace(tzinfo=datetime.timezone(datetime.timedelta(hours=-5))),
+        datetime.datetime.min.replace(tzinfo=datetime.timezone(datetime.timedelta(hours=5))),
+    ],
+)
+def test_a_datetime_that_has_no_year_in_utc_is_refused_as_that(moment: datetime.datetime) -> None:
+    with pytest.raises(rr.NotSerializable, match=r"request\.a\[0\]: .* got a datetime whose year in UTC .* 1 to 9999"):
+        encode({"a": [moment]})
+
+
 class TaggedModel(pydantic.BaseModel):
     tags: set[str] = set()
 

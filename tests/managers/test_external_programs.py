@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
@@ -140,6 +141,7 @@ def test_a_start_without_free_descriptors_leaves_no_descriptor_and_no_shim(
 ) -> None:
     home = Home(tmp_path / "programs" / KEY)
     programs._clear(home)  # pyright: ignore[reportPrivateUsage]
+    gc.collect()  # what earlier tests have left closes its descriptors now
     before = sorted(os.listdir("/proc/self/fd"))
     with NoDescriptors(free), pytest.raises(OSError, match="Too many open files"):
         programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
@@ -598,6 +600,16 @@ def test_killing_the_shim_ends_the_program_and_its_children_and_is_heard_of(
     shim.kill()
     assert exits.wait()[1] == Exit(None, None, ("ready",))
     assert not find_processes(VARIABLE, KEY)
+
+
+def test_an_end_that_could_not_be_written_is_not_called_a_kill(
+    programs: ExternalPrograms, exits: Exits, tmp_path: Path
+) -> None:
+    programs.start(KEY, python(SLEEP, ready="ready"))
+    running = Home(tmp_path / "programs" / KEY).state()["program"][0]
+    (tmp_path / "programs" / KEY / "state.json.new").mkdir()  # as a full disk would
+    os.kill(running, signal.SIGTERM)
+    assert "has ended unseen: the process that watched over it was killed, or could not write" in str(exits.wait()[1])
 
 
 def test_closing_leaves_the_programs_running(tmp_path: Path, exits: Exits) -> None:

@@ -50,6 +50,9 @@ def test_the_robot_reaches_its_goal_through_all_faults_and_stops_at_the_first_wi
     assert row(done.stdout, "processes left")[2] == "0"
     for figure in ("path.png", "distance.png"):
         assert (tmp_path / "out" / figure).read_bytes().startswith(b"\x89PNG")
+    with_faults = (tmp_path / "out" / "timeline-with-faults.svg").read_text()
+    assert [child in with_faults for child in ("root/programs", "root/components", "root/robots")] == [True] * 3
+    assert "killed" in with_faults
     assert "Traceback" not in (tmp_path / "out" / "mission.log").read_text()
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import random
 import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from support import Calls, eventually, kill, pid_of, wait_respawned
 from support_programs import running_programs
 
 SLEEP = "import time; print('ready'); time.sleep(600)"
+EVIL = RunProgram(  # takes some thousand years to see that the line does not match
+    "sh", ("-c", f"echo {'a' * 60}b; exec sleep 600"), ready=Ready(line="(a+)+$", timeout_s=2.0), grace_s=600.0
+)
 SPEC = rr.ChildSpec(Programs, id="programs")
 Start = Callable[..., rr.System]
 
@@ -54,6 +58,54 @@ def test_a_program_is_started_shared_and_ended_with_its_last_holder(system: rr.S
     assert is_running(first.response)
     second.unload()
     assert not psutil.pid_exists(second.response.pid)
+
+
+def is_paused(program: Program) -> bool:
+    return psutil.Process(program.pid).status() == psutil.STATUS_STOPPED
+
+
+def test_an_idle_program_is_paused_also_over_a_crash_of_its_manager_and_goes_on_when_it_is_needed(start: Start) -> None:
+    system = start(rr.ChildSpec(Programs, id="programs", kwargs={"idle": "pause"}))
+    app = system.open_registrar("app")
+    query = app.load("programs/program", python(SLEEP))
+    assert not is_paused(query.response)
+    query.standby()
+    eventually(lambda: is_paused(query.response))
+
+    wait_respawned(system, "programs", kill(system, "programs"))
+    assert is_paused(query.response)
+    again = app.load("programs/program", python(SLEEP))
+    assert again.response == query.response
+    assert not is_paused(again.response)
+
+    again.unload()
+    eventually(lambda: is_paused(query.response))
+    query.unload()
+    (kept,) = system.registrar("programs").resources()  # nobody holds it; without paused_s it is kept
+    eventually(lambda: system.registrar("programs").resources()[0].phase == "paused")
+    system.registrar("programs").unload(kept, force=True)
+    assert not psutil.pid_exists(query.response.pid)
+
+
+def test_a_paused_program_ends_in_order_when_its_time_is_over(start: Start, tmp_path: Path) -> None:
+    """Its handler of SIGTERM runs, though it was stopped when the signal came."""
+    code = "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: (open(sys.argv[1], 'w'), sys.exit()))\n"
+    code += "print('ready')\nwhile True: time.sleep(600)"
+    system = start(rr.ChildSpec(Programs, id="programs", kwargs={"idle": "pause", "paused_s": 0.2}))
+    app = system.open_registrar("app")
+    program = app.load("programs/program", python(code, str(tmp_path / "ended"), grace_s=600.0), priority=None)
+    eventually(lambda: is_paused(program.response))
+    program.unload()
+    eventually(lambda: system.registrar("programs").resources() == [])
+    assert (tmp_path / "ended").exists()
+
+
+@pytest.mark.parametrize(("options", "named"), [({"idle": "sleep"}, "idle"), ({"linger_s": -1}, "linger_s")])
+def test_a_wrong_way_to_treat_idle_programs_is_refused_by_name(
+    start: Start, options: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(rr.StartFailed, match=named):
+        start(rr.ChildSpec(Programs, id="programs", kwargs=options))
 
 
 def test_instances_tell_equal_programs_apart(app: rr.Registrar) -> None:
@@ -124,6 +176,8 @@ def test_a_program_can_be_ready_when_a_function_says_so(start: Start, tmp_path: 
         (python("print('boom'); raise SystemExit(7)"), "(?s)exited with code 7.*boom"),
         (python(SLEEP, ready=Ready(line="never", timeout_s=2.0)), "(?s)not ready within 2 s.*ready"),
         (python(SLEEP, ready=Ready(line="(")), "expected a regular expression, got '\\('"),
+        (python(SLEEP, ready=Ready(line="(?u)ready")), "expected a regular expression, got .*bytes pattern"),
+        (EVIL, "(?s)not ready within 2 s.*aaab"),
         (python(SLEEP, ready=Ready(probe="no.such:probe")), "package.module:function"),
         (python(SLEEP, stop_signal="SIGNOTHING"), "expected a name like 'SIGTERM', got 'SIGNOTHING'"),
     ],
@@ -134,6 +188,71 @@ def test_a_program_that_cannot_be_had_fails_with_the_reason_and_leaves_nothing(
     with pytest.raises(rr.LoadFailed, match=says):
         app.load("programs/program", request_)
     assert app.queries() == []
+
+
+@pytest.mark.parametrize(
+    ("first", "says"),
+    [
+        ("#!/no/such/interpreter -u", "is there, but not its interpreter '/no/such/interpreter -u'"),
+        ("#!/bin/sh\r", r"is there, but not its interpreter '/bin/sh\\r'"),
+    ],
+)
+@pytest.mark.parametrize("in_path", [False, True])
+def test_a_script_whose_interpreter_is_missing_names_that(
+    app: rr.Registrar, tmp_path: Path, first: str, says: str, in_path: bool
+) -> None:
+    script = tmp_path / "a_script"
+    script.write_text(f"{first}\nexit 0\n")
+    script.chmod(0o700)
+    path = {"PATH": f"{tmp_path}:/usr/bin:/bin"} if in_path else {}
+    with pytest.raises(rr.LoadFailed, match=f"cannot start .*a_script': FileNotFoundError: {script} {says}"):
+        app.load("programs/program", RunProgram("a_script" if in_path else str(script), environment=path))
+
+
+def hang_until(gate: str, pid: int) -> bool:
+    """Hang as a probe does that waits for something that does not come."""
+    Path(gate).joinpath("asked").touch()
+    while not Path(gate).joinpath("open").exists():
+        threading.Event().wait(0.02)
+    return True
+
+
+@pytest.fixture
+def hanging(start: Start, tmp_path: Path) -> Iterator[rr.System]:
+    """A system whose programs may have a probe that hangs."""
+    probe = functools.partial(hang_until, str(tmp_path))
+    yield start(rr.ChildSpec(Programs, id="programs", kwargs={"probes": {"hangs": probe}}))
+    (tmp_path / "open").touch()
+
+
+def test_a_probe_that_hangs_is_given_up_in_time(hanging: rr.System) -> None:
+    with pytest.raises(rr.LoadFailed, match=r"not ready within 2 s \(the check whether it is ready has not returned\)"):
+        hanging.open_registrar("app").load("programs/program", python(SLEEP, ready=Ready(probe="hangs", timeout_s=2.0)))
+    assert not running_programs()
+
+
+def test_the_end_of_a_program_whose_probe_hangs_is_noticed(hanging: rr.System, tmp_path: Path) -> None:
+    code = (
+        f"import os, time\nwhile not os.path.exists({str(tmp_path / 'asked')!r}): time.sleep(0.01)\nraise SystemExit(3)"
+    )
+    with pytest.raises(rr.LoadFailed, match="not ready yet and exited with code 3"):
+        hanging.open_registrar("app").load(
+            "programs/program", python(code, ready=Ready(probe="hangs", timeout_s=600.0))
+        )
+
+
+@pytest.mark.parametrize("grace_s", [float("inf"), 1e300])
+def test_a_grace_without_end_is_waited_for(app: rr.Registrar, tmp_path: Path, grace_s: float) -> None:
+    mark = tmp_path / "mark"
+    code = (
+        "import pathlib, signal, time\n"
+        f"def end(*_): time.sleep(0.1); pathlib.Path({str(mark)!r}).touch(); raise SystemExit\n"
+        "signal.signal(signal.SIGTERM, end); print('ready'); time.sleep(600)"
+    )
+    with app.load("programs/program", python(code, grace_s=grace_s)) as program:
+        assert is_running(program.response)
+    assert mark.exists()
+    assert not running_programs(program.resource_id)
 
 
 def test_a_request_of_the_wrong_type_names_the_field(app: rr.Registrar) -> None:
@@ -285,3 +404,100 @@ def test_a_system_that_stops_ends_its_programs(start: Start) -> None:
     program = system.open_registrar("app").load("programs/program", python(SLEEP))
     system.stop()
     assert not running_programs(program.resource_id)
+
+
+@pytest.mark.parametrize("ready", [Ready(line="never", timeout_s=600.0), Ready(probe="hangs", timeout_s=600.0)])
+def test_a_system_that_stops_ends_a_program_that_is_not_ready_yet(
+    hanging: rr.System, tmp_path: Path, ready: Ready
+) -> None:
+    code = f"import pathlib, time; pathlib.Path({str(tmp_path / 'runs')!r}).touch(); time.sleep(600)"
+    hanging.open_registrar("app").load("programs/program", python(code, ready=ready), block=False)
+    eventually((tmp_path / "runs").exists)
+    hanging.stop()
+    assert not running_programs()
+
+
+# -- usage -----------------------------------------------------------------------------------------------------------
+
+BUSY = """
+import os, threading, time
+held = bytearray(os.urandom(1)) * 50_000_000
+threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
+if os.fork() == 0:
+    while True:
+        pass
+print("ready")
+time.sleep(600)
+"""
+ENDED = """
+import os, time
+if os.fork() == 0:
+    if os.fork() == 0:  # an orphan soon, which the shim reaps
+        end = time.process_time() + 0.6  # and a margin: /proc counts in ticks
+        while time.process_time() < end:
+            pass
+    os._exit(0)
+os.wait()
+print("ready")
+time.sleep(600)
+"""
+
+
+def test_the_usage_of_a_program_is_that_of_its_whole_tree(system: rr.System, app: rr.Registrar) -> None:
+    programs = system.registrar("programs")
+    with app.load("programs/program", python(BUSY)) as busy, app.load("programs/program", python(SLEEP)) as idle:
+        assert eventually(lambda: programs.usage()[busy.resource_id]["cpu_s"] >= 0.3)
+        found = programs.usage()
+        assert found.failures == {}
+        used, unused = found[busy.resource_id], found[idle.resource_id]
+        assert set(used) == {"cpu_s", "cpu", "memory_bytes", "threads"}
+        assert 0 < used["cpu"] <= 1.2
+        assert used["cpu"] > unused["cpu"]
+        assert (used["threads"], unused["threads"]) == (3, 1)
+        assert 50e6 < used["memory_bytes"] < 100e6  # once, though two processes have it
+        assert unused["memory_bytes"] < 50e6
+    assert programs.usage() == {}
+
+
+def test_the_usage_has_the_time_of_descendants_that_have_ended(system: rr.System, app: rr.Registrar) -> None:
+    programs = system.registrar("programs")
+    with app.load("programs/program", python(ENDED)) as program:
+        assert eventually(lambda: programs.usage()[program.resource_id]["cpu_s"] >= 0.4)
+        assert eventually(lambda: programs.usage()[program.resource_id]["threads"] == 1)
+        assert programs.usage()[program.resource_id]["cpu_s"] >= 0.4
+
+
+def test_a_respawned_manager_knows_the_usage_of_its_programs(system: rr.System, app: rr.Registrar) -> None:
+    programs = system.registrar("programs")
+    with app.load("programs/program", python(BUSY)) as busy:
+        before = programs.usage()[busy.resource_id]["cpu_s"]
+        wait_respawned(system, "programs", kill(system, "programs"))
+        assert eventually(lambda: programs.usage()[busy.resource_id]["cpu_s"] >= before)
+
+
+def test_a_control_group_of_its_own_counts_what_nobody_reaped(system: rr.System, app: rr.Registrar) -> None:
+    mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
+    mounted = next((Path(mount[1]) for mount in mounts if mount[2] == "cgroup2"), None)
+    if mounted is None or not os.access(mounted, os.W_OK):
+        pytest.skip("no control groups of version 2 that can be written")
+    group = mounted / f"rr-usage-{os.getpid()}"
+    code = """
+import os, pathlib, signal, sys, time
+pathlib.Path(sys.argv[1], "cgroup.procs").write_text(str(os.getpid()))
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps the child, and counts its time nowhere else
+if os.fork() == 0:
+    end = time.process_time() + 0.4
+    while time.process_time() < end:
+        pass
+    os._exit(0)
+print("ready")
+time.sleep(600)
+"""
+    group.mkdir()
+    try:
+        programs = system.registrar("programs")
+        with app.load("programs/program", python(code, str(group))) as program:
+            assert eventually(lambda: programs.usage()[program.resource_id]["threads"] == 1)
+            assert programs.usage()[program.resource_id]["cpu_s"] >= 0.4
+    finally:
+        group.rmdir()

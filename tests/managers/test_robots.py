@@ -170,8 +170,8 @@ def test_a_replacement_is_heard_of_once_also_when_the_managers_are_killed_afterw
     ("text", "key", "says"),
     [
         ("[[robot]]\nname = 'a'\n", "robot[0]", "driver"),
-        ("[[robot]]\nname = 'a'\ndriver = 'x'\n", "robot[0].driver", "expected `object`, got `str`"),
-        ("[[robot]]\nname = 'a'\ndriver = { kind = 'x' }\n", "robot[0].driver", "kind"),
+        ("[[robot]]\nname = 'a'\ndriver = 'x'\n", "robot[0].driver", "expected a table, got 'x' (str)"),
+        ("[[robot]]\nname = 'a'\ndriver = { kind = 'x' }\n", "robot[0].driver.kind", "one of type, parameters"),
         (ROBOTS + ROBOTS, "robot[2].name", "'rover' again"),
     ],
 )

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 import tomllib
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -121,6 +122,36 @@ def test_fastapi_has_a_system_in_each_of_several_workers(place: Path) -> None:
         assert len(still_running(place)) == 2
         server.stop()
     assert "Traceback" not in server.log
+    assert still_running(place) == []
+
+
+@pytest.mark.slow
+def test_workers_of_a_web_service_share_a_model_that_is_loaded_again_after_a_kill(place: Path) -> None:
+    with running(place, sys.executable, "shared_model.py") as owner:
+        eventually(lambda: still_running(place), START_S)
+        with running(place, BIN / "uvicorn", "--port", "0", "--workers", "2", "shared_model:app") as server:
+            url = server.wait_for(ADDRESS.pattern)[0]
+            server.wait_for("Application startup complete", 2)
+            seen: list[dict[str, Any]] = []
+
+            def both() -> bool:
+                seen.append(get_json(f"{url}/numbers/two"))
+                return len({answer["worker"] for answer in seen}) == 2
+
+            eventually(both, START_S)
+            (model,) = {answer["model_pid"] for answer in seen}
+            os.kill(model, signal.SIGKILL)
+
+            def answered() -> bool:
+                with contextlib.suppress(urllib.error.HTTPError):  # 503
+                    seen.append(get_json(f"{url}/numbers/two"))
+                return seen[-1]["model_pid"] != model
+
+            eventually(answered, START_S)
+            assert {answer["number"] for answer in seen} == {2}
+            server.stop()
+        assert "Traceback" not in server.log
+        assert owner.stop() == 0
     assert still_running(place) == []
 
 

@@ -44,6 +44,18 @@ EXPECTED = {
         "the counter kept its place: True",
         "nothing was loaded twice: True",
     ],
+    "camera": [
+        "both have pictures of 307200 bytes: True",
+        "display goes on with picture ",
+        "recorder goes on with picture ",
+    ],
+    "brownout": [
+        "100 W                radio, lamp, camera, map, arm",
+        "the pump needs 40 W  camera, map, arm, pump",
+        "at most 100 W were in use",
+        "60 W                 arm, pump",
+        "100 W again          camera, map, arm, pump",
+    ],
     "run_time_registration": ["twice 21 is 42", "it ran in another process: True", "after a respawn, twice 4 is 8"],
     "async_load": [
         "ten loads at once: [0, 1, 4, 9, 16, 25, 36, 49, 64, 81]",

@@ -18,7 +18,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # Where each library may be imported: a file, or a folder ending in "/".
 PLACES = {
-    "pykka": ("actors/", "supervision/", "registrar/", "system/hosting/", "system/snapshots.py"),
+    "pykka": ("actors/", "supervision/", "registrar/", "system/snapshots.py"),
     "cloudpickle": ("base/pickling.py",),
     "multiprocessing": ("runtime/processes/fork_server.py", "runtime/processes/child_bootstrap.py"),
     "sqlite3": ("storage/",),
@@ -75,9 +75,11 @@ def name_of(path: Path) -> str:
     return ".".join(("rr_actors", *parts[: -1 if parts[-1] == "__init__" else None]))
 
 
-def contract() -> dict[str, object]:
+def layers(contract: int) -> list[str]:
+    """The names in the layers of a contract: 0 is that of the modules, 1 that of the rooms."""
     config = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    return config["tool"]["importlinter"]["contracts"][0]
+    found = config["tool"]["importlinter"]["contracts"][contract]["layers"]
+    return [name.strip(" ()") for layer in found for name in str(layer).split(":")]
 
 
 def test_imports_point_downward() -> None:
@@ -88,12 +90,8 @@ def test_imports_point_downward() -> None:
 
 
 def test_every_module_has_its_layer() -> None:
-    layers = contract()["layers"]
-    assert isinstance(layers, list)
-    named = [name.strip(" ()") for layer in layers for name in str(layer).split(":")]
-    packages = {
-        f"rr_actors{name}" for name in ("", ".registrar", ".supervision", ".system", ".system.hosting", ".tools")
-    }  # their modules are named one by one
+    named = layers(0)
+    packages = {f"rr_actors{name}" for name in ("", ".registrar", ".supervision", ".system", ".tools")}  # one by one
 
     left_out = [
         name
@@ -102,6 +100,12 @@ def test_every_module_has_its_layer() -> None:
     ]
 
     assert left_out == []
+
+
+def test_every_room_has_its_layer() -> None:
+    rooms = {f"rr_actors.{path.parent.name}" for path in PACKAGE.glob("*/__init__.py")}
+
+    assert rooms | {"rr_actors.__main__"} == set(layers(1))
 
 
 @pytest.mark.parametrize("library", sorted(PLACES))

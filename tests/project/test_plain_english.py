@@ -14,7 +14,7 @@ import rr_actors as rr
 from support import REPOSITORY
 
 LIMIT = 30  # words; 25 is the rule
-PAGES = [REPOSITORY / "README.md", REPOSITORY / "CHANGELOG.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+PAGES = [*sorted(REPOSITORY.glob("*.md")), *sorted((REPOSITORY / "docs").rglob("*.md"))]
 PRIVATE = re.compile(
     r"\b(whoever|let go|lets go|letting go|is told|are told|taken up|takes up|under way)\b", re.IGNORECASE
 )

@@ -21,6 +21,7 @@ import pytest
 
 import rr_actors as rr
 from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, messages, serve
+from support_inside import actor_of
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -336,7 +337,7 @@ def test_a_registrar_that_cannot_say_why_it_cannot_commit_is_down_and_does_not_h
     app, provider = system.open_registrar("app"), system.open_registrar("provider")
     served = serve(provider, "camera")
     app.load("provider/camera", "first")
-    monkeypatch.setattr(provider._actor._commits, "commit", lambda _decision: 1 // 0)
+    monkeypatch.setattr(actor_of(provider).commits, "commit", lambda _decision: 1 // 0)
     with pytest.raises(rr.LoadTimeout):
         app.load("provider/camera", "second", timeout_s=0.5)
     assert served.loads.items == ["first"]

@@ -14,12 +14,14 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.engine.monitor import CommitLog, Monitor
+from rr_actors.registrar.engine.commit_log import CommitLog
+from rr_actors.registrar.engine.monitor import RegistrarMonitor
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.rows import Phase, Query, Resource
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
+from support_inside import actor_of
 
 Start = Callable[..., rr.System]
 
@@ -46,14 +48,14 @@ def behind(gate: Gate) -> Callable[[str], str]:
 def told(monkeypatch: pytest.MonkeyPatch) -> Calls:
     """Whether the threads that ran callbacks decided that themselves, one after another."""
     calls = Calls()
-    decide_here: Callable[[Monitor, Any], bool] = Monitor.decide_here
+    decide_here: Callable[[RegistrarMonitor, Any], bool] = RegistrarMonitor.decide_here
 
-    def noted(monitor: Monitor, done: Any) -> bool:
+    def noted(monitor: RegistrarMonitor, done: Any) -> bool:
         outcome = decide_here(monitor, done)
         calls(outcome)
         return outcome
 
-    monkeypatch.setattr(Monitor, "decide_here", noted)
+    monkeypatch.setattr(RegistrarMonitor, "decide_here", noted)
     return calls
 
 
@@ -66,7 +68,7 @@ def on_disk(state_dir: Path, request: str) -> list[Phase]:
 
 
 def nothing_is_left_open(provider: rr.Registrar) -> bool:
-    routes = provider._actor.consumers.routes
+    routes = actor_of(provider).consumers.routes
     ways = routes._loads, routes._unloads
     return not any(way.lines or way.links for way in ways)
 
@@ -91,7 +93,7 @@ def in_thread(fn: Callable[[], object], outcome: Calls) -> threading.Thread:
 def test_a_first_load_and_the_last_unload_are_on_disk_and_answered_while_the_loop_does_something_else(
     app: rr.Registrar, provider: rr.Registrar, told: Calls, state_dir: Path
 ) -> None:
-    dispatcher = provider._actor.node.dispatcher
+    dispatcher = actor_of(provider).node.dispatcher
     busy: list[Gate] = []
 
     def load(request: str) -> str:
@@ -178,7 +180,7 @@ def test_two_who_wait_for_one_load_are_both_answered(
     app.load("provider/thing", "before")
     outcome = Calls()
     threads = [in_thread(lambda: app.load("provider/thing", "x"), outcome) for _ in range(2)]
-    eventually(lambda: len(provider._actor.catalog.waiting) == 2)
+    eventually(lambda: len(actor_of(provider).catalog.waiting) == 2)
     gate.open()
     for thread in threads:
         thread.join()
@@ -208,9 +210,9 @@ def test_of_a_closed_registrar_nothing_is_written_and_nobody_answered(
     thread = in_thread(lambda: app.load("provider/thing", "x", timeout_s=0.5), outcome)
     gate.wait_arrived()
     writes = Calls()
-    monkeypatch.setattr(provider._actor._commits._store, "commit", writes)
-    provider._actor.node.dispatcher.call(provider._actor.close)
-    eventually(lambda: provider._actor.closed)
+    monkeypatch.setattr(actor_of(provider).commits.store, "commit", writes)
+    actor_of(provider).node.dispatcher.call(actor_of(provider).close)
+    eventually(lambda: actor_of(provider).closed)
     writes_before = len(writes)
     gate.open()
     assert told.wait(2)[1] is False
@@ -232,7 +234,7 @@ def test_what_the_thread_cannot_write_the_loop_does(
     monkeypatch: pytest.MonkeyPatch,
     error: Exception,
 ) -> None:
-    store = provider._actor._commits._store
+    store = actor_of(provider).commits.store
     commit, failures = store.commit, Calls()
 
     def fails_in_threads(changes: Any) -> None:
@@ -256,7 +258,7 @@ def test_while_the_disk_is_full_who_waits_waits_and_is_answered_when_there_is_ro
 ) -> None:
     served = serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")
-    store = provider._actor._commits._store
+    store = actor_of(provider).commits.store
     outcome, failures = Calls(), Calls()
     thread = in_thread(lambda: app.load("provider/thing", "x"), outcome)
     gate.wait_arrived()
@@ -346,7 +348,7 @@ def test_the_thread_that_forked_decides_nothing_in_the_child_and_waits_for_nobod
     app: rr.Registrar, provider: rr.Registrar, gate: Gate
 ) -> None:
     """Whoever was deciding at the fork decides for ever there."""
-    outcome, actor = Calls(), provider._actor
+    outcome, actor = Calls(), actor_of(provider)
 
     serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")

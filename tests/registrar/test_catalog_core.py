@@ -8,13 +8,14 @@ from typing import Any
 import msgspec
 import pytest
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import holding, recovery
 from rr_actors.registrar.core.decide import Item, decide
+from rr_actors.registrar.core.releasing import forgetting, owing
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
 from rr_actors.registrar.model.messages import (
-    Failure,
     Fetch,
     Fetched,
     FetchedQuery,
@@ -29,7 +30,19 @@ from rr_actors.registrar.model.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.registrar.model.rows import Drop, Held, Hold, Notice, Peer, Phase, Put, State, StoredServer, content_of
+from rr_actors.registrar.model.rows import (
+    Drop,
+    Held,
+    Hold,
+    Notice,
+    Peer,
+    Phase,
+    Put,
+    State,
+    StoredServer,
+    apply,
+    content_of,
+)
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
@@ -129,7 +142,7 @@ def provider(phase: str, **server: Any) -> Registrar:
         ("loading", None),
         ("loaded", Loaded("q", "q", b"feed")),
         ("unload_failed", Loaded("q", "q", b"feed")),
-        ("fatal", Loaded("q", "q", b"feed")),
+        ("fatal", Loaded("q", "q", b"feed", state=State.FATAL)),
         ("recovering", None),
     ],
 )
@@ -389,7 +402,8 @@ def test_a_fetch_lists_the_queries_and_then_sends_what_was_not_dealt_with() -> N
     registrar.decide(Fetch("app", True, 7))
 
     listed, noticed = registrar.replies
-    assert listed == Fetched([FetchedQuery("q", "cam", "q", b"front", b"feed", "", 0, 1, "ERROR")], False, 7)
+    rows = [FetchedQuery("q", "cam", "q", b"front", b"feed", "", 0, 1, "ERROR")]
+    assert listed == Fetched(rows, False, 7, notices=True)
     assert (noticed.notice.id, noticed.repeated) == ("s:q", False)
 
 
@@ -443,12 +457,30 @@ def test_each_answer_to_each_view_of_a_query(hold: str, message: Any, after: Hol
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_a_provider_that_was_never_asked_is_looked_for_after_a_crash_if_it_has_anything_of_ours(listed: bool) -> None:
+def test_a_provider_is_looked_for_after_a_crash_once_a_link_to_it_has_been_up(listed: bool) -> None:
+    """It may have something of ours; or a thread loads by its own line there, before a decision knows of it."""
     registrar = Registrar("app")
 
     registrar.obey(c.Reconcile("p", [their()] if listed else [], "r0"))
 
-    assert registrar.changes[:1] == ([Put(Peer("p"))] if listed else [])
+    assert registrar.changes[:1] == [Put(Peer("p"))]
+
+
+@pytest.mark.parametrize("notices", [True, False])
+def test_a_provider_that_goes_for_good_before_its_notices_arrived_is_looked_for_when_it_is_back(notices: bool) -> None:
+    """A query that nobody knows was lost there while this registrar was down; its notice went with the link."""
+    lost = Notice("e:lost", "lost", "app", "res", "e", State.FATAL, "lost", "p/cam", True)
+    provider = Registrar("p", rows=[lost] if notices else ())
+    provider.decide(Fetch("app", resume=True))
+    (fetched,) = [reply for reply in provider.replies if isinstance(reply, Fetched)]
+    assert fetched.notices is notices
+
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", [], "r0", notices=fetched.notices))
+    registrar.obey(c.LinkLost("p"))
+    registrar.obey(c.PeerGone("p", FAILURE, final=True, event="r1", empty=False))
+
+    assert registrar.again().catalog.needs("p") is notices
 
 
 def test_a_load_that_was_sent_again_and_that_its_line_refused_is_owed_on_disk_before_anybody_hears_so() -> None:
@@ -526,6 +558,31 @@ def ask_directly(registrar: Registrar) -> None:
     """A load by its caller's own connection, of which something is about to be decided."""
     registrar.catalog.in_flight["q"] = ASKED
     registrar.obey(c.AddInFlight())
+
+
+@pytest.mark.parametrize(("run", "lost"), [(3, 0), (4, 1)])
+def test_what_a_line_has_brought_without_a_link_is_lost_if_a_later_run_of_its_provider_does_not_list_it(
+    run: int, lost: int
+) -> None:
+    """The list of the same run may be older than the answer of the line."""
+    registrar = in_flight()
+    registrar.obey(c.LinkLost("p"))
+    registrar.obey(c.Got("q", "res", b"feed", run=3))
+
+    registrar.obey(c.Reconcile("p", [], "r1", run=run))
+
+    assert len([effect for effect in registrar.effects if isinstance(effect, e.Receive)]) == lost
+
+
+def test_a_load_in_flight_is_owed_when_its_registrar_is_closed() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", [], "r0"))
+    registrar.catalog.in_flight["q"] = ASKED
+
+    registrar.obey(c.EndClosing())
+
+    assert hold_of(registrar) is Hold.OWED
+    assert list(registrar.catalog.peers) == ["p"]
 
 
 def everything(registrar: Registrar) -> dict[str, Any]:
@@ -828,7 +885,7 @@ def losses(registrar: Registrar) -> list[tuple[str, bool]]:
 
 def test_a_link_is_kept_for_the_notice_of_what_is_lost() -> None:
     registrar = consumer("held")
-    registrar.obey(c.Reconcile("p", [], "r"))
+    registrar.obey(c.Reconcile("p", [], "r", notices=True))
     (lost,) = received(registrar)
     registrar.decide(lost, "")
     registrar.obey(c.Heard("q", "r"))
@@ -921,6 +978,136 @@ def test_a_notice_is_acknowledged_when_its_listeners_have_dealt_with_it_and_hear
     assert requests(registrar) == [NoticesHandled(["s:q"])]
 
     registrar.decide(Noticed(noticed.notice, repeated=True), "p")
+    assert requests(registrar) == [NoticesHandled(["s:q"])]
+
+
+def test_a_window_of_notices_is_on_its_way_and_others_follow_in_order_when_half_of_it_is_handled() -> None:
+    registrar = provider("loaded")
+    registrar.catalog.window = 4
+    sent: list[str] = []
+    behind: list[Any] = []
+    for number in range(8):
+        registrar.obey(c.SetStatus("q", f"s{number}", State.WARNING, "hot", number))
+        sent += [noticed.notice.event for noticed in received_by_holders(registrar)]
+        behind += [effect for effect in registrar.effects if isinstance(effect, e.FellBehind)]
+    assert sent == ["s0", "s1", "s2", "s3"]
+    assert behind == [e.FellBehind("app", "q", "q", 4)]
+
+    registrar.decide(NoticesHandled(["s1:q"]))
+    assert received_by_holders(registrar) == []
+    registrar.decide(NoticesHandled(["s0:q"]))
+    assert [noticed.notice.event for noticed in received_by_holders(registrar)] == ["s4", "s5"]
+
+    registrar.obey(c.ConsumerLost("app"))
+    registrar.decide(NoticesHandled(["s2:q"]))
+    registrar.decide(Fetch("app", True))
+    again = [(noticed.notice.event, noticed.repeated) for noticed in received_by_holders(registrar)]
+    assert again == [("s3", True), ("s4", True), ("s5", True), ("s6", False)]
+    registrar.decide(NoticesHandled(["s3:q", "s4:q", "s5:q"]))
+    assert [noticed.notice.event for noticed in received_by_holders(registrar)] == ["s7"]
+    assert registrar.catalog.behind == {}
+
+
+def test_a_status_that_is_sent_again_has_the_newest_response() -> None:
+    """Its holder may have had that already, and takes what comes."""
+    registrar = provider("loaded")
+    registrar.decide(Fetch("app", True))
+    for number in range(2):
+        registrar.obey(c.SetResponse("q", f"s{number}", b"%d" % number, "", None))
+    assert [noticed.notice.response for noticed in received_by_holders(registrar)] == [b"1"]
+
+    registrar.obey(c.ConsumerLost("app"))
+    registrar.decide(Fetch("app", True))
+
+    again = [(noticed.notice.response, noticed.repeated) for noticed in received_by_holders(registrar)]
+    assert again == [(b"1", True), (b"1", True)]
+
+
+def said_to(registrar: Any, states: str) -> list[Any]:
+    """Say these one after another of resource q; return the effects that say what was dropped."""
+    behind: list[Any] = []
+    for number, letter in enumerate(states):
+        if letter == "R":
+            registrar.obey(c.SetResponse("q", f"s{number}", b"%d" % number, "", number))
+        else:
+            state = State.FATAL if letter == "F" else State.WARNING
+            registrar.obey(c.SetStatus("q", f"s{number}", state, "hot", number))
+        behind += [effect for effect in registrar.effects if isinstance(effect, e.FellBehind) and effect.dropped]
+    return behind
+
+
+@pytest.mark.parametrize(("linked", "left", "dropped"), [(True, "s0 s1 s3 s4 s5 s6", 1), (False, "s3 s4 s5 s6", 3)])
+def test_of_a_query_with_too_many_notices_the_oldest_that_wait_go_but_no_fatal_and_not_the_last_response(
+    linked: bool, left: str, dropped: int
+) -> None:
+    registrar = provider("loaded")
+    registrar.catalog.window, registrar.catalog.backlog = 2, 6
+    if not linked:
+        registrar.obey(c.ConsumerLost("app"))
+    behind = said_to(registrar, "WWRRFWW")
+    assert " ".join(notice.event for notice in registrar.catalog.notices.values()) == left
+    assert behind == [e.FellBehind("app", "q", "q", 0, dropped)]
+
+
+def test_own_statuses_wait_for_a_status_callback_up_to_a_bound_also_while_the_resource_is_recovered() -> None:
+    registrar = provider("loaded", has_status=True, has_recover=True)
+    registrar = registrar.again(Server("cam", has_status=True, has_recover=True))
+    registrar.catalog.window, registrar.catalog.backlog = 2, 4
+    behind = said_to(registrar, "WWWFWWWWW")
+    assert [start.notice.event for start in registrar.catalog.deferred["q"]] == ["s0", "s1"]
+    assert [effect.dropped for effect in behind] == [1, 1, 1]
+    registrar.obey(c.RecoverDone("q", 1, None, "r"))
+    runs = [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    for notice in runs:  # it grows
+        registrar.obey(c.StatusDone("q", notice, handled=False))
+        runs += [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    assert [notice.event for notice in runs] == ["s0", "s1", "s3", "s6", "s7", "s8"]
+    assert registrar.catalog.late == registrar.catalog.deferred == registrar.catalog.own_notices == {}
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_response_that_came_before_a_load_was_answered_is_of_the_resource_that_the_answer_names(again: bool) -> None:
+    """The query was on another before. Its provider took that away, and was asked again before it could say so."""
+    registrar = consumer("pending")
+    registrar.decide(Noticed(Notice("s:q", "q", "app", "before", "s", State.UPDATE, "", "p/cam", False, b"late")), "p")
+    if again:  # the new one says something, too
+        registrar.decide(Noticed(Notice("t:q", "q", "app", "res", "t", State.WARNING, "hot", "p/cam")), "p")
+
+    registrar.decide(Loaded("q", "res", b"feed"), "p")
+
+    held = registrar.catalog.held["q"]
+    assert (held.response, held.state) == (b"feed", State.WARNING if again else State.OK)
+
+
+def test_a_status_that_a_part_brings_again_takes_no_second_place_in_the_window() -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.catalog.window = 1
+    registrar.obey(c.Reconcile("lens", [], "r"))
+    registrar.decide(Fetch("app", True))
+    registrar.decide(load())
+    registrar.ask("part", "lens", "zoom", b"", "q")
+    registrar.decide(Loaded("part", "res", b"x"), "lens")
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    registrar.obey(c.SetStatus("q", "t", State.ERROR, "hotter", None))
+
+    registrar.decide(
+        Noticed(Notice("s:part", "part", "p", "res", "s", State.WARNING, "hot", "lens/zoom"), True), "lens"
+    )
+    registrar.decide(NoticesHandled(["s:q"]))
+
+    assert [noticed.notice.event for noticed in received_by_holders(registrar)] == ["t"]
+
+
+def received_by_holders(registrar: Registrar) -> list[Noticed]:
+    return [reply for reply in registrar.replies if isinstance(reply, Noticed)]
+
+
+def test_a_notice_for_a_query_that_is_not_held_again_whatever_happens_is_acknowledged() -> None:
+    registrar = consumer("pending")
+    registrar.obey(c.GiveUp("q", FAILURE))
+
+    registrar.decide(Noticed(Notice("s:q", "q", "app", "res", "s", State.WARNING, "hot", "p/cam")), "p")
     assert requests(registrar) == [NoticesHandled(["s:q"])]
 
 
@@ -1046,6 +1233,33 @@ def test_after_a_crash_a_status_callback_that_had_not_run_to_its_end_runs_again(
     else:
         assert again.started(e.StartStatus) == []
         assert list(again.catalog.deferred) == ["q"]
+
+
+@pytest.mark.parametrize("crash", [False, True])
+def test_a_window_of_own_statuses_is_given_to_the_status_callback_and_the_next_follow_in_order(
+    crash: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Catalog, "window", 4)
+    registrar = provider("loaded", has_status=True)
+
+    def started() -> list[Notice]:
+        return [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+
+    runs: list[Notice] = []
+    for number in range(9):
+        registrar.obey(c.SetStatus("q", f"s{number}", State.WARNING, "hot", None))
+        runs += started()
+    assert [notice.event for notice in runs] == ["s0", "s1", "s2", "s3"]
+    if crash:
+        registrar = registrar.again(Server("cam", has_status=True))
+        runs = started()
+        assert [notice.event for notice in runs] == ["s0", "s1", "s2", "s3"]
+    for done in range(9):
+        assert len(runs) - done <= 4
+        registrar.obey(c.StatusDone("q", runs[done], handled=False))
+        runs += started()
+    assert [notice.event for notice in runs] == [f"s{number}" for number in range(9)]
+    assert registrar.catalog.late == registrar.catalog.statuses == registrar.catalog.own_notices == {}
 
 
 @pytest.mark.parametrize("crash", [False, True])
@@ -1237,6 +1451,37 @@ def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds(
 
     assert len(registrar.catalog.heard) <= 1024
     assert len(registrar.catalog.refused) <= 4096
+
+
+def test_a_deleted_provider_keeps_what_it_has_said_of_a_query_that_is_still_held() -> None:
+    """Its holder may not find it gone, as it is started again soon; and its unload callback may fail then."""
+    owner = provider("loaded")
+    owner.obey(c.SetStatus("q", "f", State.FATAL, "", None))
+    content = owner.catalog.tables
+    apply(content, owing(content, 2))
+
+    apply(content, forgetting(content, "p", ()))
+
+    (notice,) = content["notices"].values()
+    assert (notice.query_id, notice.state) == ("q", State.FATAL)
+
+
+def test_a_notice_of_what_a_list_has_shown_to_be_lost_stays_at_its_provider_until_the_row_is_gone() -> None:
+    owner = provider("loaded")
+    owner.obey(c.ForceUnload("q", "f", None))
+    (noticed,) = owner.replies
+    registrar = consumer("held")
+    registrar.obey(c.Reconcile("p", [], "r1"))
+    (received,) = [effect for effect in registrar.effects if isinstance(effect, e.Receive)]
+    registrar.decide(received.message, received.sender)
+    noticed = msgspec.structs.replace(noticed, notice=msgspec.structs.replace(noticed.notice, resource_id="res"))
+
+    assert registrar.decide(noticed, "p") == []
+    (unload,) = [effect.message for effect in registrar.obey(c.Heard("q", "r1")) if isinstance(effect, e.Request)]
+
+    assert registrar.changes == [Drop("held", "q")]
+    owner.decide(unload)
+    assert not owner.catalog.notices
 
 
 @pytest.mark.parametrize("hold", ["held", "owed"])

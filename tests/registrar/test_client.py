@@ -13,6 +13,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.messages import Unload
 from support import LIMIT_S, eventually, serve
+from support_inside import actor_of
 
 
 def test_what_was_decided_for_a_link_does_not_go_over_the_next(
@@ -21,7 +22,7 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
     """The provider runs on, and the next link is there before its consumer has taken up that the first was lost."""
     serve(provider, "thing")
     query = app.load("provider/thing", "x")
-    actor = app._actor
+    actor = actor_of(app)
     post, waiting = actor.post, list[Any]()
 
     def hold_back(command: Any, **_more: bool) -> None:
@@ -52,7 +53,7 @@ def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answ
 ) -> None:
     serve(provider, "thing")
     first = app.load("provider/thing", "first")
-    actor = app._actor
+    actor = actor_of(app)
     client, call = actor.client("provider"), actor.node.dispatcher.call
     fetched, waiting, heard = client._fetched, list[Any](), list[list[str]]()
 
@@ -77,7 +78,7 @@ def test_a_fetch_ends_when_its_registrar_is_closed(
 ) -> None:
     serve(provider, "thing")
     app.load("provider/thing", "x")
-    client = app._actor.client("provider")
+    client = actor_of(app).client("provider")
     monkeypatch.setattr(client, "_fetched", lambda *_: None)  # as though the provider were slow
     with ThreadPoolExecutor(1) as thread:
         fetching = thread.submit(app.fetch_queries, "provider", timeout_s=None)
@@ -90,5 +91,9 @@ def test_a_fetch_ends_when_its_registrar_is_closed(
             for done in client._fetching:
                 done([], None)
     heard: list[Any] = []
-    client.fetch(lambda *answer: heard.append(answer))  # one that the loop takes after the close
+
+    async def fetch() -> None:
+        client.fetch(lambda *answer: heard.append(answer))  # one that the loop takes after the close
+
+    actor_of(app).node.dispatcher.run(fetch(), timeout_s=LIMIT_S)
     assert [type(error) for _, error in heard] == [rr.RegistrarDown]

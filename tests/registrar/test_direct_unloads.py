@@ -16,21 +16,13 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.engine.monitor import CommitLog
+from rr_actors.base.values.failure import Failure
+from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.links.provider_link import THREADS
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.messages import (
-    Failure,
-    Load,
-    Loaded,
-    LoadRefused,
-    Noticed,
-    Unload,
-    Unloaded,
-    UnloadRefused,
-)
+from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Noticed, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import Held, Hold, Notice, State
 from rr_actors.runtime.time_limits import deadline_of, left_until
 from rr_actors.storage.opening import read_rows
@@ -50,6 +42,7 @@ from support import (
     serve,
     wait_respawned,
 )
+from support_inside import actor_of
 from support_managers import Order, Shop
 
 # -- brief holds of real registrars ----------------------------------------------------------------------------------
@@ -81,7 +74,7 @@ def held_on_disk(state_dir: Path) -> list[Held]:
 
 def is_new(registrar: rr.Registrar, query: rr.Query) -> bool:
     """Whether nothing of it is on disk."""
-    return query.id in registrar._actor._commits.unsaved.new
+    return query.id in actor_of(registrar).commits.unsaved.new
 
 
 def held_directly(registrar: rr.Registrar, name: str) -> rr.Query:
@@ -292,7 +285,7 @@ def test_lines_that_threads_give_back_while_their_registrar_closes_are_closed_wi
 ) -> None:
     serve(provider, "thing")
     app.load("provider/thing", "x").unload()
-    connections = app._actor.clients["provider"].connections
+    connections = actor_of(app).clients["provider"].connections
     assert connections is not None
     late, last = Giving(connections, []), Giving(connections, [])
     connections.give_back(Giving(connections, [late]))
@@ -318,7 +311,7 @@ def test_a_line_that_breaks_hands_over_to_the_link(
     assert workshop.lines("unload") == ["unload wheel"]
     assert query.id not in [held.id for held in buyer.queries()]
     assert buyer.owed() == []
-    assert not buyer._actor.busy()
+    assert not actor_of(buyer).busy()
 
 
 @pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
@@ -352,7 +345,7 @@ def test_who_is_interrupted_when_the_unload_was_answered_leaves_nothing_under_wa
     with pytest.raises(KeyboardInterrupt):
         query.unload()
     assert query.id not in [held.id for held in buyer.queries()]
-    eventually(lambda: not buyer._actor.busy())
+    eventually(lambda: not actor_of(buyer).busy())
     assert workshop.lines("unload") == ["unload wheel"]
 
 
@@ -363,7 +356,7 @@ def test_who_is_interrupted_when_the_load_was_answered_holds_nothing(
     with pytest.raises(KeyboardInterrupt):
         buyer.load("shop/thing", Order("wheel"))
     eventually(lambda: workshop.lines("unload") == ["unload wheel"])
-    eventually(lambda: not buyer._actor.busy())
+    eventually(lambda: not actor_of(buyer).busy())
     assert [held.request.name for held in buyer.queries()] == ["first"]
 
 
@@ -377,7 +370,7 @@ def test_a_full_disk_when_the_line_breaks_delays_the_release(
 ) -> None:
     query = held_directly(buyer, "wheel")
     break_lines(ConnectionResetError("lost"), sends=sends)
-    store = buyer._actor._commits._store
+    store = actor_of(buyer).commits.store
     refusals = [CatalogError("disk full"), CatalogError("disk full")]
     commit = store.commit
 
@@ -485,7 +478,7 @@ def test_lines_that_are_closed_give_their_file_descriptors_back(
 def test_a_line_whose_registrar_answers_and_closes_is_lost_after_the_answer(
     app: rr.Registrar, provider: rr.Registrar
 ) -> None:
-    line = LocalLine(app._actor.node, provider._actor, Hello(THREADS, "provider", "app", 1))
+    line = LocalLine(actor_of(app).node, actor_of(provider), Hello(THREADS, "provider", "app", 1))
     line.send(Unloaded("q"))
     line.close()
     line.close()
@@ -560,7 +553,7 @@ def test_that_it_is_owed_is_on_disk_before_its_provider_hears_of_it(app: rr.Regi
     assert watched.found == [Hold.OWED]
     app.save_catalog()
     assert watched.on_disk() is None
-    assert not app._actor.busy()
+    assert not actor_of(app).busy()
 
 
 def test_what_was_never_written_need_not_be_owed_on_disk(app: rr.Registrar, watched: Watched) -> None:
@@ -569,7 +562,7 @@ def test_what_was_never_written_need_not_be_owed_on_disk(app: rr.Registrar, watc
     assert watched.found == [None]
     app.save_catalog()
     assert watched.on_disk() is None
-    assert not app._actor.busy()
+    assert not actor_of(app).busy()
 
 
 def test_an_update_that_waits_to_be_written_is_not_the_first_that_is_written_of_it(
@@ -586,7 +579,7 @@ def test_an_update_that_waits_to_be_written_is_not_the_first_that_is_written_of_
 
 def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     query = taken_up(app, watched, saved=True)
-    monkeypatch.setattr(type(app._actor), "release", None)
+    monkeypatch.setattr(type(actor_of(app)), "release", None)
     query.unload()
     assert watched.found == [Hold.OWED]
 
@@ -594,11 +587,11 @@ def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monke
 def test_while_something_waits_to_be_decided_the_loop_lets_it_go(app: rr.Registrar, watched: Watched) -> None:
     """It may be about the query."""
     query = taken_up(app, watched, saved=True)
-    app._actor.waiting.append((c.LinkLost("nobody"), None))
-    assert not app._actor.owe(query.id)
+    actor_of(app).waiting.append((c.LinkLost("nobody"), None))
+    assert not actor_of(app).owe(query.id)
     query.unload()
     assert watched.found == [Hold.OWED]
-    assert not app._actor.waiting
+    assert not actor_of(app).waiting
 
 
 def test_a_failing_unload_callback_leaves_it_held_and_on_disk(app: rr.Registrar, watched: Watched) -> None:
@@ -617,7 +610,7 @@ def test_who_is_interrupted_while_it_is_written_has_let_it_go_or_holds_it(
     app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     query = taken_up(app, watched, saved=True)
-    ledger = app._actor._commits
+    ledger = actor_of(app).commits
     written = ledger.commit_row
 
     def interrupted(row: Any) -> bool:
@@ -628,7 +621,7 @@ def test_who_is_interrupted_while_it_is_written_has_let_it_go_or_holds_it(
     with pytest.raises(KeyboardInterrupt):
         query.unload()
     eventually(lambda: watched.found == [Hold.OWED])
-    eventually(lambda: not app._actor.busy())
+    eventually(lambda: not actor_of(app).busy())
     assert query.id not in [held.id for held in app.queries()]
 
 
@@ -737,6 +730,15 @@ def test_what_comes_by_a_line_after_the_link_has_asked_is_answered_by_both() -> 
     routes = Routes()
     routes.asked_by_link("app", Unload("q", "app"))
     routes.asked_by_line("line", Unload("q", "app"))
+    assert routes.way_of(Unloaded("q")) == ("line", True)
+
+
+def test_an_unload_by_a_line_that_the_link_has_asked_for_and_that_was_refused_is_answered_by_both() -> None:
+    """The first answer has the query held again, so the second must not go to a line alone that its thread has left."""
+    routes = Routes()
+    routes.asked_by_link("app", Unload("q", "app"))
+    assert routes.way_of(UnloadRefused("q", Failure("UnloadFailed", "busy"))) == (None, True)
+    routes.asked_by_line("line", Unload("q", "app"), released={"q"})
     assert routes.way_of(Unloaded("q")) == ("line", True)
 
 

@@ -152,13 +152,23 @@ def test_what_was_made_old_and_then_became_garbage_is_collected_after_a_while() 
             self.itself = self
 
     rings: list[weakref.ref[Ring]] = []
+    made: list[list[int]] = []
     for _ in range(80):
         ring = Ring()
         rings.append(weakref.ref(ring))
         with left_alone():
-            pass
+            made += ([number] for number in range(3_000))
         del ring
     assert sum(ring() is not None for ring in rings) < 40
+
+
+@pytest.mark.usefixtures("nothing_is_frozen")
+def test_blocks_that_leave_little_cause_no_collection_of_what_is_old() -> None:
+    before = gc.get_stats()[-1]["collections"]
+    for _ in range(200):
+        with left_alone():
+            pass
+    assert gc.get_stats()[-1]["collections"] == before
 
 
 @pytest.mark.usefixtures("nothing_is_frozen")

@@ -16,14 +16,15 @@ import pytest
 import rr_actors
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.decide import Item
-from rr_actors.registrar.engine.monitor import RegistrarState
+from rr_actors.registrar.engine.direct_paths import DirectPaths
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
-from rr_actors.registrar.model.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
+from rr_actors.registrar.model.messages import Fetch, Load, Loaded, Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Notice, Peer, Put, State
-from rr_actors.storage.store import MemoryStore
+from rr_actors.registrar.model.store import MemoryStore
 from simulation.quiescence import compared
 
 HERE = Path(rr_actors.__file__).parent
@@ -104,13 +105,13 @@ class Stage:
         self.store = FullDisk()
         loop: Any = Loop()
         workers: Any = None
-        self.state = RegistrarState("me", RegistrarConfig(name="me"), self.store, loop, workers)
+        self.state = DirectPaths("me", RegistrarConfig(name="me"), self.store, loop, workers)
         for item in before:
             self.state.commit([item])
 
     def picture(self) -> dict[str, Any]:
         """What is known, in memory and on disk."""
-        self.state._commits._save()
+        self.state.commits._save()
         catalog = self.state.catalog
         seen = {name: dict(getattr(catalog, name)) for name in (*TABLES, *MEMORY)}
         return {**seen, "disk": self.store.load()}
@@ -123,7 +124,7 @@ class Stage:
         return [name for name in INDEXES if compared(getattr(fresh, name)) != compared(getattr(kept, name))]
 
 
-WITH = {getattr(RegistrarState, name).__code__ for name in ("commit", "join", "hold", "owe", "forget_released")}
+WITH = {getattr(DirectPaths, name).__code__ for name in ("commit", "join", "hold", "owe", "forget_released")}
 
 
 class Interrupts:
@@ -232,32 +233,32 @@ IN_FLIGHT = holding.pending(c.Ask("mine", "p", "cam", b"front", "", (1 << 32) + 
 GOT = c.Got("mine", "r", b"feed")
 
 
-def begins(state: RegistrarState) -> None:
+def begins(state: DirectPaths) -> None:
     state.catalog.in_flight["mine"] = IN_FLIGHT
 
 
-def holds(state: RegistrarState) -> None:
+def holds(state: DirectPaths) -> None:
     assert state.hold(GOT)
 
 
-def saves(state: RegistrarState) -> None:
-    state._commits._save()
+def saves(state: DirectPaths) -> None:
+    state.commits._save()
 
 
-def owes(state: RegistrarState) -> None:
+def owes(state: DirectPaths) -> None:
     assert state.owe("mine")
 
 
-def lets_go(state: RegistrarState) -> None:
+def lets_go(state: DirectPaths) -> None:
     assert state.forget_released("mine")
 
 
-def joins(state: RegistrarState) -> None:
+def joins(state: DirectPaths) -> None:
     assert state.join(load("r")) is not None
 
 
 # What had happened before by decisions, and by threads; and what is interrupted.
-QUICK: dict[str, tuple[list[Any], list[Any], Callable[[RegistrarState], None]]] = {
+QUICK: dict[str, tuple[list[Any], list[Any], Callable[[DirectPaths], None]]] = {
     "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [], joins),
     "a load by line": ([UP], [begins], holds),
     "a release by line": ([UP], [begins, holds], owes),

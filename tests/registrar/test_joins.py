@@ -16,17 +16,19 @@ from hypothesis import strategies as st
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import loading
 from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.effects import Reply
-from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
+from rr_actors.registrar.model.messages import Load, Loaded, Unload
 from rr_actors.registrar.model.rows import Phase, Put, Query
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, catalog_path, eventually, serve, wait_respawned
+from support_inside import actor_of
 
 # -- what may be joined ----------------------------------------------------------------------------------------------
 
@@ -94,7 +96,8 @@ def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[An
         else:
             fast.set("queries", query.id, query)
             resource = fast.resources[query.resource_id]
-            assert decision.effects == [Reply(step.origin, Loaded(query.id, resource.id, resource.response or b""))]
+            answer = Loaded(query.id, resource.id, resource.response or b"", state=resource.state)
+            assert decision.effects == [Reply(step.origin, answer)]
             assert (decision.changes, decision.later) == ([Put(query)], {})
         assert everything(fast) == everything(general)
 
@@ -193,7 +196,7 @@ def test_it_is_one_holder_more_whatever_comes_in_next(
 def test_it_gets_into_the_tables_when_it_is_quiet(app: rr.Registrar, provider: rr.Registrar, served: Served) -> None:
     provider.save_catalog()
     app.load("provider/thing", "x")
-    store = provider._actor._commits._store
+    store = actor_of(provider).commits.store
     assert store.wants_tidying()
     eventually(lambda: not store.wants_tidying())
 
@@ -201,7 +204,7 @@ def test_it_gets_into_the_tables_when_it_is_quiet(app: rr.Registrar, provider: r
 def test_no_thread_sees_what_was_decided_and_could_not_be_written(
     app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    actor = provider._actor
+    actor = actor_of(provider)
     seen: list[bool] = []
     undo = Decision.undo
 
@@ -221,7 +224,7 @@ def test_no_thread_sees_what_was_decided_and_could_not_be_written(
 
     with monkeypatch.context() as patch:
         patch.setattr(Decision, "undo", undone)
-        patch.setattr(actor._commits._store, "commit", full)
+        patch.setattr(actor.commits.store, "commit", full)
         with pytest.raises(CatalogError, match="disk full"):
             app.load("provider/thing", "y")
     assert seen == [False]
@@ -237,7 +240,7 @@ def test_who_is_interrupted_meanwhile_holds_nothing(
     monkeypatch: pytest.MonkeyPatch,
     written: bool,
 ) -> None:
-    ledger = provider._actor._commits
+    ledger = actor_of(provider).commits
     commit_row = ledger.commit_row
 
     def interrupted(row: Any) -> bool:
@@ -250,7 +253,7 @@ def test_who_is_interrupted_meanwhile_holds_nothing(
         patch.setattr(ledger, "commit_row", interrupted)
         with pytest.raises(KeyboardInterrupt):
             app.load("provider/thing", "x")
-    eventually(lambda: not app._actor.busy())
+    eventually(lambda: not actor_of(app).busy())
     eventually(lambda: on_disk(state_dir) == before)
     assert len(app.queries()) == 1
     assert [len(resource.queries) for resource in provider.resources()] == [1]
@@ -260,11 +263,11 @@ def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider
     """The last holder's Unload has come in: the load that comes after it runs the callback anew."""
     served = serve(provider, "thing")
     query = app.load("provider/thing", "x")
-    dispatcher = provider._actor.node.dispatcher
+    dispatcher = actor_of(provider).node.dispatcher
     arrived = threading.Event()
 
     def occupy() -> None:
-        provider._actor.monitor.receive(Unload(query.id, "app"), "app")
+        actor_of(provider).monitor.receive(Unload(query.id, "app"), "app")
         arrived.set()
         gate()
 
@@ -285,8 +288,8 @@ def test_threads_that_only_load_leave_nothing_to_be_decided(
 ) -> None:
     for _ in range(5000):
         app.load("provider/thing", "x")
-        assert not provider._actor.waiting
-        assert not app._actor.waiting
+        assert not actor_of(provider).waiting
+        assert not actor_of(app).waiting
     assert len(app.queries()) == 5001
     app.unload_all()
     assert len(served.unloads) == 1
@@ -342,11 +345,11 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     short_cuts: list[str] = []
 
     def noted(commit_row: Callable[[Any], bool], row: Any) -> bool:
-        if not app._actor.node.dispatcher.is_loop_thread():
+        if not actor_of(app).node.dispatcher.is_loop_thread():
             short_cuts.append(type(row).__name__)
         return commit_row(row)
 
-    for ledger in (app._actor._commits, provider._actor._commits):
+    for ledger in (actor_of(app).commits, actor_of(provider).commits):
         monkeypatch.setattr(ledger, "commit_row", functools.partial(noted, ledger.commit_row))
     heard: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
@@ -381,9 +384,9 @@ def test_a_load_that_is_refused_leaves_nothing_whether_its_thread_or_the_loop_en
     app.load("provider/other", 0)  # the next goes by a connection of this thread's own
     monkeypatch.setattr(interpreter, "possible", lambda: handled)
     ended: list[str] = []
-    post = app._actor.post
+    post = actor_of(app).post
     monkeypatch.setattr(
-        app._actor, "post", lambda command, **more: (ended.append(type(command).__name__), post(command, **more))
+        actor_of(app), "post", lambda command, **more: (ended.append(type(command).__name__), post(command, **more))
     )
     with pytest.raises(rr.LoadFailed, match="busy"):
         app.load("provider/thing", "x")
@@ -391,7 +394,7 @@ def test_a_load_that_is_refused_leaves_nothing_whether_its_thread_or_the_loop_en
     eventually(lambda: app.owed() == [])
     stats = app.stats()
     assert (stats["loading"], stats["queries"]) == (0, 1)
-    assert app._actor.loads == {}
+    assert actor_of(app).loads == {}
 
 
 def test_what_is_held_is_listed_and_let_go_in_the_order_of_its_loads_whichever_way_they_went(
@@ -405,7 +408,7 @@ def test_what_is_held_is_listed_and_let_go_in_the_order_of_its_loads_whichever_w
     app.load("provider/thing", 6, block=False).get(timeout=10)
     held = app.queries()
     assert [query.request for query in held] == list(range(7))
-    assert app._actor.newest_first() == [query.id for query in reversed(held)]
+    assert actor_of(app).newest_first() == [query.id for query in reversed(held)]
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

@@ -16,6 +16,7 @@ from rr_actors.registrar.model.rows import Query
 from rr_actors.storage.opening import read_rows
 from rr_actors.wire.transport import Hello
 from support import Served, catalog_path, eventually, serve
+from support_inside import actor_of
 
 
 class Line:
@@ -72,7 +73,7 @@ def load(id: str, request: str = "x") -> Load:
 
 @pytest.fixture
 def lines(app: rr.Registrar, provider: rr.Registrar, served: Served) -> Lines:
-    return Lines(provider._actor, app._actor.epoch)
+    return Lines(actor_of(provider), actor_of(app).epoch)
 
 
 def on_disk(state_dir: Path) -> list[str]:
@@ -81,7 +82,7 @@ def on_disk(state_dir: Path) -> list[str]:
 
 def commits(provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many changes each commit has from now on."""
-    store = provider._actor._commits._store
+    store = actor_of(provider).commits.store
     commit, sizes = store.commit, []
 
     def counted(changes: Any) -> None:
@@ -96,10 +97,10 @@ def test_it_is_in_memory_and_on_disk_when_it_is_answered_and_the_inbox_has_seen_
     provider: rr.Registrar, lines: Lines, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(provider._actor.monitor, "put", None)
+        patch.setattr(actor_of(provider).monitor, "put", None)
         (line,) = lines.ask(load("new"))
     (resource,) = provider.resources()
-    server = provider._actor.catalog.servers[resource.server]
+    server = actor_of(provider).catalog.servers[resource.server]
     assert line.sent == [Loaded("new", resource.id, encode(resource.response), server.types_checksum)]
     assert line.flushed == 1
     assert "new" in on_disk(state_dir)
@@ -156,7 +157,7 @@ def test_a_full_disk_refuses_it_and_leaves_nothing(
         def full(_changes: Any) -> None:
             raise CatalogError("disk full")
 
-        patch.setattr(provider._actor._commits._store, "commit", full)
+        patch.setattr(actor_of(provider).commits.store, "commit", full)
         (line,) = lines.ask(load("new"))
         eventually(lambda: line.flushed == 1)
     (refused,) = line.sent
@@ -174,17 +175,17 @@ def test_a_defect_ends_the_registrar_so_that_nobody_waits_at_the_line_for_ever(
         def defect(_changes: Any) -> None:
             raise OverflowError("too large")
 
-        patch.setattr(provider._actor._commits._store, "commit", defect)
+        patch.setattr(actor_of(provider).commits.store, "commit", defect)
         (line,) = lines.ask(load("new"))
         eventually(lambda: line.closed)
     assert line.sent == []
-    assert provider._actor.closed
+    assert actor_of(provider).closed
     serve(system.open_registrar("provider"), "thing")  # the system has to unload what is left
 
 
 def test_it_gets_into_the_tables_when_it_is_quiet(provider: rr.Registrar, lines: Lines) -> None:
     provider.save_catalog()
-    store = provider._actor._commits._store
+    store = actor_of(provider).commits.store
     eventually(lambda: not store.wants_tidying())
     lines.ask(load("new"))
     assert store.wants_tidying()
@@ -203,7 +204,7 @@ def test_only_where_a_commit_waits_for_the_disk_do_several_share_it(
     serve(other, "thing")
     app.load("other/thing", "x")
     sizes = commits(other, monkeypatch)
-    both = Lines(other._actor, app._actor.epoch).ask(load("one"), load("two"))
+    both = Lines(actor_of(other), actor_of(app).epoch).ask(load("one"), load("two"))
     eventually(lambda: [line.flushed for line in both] == [1, 1])
     assert sizes == written
     assert [len(resource.queries) for resource in other.resources()] == [3]

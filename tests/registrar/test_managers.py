@@ -20,9 +20,10 @@ from typing import Any, Literal
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.links import remote_calls
 from rr_actors.registrar.model.messages import Loaded
-from rr_actors.system.hosting import remote_calls
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, child, eventually, hang, kill, pid_of, wait_respawned
+from support_inside import actor_of, node_of
 from support_managers import Made, Order, Shop
 
 Start = Callable[..., rr.System]
@@ -707,9 +708,8 @@ def test_the_error_of_a_handles_call_reaches_a_caller_that_reads_late() -> None:
         loop = asyncio.get_running_loop()
         dispatcher = SimpleNamespace(loop=loop, workers=SimpleNamespace(submit=refuse))
         link: Any = FullAtFirst(loop.create_future())
-        remote_calls.Door(SimpleNamespace(dispatcher=dispatcher), None, link).received(
-            link, remote_calls.Call(7, "x", b"")
-        )
+        place: Any = SimpleNamespace(dispatcher=dispatcher)
+        remote_calls.Door(place, None, link).received(link, remote_calls.Call(7, "x", b""))
         async with asyncio.timeout(5):
             return await link.sent
 
@@ -729,9 +729,8 @@ def test_threads_that_ask_at_once_for_a_handle_share_its_line(
             together.wait(LIMIT_S)
             super().__init__(*args)
 
-    monkeypatch.setattr("rr_actors.system.hosting.node.HandleLine", Slow)
-    node = system._node  # pyright: ignore[reportPrivateUsage]
-    assert node is not None
+    monkeypatch.setattr("rr_actors.registrar.engine.node.HandleLine", Slow)
+    node = node_of(system)
     with ThreadPoolExecutor() as threads:
         one, other = threads.map(node.handle, ["far", "far"])
     assert one is other
@@ -896,7 +895,7 @@ def test_a_response_is_read_with_its_own_types_though_a_thread_has_it_before_the
     first = app.load(f"{where}/again", OpenCamera("a"))
     assert (first.request, first.response) == (OpenCamera("a"), Feed("b", 1))
     provider.unregister_server("again")
-    actor = app._actor  # pyright: ignore[reportPrivateUsage]
+    actor = actor_of(app)
     client, receive = actor.clients[where], actor.monitor.receive
     late: list[Any] = []
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.engine.monitor import CommitLog
+from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.pages import Wanted, page_of
@@ -30,6 +30,7 @@ from support import (
     serve,
     wait_respawned,
 )
+from support_inside import actor_of
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -66,7 +67,7 @@ def builds(builder: rr.Registrar, *names: str, more: Callable[[rr.Query], object
 
 def in_flight(builder: rr.Registrar) -> list[Held]:
     """What threads have asked for, and nobody else knows of."""
-    return list(builder._actor.catalog.in_flight.values())
+    return list(actor_of(builder).catalog.in_flight.values())
 
 
 def held_of(system: rr.System, registrar: str = "builder") -> list[str]:
@@ -85,7 +86,7 @@ def test_the_loop_has_no_part_in_what_a_callbacks_thread_loads_and_gives_back(
     app = parts.open_registrar("app")
     with monkeypatch.context() as patch:
         for method in ("ask", "release", "go_on_loading", "go_on_unloading"):
-            patch.setattr(builder._actor, method, None)
+            patch.setattr(actor_of(builder), method, None)
         bike = app.load("builder/bike", None)
     assert [part.request.name for part in builder.children(bike)] == ["wheel"]
     assert workshop.lines("unload") == ["unload bell"]
@@ -102,7 +103,7 @@ def test_its_row_has_its_parent_and_attempt_in_memory_and_on_disk(
     builder.save_catalog()
     rows = [row for row in read_rows(catalog_path(state_dir, "builder")) if isinstance(row, Held) and row.parent]
     assert [(row.parent, row.attempt, row.hold) for row in rows] == [(bike.resource_id, 1, Hold.HELD)]
-    assert rows == [builder._actor.catalog.held[row.id] for row in rows]
+    assert rows == [actor_of(builder).catalog.held[row.id] for row in rows]
 
 
 def test_that_a_part_is_given_back_is_on_disk_before_its_provider_hears_of_it(
@@ -130,8 +131,8 @@ def test_who_looks_while_it_is_in_flight_sees_what_the_resource_waits_for(
     future = builder.load("builder/bike", None, block=False)
     workshop.wait("load wheel")
     assert [row.request for row in in_flight(builder)] != []
-    (bike,) = page_of(builder._actor, Wanted("resources")).resources
-    (part,) = page_of(builder._actor, Wanted("id", bike.parts[0])).queries
+    (bike,) = page_of(actor_of(builder), Wanted("resources")).resources
+    (part,) = page_of(actor_of(builder), Wanted("id", bike.parts[0])).queries
     assert (part.parent, part.server, part.hold) == (bike.id, "parts/thing", "pending")
     assert in_flight(builder) == []
     workshop.open("load wheel")
@@ -187,7 +188,7 @@ def test_a_callback_that_raises_ends_what_a_thread_of_it_still_loads_at_once(
     assert isinstance(error, rr.LoadError)
     assert "what asked for it is gone" in str(error)
     workshop.open("load wheel")
-    eventually(lambda: held_of(parts) == [] and not builder._actor.busy())
+    eventually(lambda: held_of(parts) == [] and not actor_of(builder).busy())
     eventually(lambda: workshop.lines("unload wheel") == ["unload wheel"])
 
 
@@ -251,7 +252,7 @@ def test_a_connection_that_breaks_hands_the_part_over_to_the_link(
     assert [part.request.name for part in builder.children(bike)] == ["wheel"]
     assert workshop.lines("load wheel") == ["load wheel attempt=1"]
     assert held_of(parts) == ["wheel"]
-    assert not builder._actor.busy()
+    assert not actor_of(builder).busy()
 
 
 def test_a_callbacks_thread_that_is_interrupted_holds_nothing(
@@ -262,7 +263,7 @@ def test_a_callbacks_thread_that_is_interrupted_holds_nothing(
         break_exchanges(patch, KeyboardInterrupt(), sends=True, kind=Load)
         with pytest.raises(rr.LoadFailed):
             builder.load("builder/bike", None)
-    eventually(lambda: held_of(parts) == [] and not builder._actor.busy())
+    eventually(lambda: held_of(parts) == [] and not actor_of(builder).busy())
 
 
 def test_more_threads_of_callbacks_than_there_are_connections_all_get_their_parts(
@@ -362,7 +363,7 @@ def test_a_provider_that_hangs_is_given_up_in_time_and_nothing_is_held_when_it_g
             builder.load("builder/bike", None, timeout_s=LIMIT_S)
     finally:
         os.kill(pid, signal.SIGCONT)
-    eventually(lambda: held_of(parts) == [] and not builder._actor.busy())
+    eventually(lambda: held_of(parts) == [] and not actor_of(builder).busy())
 
 
 # -- rings between processes -----------------------------------------------------------------------------------------

@@ -23,8 +23,9 @@ from rr_actors.registrar.engine import progress as engine
 from rr_actors.registrar.model.messages import Progressed
 from rr_actors.registrar.model.rows import Phase
 from rr_actors.registrar.pages import Wanted
-from rr_actors.registrar.progress_hearers import HearingWait
+from rr_actors.registrar.progress_hearers import HearsHere
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, eventually, kill, serve, wait_respawned
+from support_inside import actor_of
 
 Start = Callable[..., rr.System]
 
@@ -274,7 +275,7 @@ def test_the_last_report_is_sent_though_the_callback_returns_while_the_loop_wait
     planned, sent = Calls(), Calls()
     dispatcher = SimpleNamespace(call=planned, loop=SimpleNamespace(call_later=planned))
     consumers = SimpleNamespace(hint=lambda _origin, progressed: sent(progressed), flush=lambda: None)
-    registrar = SimpleNamespace(closed=False, whole=lambda: catalog, consumers=consumers)
+    registrar: Any = SimpleNamespace(closed=False, whole=lambda: catalog, consumers=consumers)
     registrar.node = SimpleNamespace(dispatcher=dispatcher, watched=False)
     reports = engine.ProgressReports(registrar)
 
@@ -310,6 +311,27 @@ def test_one_that_listens_slowly_hears_the_newest_report(app: rr.Registrar, prov
     assert heard(calls) == [(0.0, ""), (0.4, "")]
 
 
+def test_an_event_loop_that_is_busy_hears_the_newest_report_alone(app: rr.Registrar, provider: rr.Registrar) -> None:
+    calls, reported = Calls(), threading.Event()
+
+    def load(_: str) -> None:
+        for n in range(5):
+            rr.current().progress(n / 10)
+            calls.wait(1)
+            time.sleep(engine.INTERVAL_S)  # so that more than the last one arrives meanwhile
+        reported.set()
+
+    async def busy() -> None:
+        loading = asyncio.create_task(app.load_async("provider/camera", "front", progress=calls))
+        await asyncio.to_thread(calls.wait)
+        assert reported.wait(LIMIT_S)  # the event loop runs nothing else meanwhile
+        await loading
+
+    serve(provider, "camera", load)
+    asyncio.run(busy())
+    assert heard(calls) == [(0.0, ""), (0.4, "")]
+
+
 def test_nothing_is_kept_of_loads_that_have_ended(app: rr.Registrar, provider: rr.Registrar) -> None:
     served: list[rr.Current] = []
 
@@ -328,7 +350,7 @@ def test_nothing_is_kept_of_loads_that_have_ended(app: rr.Registrar, provider: r
             assert n % 2
     for current in served:
         current.progress(0.9)  # a thread that the callback has left behind
-    reports, listeners = provider._actor.progress, app._actor.listeners
+    reports, listeners = actor_of(provider).progress, actor_of(app).listeners
     eventually(lambda: not reports._loads and not listeners._by_query and not listeners._heard)
 
 
@@ -451,6 +473,7 @@ def test_subscribers_hear_of_it(system: rr.System, app: rr.Registrar, provider: 
             "registrar": "provider",
             "server": "provider/camera",
             "resource_id": query.resource_id,
+            "request": '"front"',
             "fraction": 0.5,
             "text": "opening",
         }
@@ -540,10 +563,10 @@ def test_reports_that_come_faster_than_they_are_heard_hold_up_no_time_limit() ->
             wait.progressed(report)
 
     hearer: Any = Slow()
-    wait = HearingWait(hearer)
+    wait = HearsHere(hearer)
     wait.progressed(engine.Progress(0.5, "half", "provider/thing", "r"))
 
-    assert not wait.done_within(0.05)
+    assert not wait.hear_within(0.05)
     assert hearer.heard > 1
-    wait.ended(None, None)
-    assert wait.done_within(LIMIT_S)
+    wait.ended()
+    assert wait.hear_within(LIMIT_S)

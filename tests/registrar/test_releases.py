@@ -7,6 +7,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -60,7 +61,8 @@ def two_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def releasing(held: dict[str, str]) -> tuple[Holder, Releases]:
     holder = Holder(held)
-    return holder, Releases(holder, list(held), holder.note)
+    actor: Any = holder
+    return holder, Releases(actor, list(held), holder.note)
 
 
 def test_the_next_is_let_go_when_one_has_ended_and_a_slow_provider_holds_up_no_other() -> None:

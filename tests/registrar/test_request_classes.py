@@ -14,9 +14,10 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.values.canonical import Codec, encode
-from rr_actors.registrar.engine.monitor import is_deciding
+from rr_actors.registrar.engine.registrar_state import is_deciding
 from rr_actors.registrar.model.messages import Load
 from support import LIMIT_S, Calls, Gate, eventually, serve
+from support_inside import actor_of
 
 T = TypeVar("T")
 
@@ -76,7 +77,7 @@ def load(app: rr.Registrar, server: str, request: Any, block: bool, timeout_s: f
 
 def watch(monkeypatch: pytest.MonkeyPatch, registrar: rr.Registrar, decided: Calls) -> None:
     """Note what is put to a registrar's monitor, once it has been decided."""
-    monitor = registrar._actor.monitor
+    monitor = actor_of(registrar).monitor
     put = monitor.put
 
     def noted(what: Any, sender: str | None = None, *, more: bool = False) -> None:
@@ -206,7 +207,7 @@ def test_what_its_code_raises_is_what_its_caller_hears(
         load(app, "provider/order", {"name": "wrong"}, block)
     assert load(app, "provider/order", {"name": "wheel"}, block).response == "wheel"
     assert app.stats()["queries"] == 3
-    assert app._actor.loads == {}
+    assert actor_of(app).loads == {}
 
 
 def test_what_is_held_already_in_these_bytes_is_joined_without_being_made_again(

@@ -12,16 +12,17 @@ import sys
 import textwrap
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.core import digests
+from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.rows import Held, Peer
 from rr_actors.storage.opening import read_rows
-from rr_actors.wire.name_service import Directory, Status, registrar_key
+from rr_actors.wire.name_service import Directory, Presence, registrar_key
 from rr_actors.wire.unix_transport import UnixTransport
 from support import (
     LIMIT_S,
@@ -164,6 +165,30 @@ def test_a_load_interrupted_by_the_crash_is_run_again_and_is_one_query(start: St
     assert [known.id for known in app.queries()] == [query.id]
     assert [known.id for known in app.fetch_queries("shop")] == [query.id]
     assert holders(system) == {"wheel": ["app"]}
+
+
+def test_a_revocation_goes_on_when_the_provider_has_been_killed(start: Start, workshop: Workshop) -> None:
+    system = start(shop(workshop, "parts"), shop(workshop))
+    app = system.open_registrar("app")
+    heard, goes_on = threading.Event(), threading.Event()
+
+    def on_status(status: rr.Status) -> None:
+        heard.set()
+        goes_on.wait(LIMIT_S)
+
+    app.load("shop/thing", Order("bike", ("parts/thing:wheel",)), on_status=on_status)
+    (wheel,) = system.registrar("parts").resources()
+    with ThreadPoolExecutor(1) as thread:
+        revoked = thread.submit(system.registrar("parts").revoke, wheel.id, "worn", grace_s=600)
+        assert heard.wait(LIMIT_S), revoked.exception()
+        wait_respawned(system, "parts", kill(system, "parts"))
+        assert isinstance(revoked.exception(LIMIT_S), rr.RrError)
+    assert holders(system, "parts") == {"wheel": ["shop"]}
+    goes_on.set()
+    assert eventually(lambda: not system.registrar("parts").resources())
+    assert not holders(system)
+    assert eventually(lambda: not app.queries())
+    assert workshop.lines("unload") == ["unload bike", "unload wheel"]
 
 
 def test_an_interrupted_load_holds_each_part_once(start: Start, workshop: Workshop) -> None:
@@ -334,7 +359,7 @@ def test_what_is_held_is_gone_through_when_the_provider_has_a_process_again(
     (entry,) = begun.wait()
     workshop.open("start shop")
     app.load("shop/thing", Order("wheel"))
-    assert entry.status is Status.STARTING
+    assert entry.status is Presence.STARTING
     assert entry.address.startswith(f"{pid_of(system, 'shop')}-")
 
 
@@ -759,7 +784,7 @@ def test_a_dormant_registrar_has_its_own_name_wherever_its_catalog_is(
 def test_a_release_that_a_kill_interrupts_can_be_made_again(start: Start, workshop: Workshop, state_dir: Path) -> None:
     run_and_be_killed(workshop, state_dir, "system.open_registrar('other').load('shop/thing', Order('wheel'))")
     body = """
-    from rr_actors.system.hosting.node import Node
+    from rr_actors.registrar.engine.node import Node
     Node.retire = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
     system.release('other')
     """
@@ -884,7 +909,7 @@ def test_a_provider_hears_of_a_registrar_that_is_released_while_it_is_about_to_s
 
     def publish_late(directory: Directory, name: str, address: str, **options: Any) -> None:
         if name == registrar_key("provider"):
-            directory.mark(registrar_key("app"), Status.GONE)  # System.release() does so, then looks for addresses
+            directory.mark(registrar_key("app"), Presence.GONE)  # System.release() does so, then looks for addresses
         publish(directory, name, address, **options)
 
     monkeypatch.setattr(Directory, "publish", publish_late)

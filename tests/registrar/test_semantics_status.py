@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import LIMIT_S, Calls, Gate, Served, eventually, loaded_with_parts, messages, serve
+from support import LIMIT_S, Calls, Gate, Served, eventually, loaded_with_parts, serve
 
 WARNING = rr.Status(rr.State.WARNING, "low light")
 ERROR = rr.Status(rr.State.ERROR, "no picture")
@@ -491,6 +491,23 @@ def test_wait_status_ends_with_the_query(app: rr.Registrar, provider: rr.Registr
     ending.join()
 
 
+def test_wait_status_says_what_it_misses_and_never_misses_a_fatal(
+    app: rr.Registrar, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    serve(provider, "camera")
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    provider.send_status(query.resource_id, rr.Status(rr.State.FATAL))
+    for number in range(300):
+        provider.update_response(query.resource_id, str(number))
+    heard.wait(301)
+    with caplog.at_level(logging.WARNING):
+        assert query.wait_status(timeout_s=LIMIT_S).state is rr.State.FATAL
+        assert query.wait_status(timeout_s=LIMIT_S).state is rr.State.UPDATE
+    said = f"provider/camera: wait_status() misses 45 statuses of query {query.id}: the newest 256 are kept"
+    eventually(lambda: [text for text in caplog.messages if "misses" in text] == [said])
+
+
 def test_wait_status_gives_up_after_its_time_limit(app: rr.Registrar, provider: rr.Registrar) -> None:
     serve(provider, "camera")
     query = app.load("provider/camera", "front")
@@ -513,7 +530,7 @@ def test_on_status_hears_for_every_query_at_that_server_besides_their_own_callba
         provider.send_status(query.resource_id, WARNING)
     assert {status.query_id for status in overall.wait(2)} == {first.id, second.id}
     assert [status.query_id for status in own.wait()] == [second.id]
-    assert messages(lidar_heard) == ["low light"]
+    assert messages_of(lidar_heard.wait()) == ["low light"]
     assert len(overall) == 2
 
 

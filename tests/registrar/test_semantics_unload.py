@@ -16,6 +16,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.model.catalog import Catalog
 from support import LIMIT_S, Calls, Gate, Workshop, eventually, kill, loaded_with_parts, serve, wait_respawned
+from support_inside import actor_of
 from support_managers import Order, Shop
 
 
@@ -54,7 +55,7 @@ def test_unload_drops_one_query_of_several_of_the_same_registrar(app: rr.Registr
 def test_a_forced_unload_waits_for_a_decision_that_is_being_made(app: rr.Registrar, provider: rr.Registrar) -> None:
     served = serve(provider, "thing")
     query = app.load("provider/thing", "x")
-    actor = provider._actor
+    actor = actor_of(provider)
     removed, forced = threading.Event(), threading.Event()
 
     def decide() -> None:
@@ -351,6 +352,35 @@ def test_a_with_block_ends_well_if_its_query_was_let_go_inside_and_hides_no_erro
     gate.open()
     served.unloads.wait()
     with pytest.raises(rr.UnknownQuery, match="unload it there"), pickle.loads(pickle.dumps(query)):
+        pass
+
+
+@pytest.mark.parametrize("way", ["with", "with a group", "async with"])
+def test_an_unload_that_fails_at_the_end_of_a_block_is_a_note_on_the_blocks_own_exception(
+    app: rr.Registrar, provider: rr.Registrar, way: str
+) -> None:
+    def jams(_request: str, _response: Any) -> None:
+        raise ValueError("it jams")
+
+    serve(provider, "thing", unload=jams)
+
+    async def wait_and_raise() -> None:
+        async with await app.load_async("provider/thing", "x"):
+            raise KeyError("the block's own")
+
+    def load_and_raise() -> None:
+        if way == "async with":
+            asyncio.run(wait_and_raise())
+        requests = [("provider/thing", "x")]
+        with app.load("provider/thing", "x") if way == "with" else app.load_all(requests):
+            raise KeyError("the block's own")
+
+    with pytest.raises(KeyError, match="the block's own") as raised:
+        load_and_raise()
+    assert len(raised.value.__notes__) == 1
+    assert "UnloadFailed" in raised.value.__notes__[0]
+    assert "it jams" in raised.value.__notes__[0]
+    with pytest.raises(rr.UnloadFailed), app.load("provider/thing", "x"):
         pass
 
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import digests
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Fetch, Fetched, Noticed
@@ -30,7 +30,13 @@ ONE = st.tuples(
 
 
 def held(number: int, hold: Hold = Hold.HELD, response: bytes | None = b"1") -> Held:
-    place = ("p", "cam", b"front", response if hold is Hold.HELD else None, f"r{number}" if hold is Hold.HELD else "")
+    place = (
+        "p",
+        "cam",
+        b"%d" % number,
+        response if hold is Hold.HELD else None,
+        f"r{number}" if hold is Hold.HELD else "",
+    )
     return Held(f"q{number}", *place, "", 0, number, hold, State.OK)
 
 

@@ -11,6 +11,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.engine.server import ServerActor
 from support import Workshop, eventually, serve
+from support_inside import actor_of
 from support_managers import Shop
 
 Start = Callable[..., rr.System]
@@ -33,7 +34,7 @@ class Pair:
 
     @property
     def link(self) -> Any:
-        return self.provider._actor.consumers._links.get("shop")
+        return actor_of(self.provider).consumers._links.get("shop")
 
     def lives(self) -> bool:
         """Whether the link is the one there was, and others are served by it."""
@@ -95,9 +96,9 @@ def test_a_list_of_many_is_cut_until_it_fits(start: Start, workshop: Workshop) -
     app = pair.system.open_registrar("app")
     pair.shop.register_server("echo", lambda request: request)
     held = [app.load("shop/echo", f"{number:0100}").id for number in range(100)]
-    link = app._actor.clients["shop"].link
+    link = actor_of(app).clients["shop"].link
     assert [query.id for query in app.fetch_queries("shop", timeout_s=5.0)] == held
-    assert app._actor.clients["shop"].link is link
+    assert actor_of(app).clients["shop"].link is link
 
 
 def test_a_failure_that_has_come_by_very_many_registrars_is_told_with_those_that_fit(pair: Pair) -> None:

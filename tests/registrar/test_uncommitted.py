@@ -8,6 +8,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar import loads
 from rr_actors.registrar.core.decide import refuse_uncommitted
 from rr_actors.registrar.model import commands as c
@@ -16,7 +17,6 @@ from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
-    Failure,
     Fetch,
     Fetched,
     Gone,
@@ -28,12 +28,15 @@ from rr_actors.registrar.model.messages import (
     NoticesHandled,
     Probe,
     Progressed,
+    Reprioritise,
+    Reprioritised,
     Unload,
     Unloaded,
     UnloadRefused,
 )
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State, content_of
 from support import Calls, Gate, eventually, serve
+from support_inside import actor_of
 
 FULL = Failure("CatalogError", "disk full")
 LATE = Failure("Unavailable", "not within 1 s")
@@ -77,7 +80,9 @@ TOLD: list[tuple[Any, Any]] = [
     (c.SetStatus("r", "event", State.OK, "", "ticket"), e.Answer("ticket", FULL)),
     (c.SetResponse("r", "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
     (c.Swap("r", "part", "spare", (), "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
+    (c.SetPriority("mine", 5, "ticket"), e.Answer("ticket", FULL)),
     (c.ForceUnload("r", "event", "ticket"), e.Answer("ticket", FULL)),
+    (c.Revoke("r", "event", "why", 5000, "ticket"), e.Answer("ticket", FULL)),
     (c.Unregister("cam", "event", "ticket"), e.Answer("ticket", FULL)),
 ]
 
@@ -94,6 +99,8 @@ AGAIN: list[Any] = [
     NoticesHandled(["n"]),
     Probe("served", "r", "served", []),
     Gone("app"),
+    Reprioritise("served", "app", 5),
+    Reprioritised("mine", 5),
     c.Got("mine", "r", b"feed"),
     c.SendAgain("mine"),
     c.GiveUp("mine", LATE),
@@ -109,13 +116,24 @@ AGAIN: list[Any] = [
     c.UnloadErred("r", 1, WHY),
     c.RecoverDone("r", 1, None, "event"),
     c.RecoverErred("r", 1, WHY, "event"),
+    c.RecoverOverdue("r", 1, LATE),
+    c.PauseDone("r", 1),
+    c.PauseErred("r", 1, WHY),
+    c.ResumeDone("r", 1, None, "event"),
+    c.ResumeErred("r", 1, WHY, "event"),
+    c.BeginTrial("recover:r"),
+    c.TrialOver("recover:r"),
+    c.RefusalOver("request:cam:0"),
     c.LingerOver("r"),
+    c.GraceOver("r", "event"),
     c.Heard("mine", "event"),
     c.StatusDone("r", NOTICE, False),
     c.Reconcile("p", [], "event"),
     c.ConsumerLost("app"),
     c.LinkLost("p"),
     c.PeerGone("p", LATE, True, "event"),
+    c.BeginClosing(LATE),
+    c.EndClosing(),
 ]
 
 
@@ -166,7 +184,7 @@ def test_who_tires_of_an_unload_while_the_disk_is_full_hears_that_it_is_owed(
 ) -> None:
     served = serve(provider, "thing", unload=lambda *_: gate())
     query = app.load("provider/thing", "x")
-    ledger = app._actor._commits
+    ledger = actor_of(app).commits
     commit, failed = ledger.commit, list[Decision]()
 
     def full(decision: Decision) -> None:
@@ -188,7 +206,7 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
 ) -> None:
     served = serve(provider, "thing", load=lambda request: request and gate())
     app.load("provider/thing", None)  # from now on there are lines
-    commit, withdrawn, is_full = app._actor._commits.commit, Calls(), [True]
+    commit, withdrawn, is_full = actor_of(app).commits.commit, Calls(), [True]
 
     def full(decision: Decision) -> None:
         gives_up = any(isinstance(effect, e.LoadResolved) and effect.failure for effect in decision.effects)
@@ -198,7 +216,7 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
         if gives_up:
             withdrawn(len(decision.changes))
 
-    monkeypatch.setattr(app._actor._commits, "commit", full)
+    monkeypatch.setattr(actor_of(app).commits, "commit", full)
     monkeypatch.setattr(loads, "GRACE_S", 0.1)
     with pytest.raises(rr.LoadTimeout, match=r"not loaded within 0\.3 s") as caught:
         app.load("provider/thing", "x", timeout_s=0.3)
@@ -216,14 +234,14 @@ def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_s
     app.load("provider/thing", "keeps the link")
     heard = Calls()
     query = app.load("provider/thing", "x", on_status=lambda status: heard(status.message))
-    commit, errors = app._actor._commits.commit, [CatalogError("disk full", path="")]
+    commit, errors = actor_of(app).commits.commit, [CatalogError("disk full", path="")]
 
     def full(decision: Decision) -> None:
         if errors and decision.changes:
             raise errors.pop()
         commit(decision)
 
-    monkeypatch.setattr(app._actor._commits, "commit", full)
+    monkeypatch.setattr(actor_of(app).commits, "commit", full)
     with pytest.raises(CatalogError, match="disk full"):
         app.unload(query, block=False).get(timeout=10)
     assert query.id in [held.id for held in app.queries()]
@@ -245,8 +263,8 @@ def test_what_cannot_be_committed_is_logged_once_however_often_it_is_tried(
     query = app.load("provider/thing", "x")
     app.save_catalog()
     with monkeypatch.context() as patch:
-        patch.setattr(app._actor._commits._store, "commit", full)
-        app._actor.node.dispatcher.call(app._actor.post, c.GiveUp(query.id, WHY, unheard=True))
+        patch.setattr(actor_of(app).commits.store, "commit", full)
+        actor_of(app).node.dispatcher.call(actor_of(app).post, c.GiveUp(query.id, WHY, unheard=True))
         tried.wait(3)
     eventually(lambda: app.stats()["queries"] == 0)
     assert [record.getMessage() for record in caplog.records if "not committed" in record.getMessage()] == [

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.loads import Unloads
 from support import Calls, Gate, break_exchanges, eventually, serve
+from support_inside import actor_of
 
 
 class Pause:
@@ -28,8 +30,8 @@ class Lock:
     """The lock of who decides; a thread that waits at `pause` goes on when the loop begins to wait for the lock."""
 
     def __init__(self, registrar: rr.Registrar, pause: Pause) -> None:
-        self._lock = registrar._actor.lock
-        self._dispatcher = registrar._actor.node.dispatcher
+        self._lock = actor_of(registrar).lock
+        self._dispatcher = actor_of(registrar).node.dispatcher
         self._pause = pause
 
     def __enter__(self) -> None:
@@ -49,8 +51,8 @@ def query(app: rr.Registrar, provider: rr.Registrar) -> rr.Query:
     app.load("provider/thing", "not the first of its kind")
     query = app.load("provider/thing", "x")
     app.save_catalog()
-    assert query.id in app._actor.catalog.held
-    eventually(lambda: app._actor._commits.saving is False)
+    assert query.id in actor_of(app).catalog.held
+    eventually(lambda: actor_of(app).commits.saving is False)
     return query
 
 
@@ -58,7 +60,7 @@ def query(app: rr.Registrar, provider: rr.Registrar) -> rr.Query:
 def writing(app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch) -> Pause:
     """Threads that are about to write that it is owed wait until the loop wants to decide something."""
     pause = Pause()
-    ledger = app._actor._commits
+    ledger = actor_of(app).commits
     commit_row = ledger.commit_row
 
     def slowly(row: Any) -> bool:
@@ -67,22 +69,21 @@ def writing(app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(ledger, "commit_row", slowly)
     lock = Lock(app, pause)
-    monkeypatch.setattr(app._actor, "lock", lock)
+    monkeypatch.setattr(actor_of(app), "lock", lock)
     return pause
 
 
 @pytest.fixture
-def answered(app: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> Pause:
+def answered(monkeypatch: pytest.MonkeyPatch) -> Pause:
     """Threads whose line has not brought that it is unloaded wait before they turn to the loop."""
     pause = Pause()
-    unloads = app._unloads
-    finish = unloads._finish
+    go_on = Unloads.go_on
 
     def later(*args: Any) -> None:
         pause()
-        finish(*args)
+        go_on(*args)
 
-    monkeypatch.setattr(unloads, "_finish", later)
+    monkeypatch.setattr(Unloads, "go_on", later)
     return pause
 
 
@@ -149,20 +150,20 @@ def test_who_tries_again_before_another_has_taken_in_the_refusal_is_told_as_well
         break_exchanges(monkeypatch, ConnectionResetError("lost"), sends=True)
     thread, outcomes = letting_go(query)
     assert answered.there.wait(10)
-    eventually(lambda: query.id in app._actor.catalog.kept)
+    eventually(lambda: query.id in actor_of(app).catalog.kept)
     again = app.unload(query, block=False, timeout_s=None)
     gate.wait_arrived()
-    alone = app._actor.unloads[query.id]
+    alone = actor_of(app).unloads[query.id]
     answered.go_on.set()
     if line == "refused":
         outcomes.wait()
     else:
-        eventually(lambda: app._actor.unloads[query.id] is not alone)
+        eventually(lambda: actor_of(app).unloads[query.id] is not alone)
     gate.open()
     again.get(timeout=10)
     thread.join()
     assert list(outcomes) == [outcome]
-    assert not app._actor.busy()
+    assert not actor_of(app).busy()
 
 
 def test_what_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
@@ -175,7 +176,7 @@ def test_what_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
     thread, outcomes = letting_go(query)
     assert answered.there.wait(10)
 
-    dispatcher = app._actor.node.dispatcher
+    dispatcher = actor_of(app).node.dispatcher
     turn = Pause()
     dispatcher.call(turn)
     assert turn.there.wait(10)
@@ -194,7 +195,7 @@ def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_
     app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it had written would be read, and its note be about another catalog."""
-    actor = app._actor
+    actor = actor_of(app)
     lets_go = threading.Event()
     found: list[Any] = []
     busy = actor.busy
@@ -226,13 +227,13 @@ def test_releases_that_come_together_are_decided_and_written_together(app: rr.Re
     queries = [app.load("provider/thing", "x") for _ in range(40)]
     app.save_catalog()  # now each release is written
     pause = Pause()
-    app._actor.node.dispatcher.call(pause)  # the loop
+    actor_of(app).node.dispatcher.call(pause)  # the loop
     assert pause.there.wait(10)
-    before = app._actor.commit_counts()["commits"]
+    before = actor_of(app).commit_counts()["commits"]
 
     replies = [app.unload(query, block=False) for query in queries]
     pause.go_on.set()
 
     for reply in replies:
         reply.get(timeout=10)
-    assert app._actor.commit_counts()["commits"] - before <= 3  # the releases, and what is forgotten a moment later
+    assert actor_of(app).commit_counts()["commits"] - before <= 3  # the releases, and what is forgotten a moment later

@@ -17,6 +17,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Query
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, catalog_path, eventually, serve
+from support_inside import actor_of
 
 
 @contextmanager
@@ -27,7 +28,7 @@ def full(registrar: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> Iterator[N
         raise CatalogError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(registrar._actor._commits._store, "commit", refuse)
+        patch.setattr(actor_of(registrar).commits.store, "commit", refuse)
         yield
 
 
@@ -115,7 +116,7 @@ def test_while_the_providers_disk_is_full_an_unload_waits(
     thread = threading.Thread(target=lambda: outcome(UNLOADS[way](app, query)))
     with full(provider, monkeypatch):
         thread.start()
-        eventually(lambda: provider._actor.waiting)
+        eventually(lambda: actor_of(provider).waiting)
         assert len(outcome) == 0
     thread.join()
     assert len(outcome) == 1
@@ -179,11 +180,11 @@ def collected_in_decisions_only() -> Iterator[None]:
 
 def collecting(registrar: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> None:
     """The garbage collector runs each time that something is written, under the lock."""
-    ledger = registrar._actor._commits
+    ledger = actor_of(registrar).commits
     write = ledger._write
 
     def written(changes: Any) -> None:
-        assert registrar._actor.is_inside()
+        assert actor_of(registrar).is_inside()
         gc.collect()
         write(changes)
 
@@ -231,13 +232,13 @@ def test_who_forks_while_another_thread_decides_waits_for_nobody_in_the_child(
     """That thread is not there: it never gives the lock back."""
 
     def decide() -> None:
-        with provider._actor.lock, app._actor.lock:
+        with actor_of(provider).lock, actor_of(app).lock:
             gate()
 
     thread = threading.Thread(target=decide)
     thread.start()
     gate.wait_arrived()
-    (query,) = app._actor.catalog.held
+    (query,) = actor_of(app).catalog.held
     child = os.fork()
     if child == 0:
         refused = 0

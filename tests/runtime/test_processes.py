@@ -23,7 +23,7 @@ import pytest
 from rr_actors.base.errors import StartFailed
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.process import Exited, Process, Spawner
-from support import lives, quickly, wait_gone
+from support import eventually, lives, quickly, wait_gone
 from support_children import hear
 
 TELL = "support_children:until_told"
@@ -215,10 +215,11 @@ def test_a_process_that_cannot_be_started_in_time_is_an_error_and_leaves_nothing
             server.resume()
 
 
+@pytest.mark.parametrize("error", ["RuntimeError", "SystemExit"])
 def test_a_broken_preload_does_not_keep_children_from_starting(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: str
 ) -> None:
-    (tmp_path / "broken_preload.py").write_text("raise RuntimeError('broken on purpose')")
+    (tmp_path / "broken_preload.py").write_text(f"raise {error}('broken on purpose')")
     monkeypatch.syspath_prepend(str(tmp_path))
     spawner = Spawner(["broken_preload"])
     with started(spawner) as child:
@@ -492,3 +493,26 @@ def test_the_parents_main_module_is_not_run_again_in_a_child(tmp_path: Path) -> 
     )
     assert done.stdout.splitlines() == ["main runs", f"{[str(script), 'an argument']} False"]
     assert done.stderr == ""
+
+
+def test_a_fork_server_that_cannot_start_is_named_as_what_is_wanting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("multiprocessing.spawn._python_exe", b"/bin/false")
+    spawner = Spawner()
+    try:
+        with pytest.raises(StartFailed, match="fork server: it ends before it answers") as failed:
+            spawner.start("support_children:until_told", b"", name="child")
+        assert failed.value.wanted.startswith("fork server")
+    finally:
+        spawner.close()
+
+
+def test_how_long_a_process_has_waited_for_a_processor_is_known() -> None:
+    spin = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nwhile True: pass"
+    spinning = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(2)]
+    try:
+        eventually(lambda: all(lifeline.starved_s(process.pid) > 0.1 for process in spinning))
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
+    assert lifeline.starved_s(spinning[0].pid) == 0.0

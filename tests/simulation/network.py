@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.messages import Failure, Gone
+from rr_actors.registrar.model.messages import Gone
 from rr_actors.registrar.model.rows import Hold
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
 from simulation.world_state import WorldState
@@ -56,15 +57,20 @@ class Network(WorldState):
         if key not in self.todo:
             return False
         here, there = self.registrars[consumer], self.registrars[provider]
-        if there.state == "gone" or (there.state == "stopped" and provider in here.asked):
+        known = there.state in ("away", "absent") and provider in here.gone and provider not in here.asked
+        if not known and (gone := self.unreachable(provider, provider in here.asked)) is not None:
             here.asked.discard(provider)
-            here.post(c.PeerGone(provider, DOWN, there.state == "gone", self.new_event()))
-        if there.state == "gone":
+            here.post(gone)
+            if gone.final:
+                here.gone.add(provider)
+        if there.state not in ("away", "absent"):
+            here.gone.discard(provider)
+        if there.state == "gone" or (there.state in ("away", "absent") and not here.catalog.needs(provider)):
             self.todo.discard(key)
         if self.parted(consumer, provider) or (
             there.state != "up" and not (there is here and there.state == "starting")
         ):
-            return there.state in ("gone", "stopped")
+            return there.state in ("gone", "stopped", "away", "absent")
         self.todo.discard(key)
         link = SimLink(here.epoch)
         old = there.links.get(consumer)
@@ -85,7 +91,7 @@ class Network(WorldState):
     def up(self, name: str) -> bool:
         """A dead registrar is started again."""
         registrar = self.registrars[name]
-        if registrar.state not in ("down", "stopped") or registrar.disk_is_full:
+        if registrar.state not in ("down", "stopped", "away", "absent") or registrar.disk_is_full:
             return False
         self.todo.discard(("up", name))
         registrar.start()
@@ -99,10 +105,18 @@ class Network(WorldState):
         self.todo.discard(key)
         registrar = self.registrars[name]
         for origin in {**registrar.catalog.by_origin, **registrar.catalog.notices_to}:
-            if origin in self.retired:
+            if self.is_gone(origin):
                 registrar.receive(Gone(origin), origin)
         registrar.serve()
         return True
+
+    def unreachable(self, provider: str, asked: bool) -> c.PeerGone | None:
+        """What a consumer concludes about a provider that it cannot reach."""
+        raise AssertionError(provider, asked)
+
+    def is_gone(self, name: str) -> bool:
+        """Whether the directory says that a registrar is gone for good."""
+        raise AssertionError(name)
 
     # -- what breaks ---------------------------------------------------------------------------------------------
 
@@ -187,7 +201,7 @@ class Network(WorldState):
 
 
 _OF_A_PROCESS = frozenset(
-    ("wake", "act", "save", "register", "serve", "timer", "call", "tire", "late", "dial", "reregister")
+    ("wake", "act", "save", "register", "serve", "timer", "call", "tire", "late", "dial", "reregister", "closing")
 )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from rr_actors.registrar.model.messages import Fetch, Fetched
+import itertools
+
+from rr_actors.registrar.model.messages import Fetch, Fetched, Noticed
 from simulation.network import Network
 from simulation.sim_links import TO_CONSUMER, SimLink
 
@@ -66,7 +68,7 @@ class Trouble(Network):
     # -- messages that come twice --------------------------------------------------------------------------------
 
     def dup(self, consumer: str, provider: str, way: int, place: int, behind: int) -> bool:
-        """A message on a link comes a second time.
+        """A message on a link comes a second time. A notice before the list is passed over: it never comes behind that.
 
         Args:
             place: of the message among those on their way.
@@ -77,6 +79,9 @@ class Trouble(Network):
         if link is None or len(link.ways[way]) <= place or isinstance(link.ways[way][place], _ONCE):
             return False
         queue = link.ways[way]
+        between = itertools.islice(queue, place + 1, place + 1 + behind)
+        if isinstance(queue[place], Noticed) and any(isinstance(message, Fetched) for message in between):
+            return False
         queue.insert(place + 1 + behind, queue[place])
         return True
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+from rr_actors.registrar.core.callback_runs import ATTEMPTS
 from rr_actors.registrar.model.rows import Held, Notice, State
 
 
@@ -33,6 +34,8 @@ class Ledger:
         self.lives: dict[tuple[str, str], Life] = {}  # (registrar, resource)
         self.by_request: dict[tuple[str, str, bytes], set[str]] = {}
         self.request_of: dict[tuple[str, str], tuple[str, str, bytes]] = {}
+        self.open: dict[tuple[str, str, str], int] = {}  # (registrar, kind, resource) -> callbacks that run now
+        self.deaths: dict[tuple[str, str, str], int] = {}  # the same -> processes in a row that died in its runs
         self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
         self.given_up: set[tuple[str, str]] = set()  # loads that died, and are not run again: what is left is unloaded
         self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
@@ -43,6 +46,8 @@ class Ledger:
         self.provider: dict[str, str] = {}
         self.noticed: dict[str, Notice] = {}
         self.open_notices: dict[str, list[str]] = {}
+        self.numbers: dict[str, int] = {}  # of the notices that were ever on disk, in their order; 0: twice
+        self.last_heard: dict[tuple[str, int], int] = {}  # by query and incarnation of its holder
         self.stored: set[str] = set()  # queries that were ever on a provider's disk
         self.told: set[tuple[str, str]] = set()  # event and query of every notice that was ever on disk
         self.let_go: set[str] = set()  # queries that have left a provider's disk
@@ -59,7 +64,13 @@ class Ledger:
         self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
         self.heard: set[tuple[str, str]] = set()  # and it was dealt with
         self.losses: set[str] = set()  # queries whose holders heard that they are gone
+        self.revoked: set[str] = set()  # queries whose holders heard that they are to let them go
+        self.given_up_parts: set[tuple[str, str]] = set()  # a whole, and the revoked resource that it was to let go
+        self.forced: set[str] = set()  # resources that their owners took away, or whose grace was over
+        self.on: dict[str, str] = {}  # query -> the resource that it was last on
+        self.deleted: set[str] = set()  # notices that their provider forgot when it was deleted
         self.answered: dict[str, bool] = {}
+        self.wishes: dict[str, list[tuple[int, int | None]]] = {}  # query -> ticket and priority; None: it inherits
         self.acknowledged = 0
 
     # -- callbacks -----------------------------------------------------------------------------------------------
@@ -96,18 +107,59 @@ class Ledger:
         if stage == "unload_failed":  # from now on it does not stand in the way of a fresh one
             self.by_request[self.request_of[key]].discard(id)
 
-    def settled(self, registrar: str, id: str) -> None:
-        """That a resource is gone is on disk: its callbacks must not run again."""
+    def callback_began(self, registrar: str, kind: str, id: str) -> None:
+        """A callback of a resource begins: not for a fourth time, if three processes have died in its runs."""
+        key = (registrar, kind, id)
+        if self.deaths.get(key, 0) >= ATTEMPTS:
+            raise Violation("callbacks", f"{registrar}: {kind} of {id} begins after {self.deaths[key]} deaths")
+        self.open[key] = self.open.get(key, 0) + 1
+
+    def callback_ended(self, registrar: str, kind: str, id: str) -> None:
+        """A callback of a resource has ended, and its process lives."""
+        key = (registrar, kind, id)
+        self.deaths.pop(key, None)
+        self.open[key] = max(0, self.open.get(key, 0) - 1)
+
+    def given_up_unload(self, registrar: str, id: str, *, died: bool) -> None:
+        """That a resource is kept as unload_failed is on disk: its unload callback has ended so, or runs no more.
+
+        `died`: three processes have, that were to run it. They may not have come so far.
+        """
+        life = self.lives.get((registrar, id))
+        if life is not None and (life.stage == "unloading" or (died and life.interrupted and life.stage != "gone")):
+            self.run_ended(registrar, id, "unload_failed")
+
+    def unload_began(self, id: str, wholes: dict[str, int]) -> None:
+        """The unload callback of a revoked resource begins: what depends on it has been unloaded, or has let it go.
+
+        Args:
+            wholes: the attempts of all resources that are loaded and have not dealt with the revocation.
+        """
+        if id in self.forced:
+            return
+        for whole, attempt in wholes.items():
+            for part in self.parts.get((whole, attempt), ()):
+                if self.on.get(part) == id and part not in self.swapped | self.losses:
+                    raise Violation("revocations", f"{id} is unloaded, and {whole} is loaded, which holds it by {part}")
+
+    def settled(self, registrar: str, id: str, *, cleared: bool = False) -> None:
+        """That a resource is gone is on disk: its callbacks must not run again. `cleared`: without its callback."""
         key = (registrar, id)
+        for kind in ("load", "unload", "recover", "reload", "status", "pause", "resume"):
+            self.deaths.pop((registrar, kind, id), None)
+            self.open.pop((registrar, kind, id), None)
         life = self.lives.pop(key, None)
         if life is None:
             return
-        if life.stage != "gone":
+        if life.stage != "gone" and not (cleared and life.stage == "unload_failed"):
             raise Violation("callbacks", f"{registrar}: {id} left the catalog while it was {life}")
         self.by_request[self.request_of.pop(key)].discard(id)
 
     def crashed(self, registrar: str) -> None:
         """A process died: what its callbacks did may be repeated."""
+        for key in [key for key, count in self.open.items() if key[0] == registrar and count]:
+            self.deaths[key] = self.deaths.get(key, 0) + 1
+            del self.open[key]
         for key, life in self.lives.items():
             if key[0] == registrar:
                 self.lives[key] = life._replace(interrupted=True)
@@ -152,6 +204,7 @@ class Ledger:
         """A notice is on its provider's disk."""
         self.told.add((notice.event, notice.query_id))
         self.noticed.setdefault(notice.id, notice)
+        self.numbers[notice.id] = 0 if notice.id in self.numbers else len(self.numbers) + 1
         if notice.released:
             self.evicted.add(notice.query_id)
             self.taken.setdefault(notice.query_id, set()).add(notice.resource_id)
@@ -172,10 +225,13 @@ class Ledger:
             raise Violation("statuses", f"{notice} was heard again, and it was not marked as repeated")
         times.append(incarnation)
 
-    def own_dealt_with(self, notice: Notice, queries: Iterable[str]) -> None:
-        """It has left the disk, and its resource has not: its server has dealt with it, and those on it are told."""
+    def own_dealt_with(self, notice: Notice, queries: Iterable[str], passed_over: bool) -> None:
+        """It has left the disk, and its resource has not: its server has dealt with it, and those on it are told.
+
+        `passed_over`: its server's callback runs no more, as three processes have died in it.
+        """
         place = (notice.resource_id, notice.event)
-        if place not in self.own_heard and notice.id not in self.own_hears:
+        if not passed_over and place not in self.own_heard and notice.id not in self.own_hears:
             raise Violation("statuses", f"{notice} was forgotten before its server had dealt with it")
         untold = [id for id in queries if (notice.event, id) not in self.told]
         if untold and place not in self.handled:
@@ -197,6 +253,11 @@ class Ledger:
 
     def hear(self, query_id: str, notice: Notice, incarnation: int, repeated: bool, excused: bool) -> None:
         """Who listens to the query is being told. `excused`: there is a reason for a loss that is not in the ledger."""
+        number = self.numbers.get(notice.id)  # None: its holder says by itself that it is lost
+        again = query_id in self.refused  # held again, as its unload failed: then older statuses come again
+        if number and not again and number < self.last_heard.get((query_id, incarnation), 0):
+            raise Violation("statuses", f"{query_id} heard {notice.event} after a later one")
+        self.last_heard[query_id, incarnation] = number or 0
         times = self.hears.setdefault((query_id, notice.event), [])
         if incarnation in times:
             raise Violation("statuses", f"{query_id} heard {notice.event} twice in one incarnation")
@@ -234,6 +295,19 @@ class Ledger:
             raise Violation("answers", f"the owner's call {ticket} was answered twice")
         else:
             self.answered[ticket] = True
+
+    # -- priorities ----------------------------------------------------------------------------------------------
+
+    def wished(self, query_id: str, ticket: int, priority: int) -> None:
+        """Somebody gives a query a priority. Until that is answered, it may have this one or the one before."""
+        self.wishes.setdefault(query_id, [(0, 0)]).append((ticket, priority))
+
+    def wish_answered(self, ticket: Any, *, done: bool) -> None:
+        """A query has the priority that it was given, or has not got it."""
+        for query_id, wishes in self.wishes.items():
+            if wishes[-1][0] >= ticket and any(one == ticket for one, _ in wishes):
+                kept = [wish for wish in wishes if (wish[0] >= ticket if done else wish[0] != ticket)]
+                self.wishes[query_id] = kept
 
 
 _BEGINS = {"load": "loading", "reload": "loaded", "unload": "unloading"}

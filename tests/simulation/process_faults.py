@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+from rr_actors.registrar.model.rows import STANDBY, Hold
 from simulation.network import OLD
 from simulation.pending_steps import Key
 from simulation.world import Step, World
@@ -28,7 +29,16 @@ says."""
 SWAP_FIRST = 2**47
 """From here on, status callbacks replace parts of what they are about."""
 PARTS_FIRST = 2**48
-"""From here on, callbacks load by connections of their threads; fresh seeds are from here."""
+"""From here on, callbacks load by connections of their threads."""
+LIVES_FIRST = 2**49
+"""From here on, registrars are closed, deleted and absent, and come back."""
+RANK_FIRST = 2**50
+"""From here on, loads have priorities, which change."""
+REVOKE_FIRST = 2**51
+"""From here on, owners revoke resources."""
+IDLE_FIRST = 2**52
+"""From here on, servers pause what idles; fresh seeds are from here."""
+PRIORITIES = (STANDBY, -3, 0, 0, 4, 9)
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 
 
@@ -102,6 +112,30 @@ class Rough:
             self._parts = parts if parts.random() < 0.8 else None
             self.parts = parts.random() * 0.3
             self.part_rings = parts.random() < 0.5
+        self._lives: random.Random | None = None
+        if seed >= LIVES_FIRST:
+            lives = random.Random(f"lives {seed}")
+            self._lives = lives if lives.random() < 0.8 else None
+            self.close = lives.random() ** 2 * 0.02
+            self.delete = lives.random() * 0.3
+            self.generations = lives.random() ** 2 * 0.01
+            self.late = lives.random() ** 2 * 0.2 if lives.random() < 0.4 else 0.0
+        self._ranking: random.Random | None = None
+        if seed >= RANK_FIRST:
+            ranking = random.Random(f"rank {seed}")
+            self._ranking = ranking if ranking.random() < 0.9 else None
+            self.rank = ranking.random() * 0.15
+            self.ranked = ranking.random()
+            if ranking.random() < 0.5:
+                self.subs = max(self.subs, 0.6)
+        self._revoking: random.Random | None = None
+        if seed >= REVOKE_FIRST:
+            revoking = random.Random(f"revoke {seed}")
+            self._revoking = revoking if revoking.random() < 0.9 else None
+            self.revoke = revoking.random() ** 2 * 0.1
+            self.hastens = revoking.random() ** 3  # the end of the grace
+            if revoking.random() < 0.5:
+                self.subs = max(self.subs, 0.7)
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -124,6 +158,12 @@ class Rough:
         if self._telling is not None and (step := self._hurry(world, self._telling)) is not None:
             return step
         if self._parts is not None and (step := self._part(world, self._parts)) is not None:
+            return step
+        if self._lives is not None and (step := self._live(world, self._lives)) is not None:
+            return step
+        if self._ranking is not None and (step := self._rank(world, self._ranking)) is not None:
+            return step
+        if self._revoking is not None and (step := self._revoke(world, self._revoking)) is not None:
             return step
         if self.brief and (step := self._let_go(world)) is not None:
             return step
@@ -252,6 +292,8 @@ class Rough:
         """Whether what was drawn to happen next does not happen yet."""
         if key[0] == "dial":
             self._dialled = key
+        if self._revoking is not None and key[0] == "timer" and str(key[2]).startswith("revoke:"):
+            return self._revoking.random() >= self.hastens
         if not self.slow:
             return False
         kind = key[0]
@@ -265,6 +307,51 @@ class Rough:
             slow = (kind,) in self.slow
         return slow and self.rng.random() < self.slowness
 
+    def _live(self, world: World, rng: random.Random) -> Step | None:
+        """A registrar is closed, stopped and deleted, or absent from the next run of the system; or it comes back."""
+        draw = rng.random()
+        if draw < self.generations:
+            return ("generation", tuple(name for name in self.names if rng.random() < 0.4))
+        name = rng.choice(self.names)
+        state = world.registrars[name].state
+        if state == "stopped" and draw < self.delete:
+            return ("delete", name)
+        if world.registrars[name].closing is not None and draw < self.late:
+            return ("closing", name, True)
+        if draw < self.close:
+            return ("close", name)
+        if state == "up" and draw < self.close * 1.5:
+            return ("crash", name, "stopped")
+        if state in ("away", "absent") and draw < 0.05:
+            return ("up", name)
+        return None
+
+    def _revoke(self, world: World, rng: random.Random) -> Step | None:
+        """An owner revokes a resource."""
+        if rng.random() >= self.revoke:
+            return None
+        servings = [(r.name, id) for r in world.live() for id in r.catalog.resources]
+        if not servings:
+            return None
+        name, id = rng.choice(servings)
+        return ("own", name, "revoke", id)
+
+    def _rank(self, world: World, rng: random.Random) -> Step | None:
+        """Somebody gives a query another priority: one of people outside, or now and then a part."""
+        if rng.random() >= self.rank:
+            return None
+        parts = rng.random() < 0.2
+        rows = [(r.name, row) for r in world.live() for row in r.catalog.held.values()]
+        held = [(name, row.id) for name, row in rows if row.hold is Hold.HELD and bool(row.parent) is parts]
+        return ("rank", *rng.choice(held), rng.choice(PRIORITIES)) if held else None
+
+    def with_priority(self, step: Step) -> Step:
+        """Return a load with a priority: often that of somebody outside, now and then that of a callback."""
+        rng = self._ranking
+        if rng is None or rng.random() >= self.ranked * (0.2 if step[0] == "call" else 0.6):
+            return step
+        return (*step, rng.choice(PRIORITIES))
+
     def _part(self, world: World, rng: random.Random) -> Step | None:
         """A callback's thread loads something by a connection of its own."""
         if rng.random() >= self.parts:
@@ -277,7 +364,9 @@ class Rough:
         rings = self.part_rings and not any(server.recovery == "reload" for server in servers)
         names = self.names if rings else self.names[: self.names.index(str(key[1]))]
         places = [(name, server.name) for name in names for server in world.layout[name]]
-        return (*key, "sub", *rng.choice(places), rng.choice((b"p", b"q")), "directly") if places else None
+        if not places:
+            return None
+        return self.with_priority((*key, "sub", *rng.choice(places), rng.choice((b"p", b"q")), "directly"))
 
     def fault(self) -> str:
         """Of the disk, when a thread leaves its direct line."""

@@ -5,10 +5,15 @@ Then everybody lets go of everything, and nothing may be left.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from rr_actors.registrar.core.callback_runs import is_given_up
+from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import Content, Hold, Phase, Resource, State
+from rr_actors.registrar.model.rows import STANDBY, Content, Hold, Notice, Phase, Query, Resource, State, rows_of
+from rr_actors.tools.inspection import Contents
+from rr_actors.tools.inspection import check as inspect
 from simulation.oracle import Violation
 from simulation.pending_steps import Key
 from simulation.sim_registrar import SimRegistrar
@@ -23,8 +28,15 @@ def come_to_rest(world: World) -> None:
     world.heal()
     for registrar in world.live():
         world.space(registrar.name)
-        world.up(registrar.name)
+        if registrar.state not in ("away", "absent"):
+            world.up(registrar.name)
     finish(world)
+    while away := [r.name for r in world.live() if r.state != "up"]:
+        check_disks(world)  # some of them were closed only now
+        for name in away:
+            world.up(name)
+        finish(world)
+    check_disks(world)
     check(world, links_are_new=False)
     cut_all(world)
     finish(world)
@@ -38,6 +50,10 @@ def finish(world: World) -> None:
     left = _LIMIT
     while True:
         keys = [key for key in world.todo.keys if _can(world, key)]
+        if not keys:  # a callback on trial may wait for one whose trial comes after it
+            keys = [key for key in world.todo.keys if key[0] == "timer" and key[2] == "trial"]
+        if not keys and (keys := [key for key in world.todo.keys if key[0] == "timer" and key[2][:7] == "revoke:"]):
+            check_revocations(world)
         if not keys:
             return
         for key in keys:
@@ -50,13 +66,59 @@ def finish(world: World) -> None:
 
 def _can(world: World, key: Key) -> bool:
     if key[0] in _WAITS_FOREVER:
-        return False
+        return key[0] == "timer" and key[2] == "turn"  # it waits for nothing
+    if key[0] == "up":
+        return world.registrars[key[1]].state not in ("away", "absent")
+    if key[0] == "closing":
+        return world.closing_goes_on(key[1])
     if key[0] == "dial":
-        there = world.registrars[key[2]]
+        here, there = world.registrars[key[1]], world.registrars[key[2]]
+        if there.state in ("away", "absent"):
+            final = key[2] not in here.gone and world.unreachable(key[2], asked=False) is not None
+            return final or key[2] in here.asked
         return there.state in ("up", "gone") or (there.state == "starting" and key[1] == key[2])
     if key[0] == "reregister":
         return key[2] not in world.registrars[key[1]].catalog.servers
     return True
+
+
+def check_revocations(world: World) -> None:
+    """What is revoked and still there waits for something else: a whole that is, too, or that cannot be unloaded."""
+    for registrar in world.live():
+        for id in registrar.catalog.revocations:
+            if registrar.state == "up" and not any(_waits(world, query) for query in registrar.catalog.queries_of(id)):
+                raise Violation("revocations", f"{registrar.name}: {id} is revoked, and nothing hinders its unload")
+
+
+def _waits(world: World, query: Query) -> bool:
+    consumer = world.registrars[query.origin]
+    whole = consumer.catalog.resources.get(query.parent)
+    if consumer.state != "up" or query.origin in world.retired | world.left:
+        return True
+    if whole is None:
+        return False
+    if is_busy(consumer.catalog, whole):  # its load waits for a second resource like this one
+        return True
+    return whole.id in consumer.catalog.revocations or whole.phase is Phase.UNLOAD_FAILED
+
+
+def check_disks(world: World) -> None:
+    """`rr-actors check` finds nothing."""
+    for registrar in world.live():
+        if registrar.state == "up":
+            registrar.save()
+    state = {r.name: Contents(r.name, Path(r.name), rows_of(r.disk)) for r in world.registrars.values()}
+    absent = {r.name for r in world.live() if r.state in ("away", "absent")}
+    refused = {id for id in world.ledger.refused & world.ledger.let_go if world.ledger.provider.get(id) in absent}
+    unheard = world.unheard | refused  # a second unload has succeeded, and a crash of both took the answer
+    found = [
+        text
+        for text in inspect(state)
+        if not any(f" {name}" in text or text.startswith(name) for name in world.retired)
+        and not any(f"held query {id} is unknown to its provider" in text for id in unheard)
+    ]
+    if found:
+        raise Violation("check", found[0])
 
 
 def cut_all(world: World) -> None:
@@ -78,6 +140,7 @@ def check(world: World, *, links_are_new: bool) -> None:
         _check_resources(world, registrar)
         _check_held(world, registrar, links_are_new=links_are_new)
         _check_parts(world, registrar)
+        _check_priorities(world, registrar)
     _check_answers(world)
     _check_statuses(world)
 
@@ -91,7 +154,7 @@ def _check_memory(registrar: SimRegistrar) -> None:
     catalog = registrar.catalog
     content: Content = {table: dict(rows) for table, rows in registrar.disk.items()}
     fresh = Catalog(registrar.name, content, registrar.epoch)
-    for name in ("resources", "queries", "held", "notices", "peers", *INDEXES):
+    for name in ("resources", "queries", "held", "notices", "peers", "callback_runs", "revocations", *INDEXES):
         if compared(getattr(catalog, name)) != compared(getattr(fresh, name)):
             _fail("memory", registrar, f"{name} is {getattr(catalog, name)}, from disk {getattr(fresh, name)}")
 
@@ -103,6 +166,7 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
         ("kept", catalog.held),
         ("unanswered", catalog.queries),
         ("told", catalog.notices),
+        ("behind", catalog.notices_on),
         ("up", registrar.clients),
         ("consumers", registrar.links),
         ("acked", {name: None for name in world.registrars if name not in world.retired or not links_are_new}),
@@ -114,7 +178,7 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
 
 INDEXES = (
     *("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
-    *("parts", "outbound", "unsettled", "moving", "own_notices"),
+    *("parts", "outbound", "unsettled", "moving", "resting", "own_notices", "ranked"),
 )
 
 
@@ -136,9 +200,15 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         "next_to_hear",
         "own_notices",
         "ending",
+        "doubted",
         "direct",
         "fresh",
         "in_flight",
+        "suspects",
+        "trial",
+        "statuses",
+        "touched",
+        "unsent",
     ):
         left = getattr(catalog, name)
         if left:
@@ -154,16 +224,35 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
     if stuck:
         _fail("stuck", registrar, f"at rest, and unloads are unanswered: {stuck}")
     if catalog.notices and links_are_new:
-        notices = [n for n in catalog.notices.values() if world.registrars[n.origin].state != "gone"]
+        notices = [
+            notice
+            for notice in catalog.notices.values()
+            if world.registrars[notice.origin].state != "gone" and not _is_released(world, catalog, notice)
+        ]
         if notices:
             _fail("stuck", registrar, f"at rest, and notices are undelivered: {notices}")
+
+
+def _check_idleness(world: World, registrar: SimRegistrar, resource: Resource) -> None:
+    """Nothing is paused that is needed, and nothing that a server pauses idles without a timer."""
+    catalog = registrar.catalog
+    server = catalog.servers.get(resource.server)
+    idles = catalog.priority_of(resource.id) <= STANDBY
+    if server is None:
+        return
+    if resource.phase is Phase.PAUSED and not idles and resource.state is not State.FATAL:
+        _fail("idle", registrar, f"{resource} is paused, and is needed")
+    waits = ("linger:" + resource.id) in registrar.timers or resource.id in catalog.idle
+    if server.pauses and idles and resource.phase is Phase.LOADED and resource.state is not State.FATAL and not waits:
+        _fail("idle", registrar, f"{resource} idles, and will not be paused")
 
 
 def _check_resources(world: World, registrar: SimRegistrar) -> None:
     catalog = registrar.catalog
     for resource in catalog.resources.values():
-        if resource.phase not in (Phase.LOADED, Phase.UNLOAD_FAILED):
+        if resource.phase not in (Phase.LOADED, Phase.UNLOAD_FAILED, Phase.PAUSED):
             _fail("stuck", registrar, f"at rest, and still {resource}")
+        _check_idleness(world, registrar, resource)
         warm = world.lingering(registrar, resource.id)
         if resource.phase is Phase.LOADED and resource.id not in catalog.holders and not warm:
             _fail("leak", registrar, f"nobody holds {resource}")
@@ -186,6 +275,15 @@ def _check_resources(world: World, registrar: SimRegistrar) -> None:
             _fail("disagree", registrar, f"{query} is {held} for its origin")
 
 
+def _is_released(world: World, catalog: Catalog, notice: Notice) -> bool:
+    """Return whether the notice goes with its query, once somebody clears the resource that is unloaded no more."""
+    origin = world.registrars[notice.origin].catalog
+    if notice.origin in world.left and notice.query_id not in catalog.queries and catalog.name not in origin.peers:
+        return True  # it has closed over a link to a dead process; it hears this if it ever asks here again
+    held = origin.held.get(notice.query_id)
+    return held is not None and held.hold is Hold.OWED and is_given_up(catalog, "unload", notice.resource_id)
+
+
 def _check_held(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
     catalog = registrar.catalog
     for held in catalog.held.values():
@@ -193,8 +291,9 @@ def _check_held(world: World, registrar: SimRegistrar, *, links_are_new: bool) -
         query = provider.catalog.queries.get(held.id)
         if held.hold is Hold.OWED:
             resource = provider.catalog.resources.get(query.resource_id) if query else None
-            excused = not links_are_new and resource is not None and resource.phase is Phase.UNLOAD_FAILED
-            if not excused:
+            failed = resource if resource is not None and resource.phase is Phase.UNLOAD_FAILED else None
+            # Over a new link the Unload is sent again, and the callback runs again, unless three processes died in it.
+            if failed is None or (links_are_new and not is_given_up(provider.catalog, "unload", failed.id)):
                 _fail("stuck", registrar, f"at rest, and a release is still owed: {held}")
             continue
         if held.hold is Hold.PENDING:
@@ -221,13 +320,32 @@ def _check_parts(world: World, registrar: SimRegistrar) -> None:
         given = set(ledger.parts.get((resource.id, resource.attempt), ())) - ledger.losses
         holds = set(catalog.parts_of(resource.id))
         lost = {id for id in given - holds if ledger.provider[id] in world.retired}
+        lost |= (given - holds) & world.given_back
         if (resource.id, resource.attempt) in ledger.cut_short and _stays_as_it_is(resource):
             given |= holds  # what that had loaded goes with the resource
         lost |= (given - holds) & ledger.swapped
+        lost |= {id for id in given - holds if (resource.id, ledger.on.get(id)) in ledger.given_up_parts}
         if holds & ledger.replaced:
             _fail("parts", registrar, f"{resource} holds {sorted(holds & ledger.replaced)}, which were replaced")
         if given - lost != holds - ledger.losses:
             _fail("parts", registrar, f"{resource} holds {sorted(holds)}, its callback was given {sorted(given)}")
+
+
+def _check_priorities(world: World, registrar: SimRegistrar) -> None:
+    """Both sides have the priority that was given, or else the highest of those who hold the whole."""
+    for held in registrar.catalog.held.values():
+        query = world.registrars[held.registrar].catalog.queries.get(held.id)
+        if held.hold is not Hold.HELD or query is None:
+            continue
+        if query.priority != held.priority:
+            _fail("priorities", registrar, f"{held} is {query} at its provider")
+        wholes = [q.priority for q in registrar.catalog.queries.values() if q.resource_id == held.parent]
+        inherited = min(max(wholes, default=STANDBY), registrar.catalog.max_priority)
+        if held.parent in registrar.catalog.resources:
+            inherited = registrar.catalog.inherited(held.parent)
+        wished = [inherited if wish is None else wish for _, wish in world.ledger.wishes.get(held.id, [(0, 0)])]
+        if held.priority not in wished:
+            _fail("priorities", registrar, f"{held} was to have {wished}")
 
 
 def _stays_as_it_is(resource: Resource) -> bool:
@@ -243,8 +361,9 @@ def _check_answers(world: World) -> None:
             continue
         holder = next((r for r in world.live() if query_id in r.catalog.held), None)
         gone = (
-            query_id in ledger.losses | (ledger.evicted & ledger.forgotten)
+            query_id in ledger.losses | ledger.revoked | (ledger.evicted & ledger.forgotten)
             or ledger.provider[query_id] in world.retired
+            or (query_id in ledger.forgotten and ledger.provider[query_id] in world.left)
         )
         if holder is None and not gone and world.asker[query_id] not in world.retired:
             raise Violation("acknowledged", f"{query_id}: its load was acknowledged, and it is held no more")
@@ -270,7 +389,11 @@ def _check_statuses(world: World) -> None:
         if held is not None and held.resource_id != notice.resource_id:
             continue  # it was refused the first, and holds another
         acknowledged = ledger.fate.get(notice.query_id) == "held" and "/" not in notice.query_id
-        if notice.released and acknowledged and notice.query_id not in ledger.losses | ledger.forgotten:
+        if (
+            notice.released
+            and acknowledged
+            and notice.query_id not in ledger.losses | ledger.forgotten | ledger.revoked
+        ):
             raise Violation("statuses", f"{notice.query_id} was taken away, and its holder never heard {notice}")
 
 
@@ -304,6 +427,8 @@ def check_nothing_is_left(world: World) -> None:
         catalog = registrar.catalog
         for name in ("resources", "queries", "held", "notices"):
             left = list(getattr(catalog, name).values())
+            if name == "notices":
+                left = [notice for notice in left if not _is_released(world, catalog, notice)]
             if left:
                 _fail("left behind", registrar, f"everybody let go of everything, and there is {left[0]}")
         left = {id for (name, id) in world.ledger.lives if name == registrar.name}

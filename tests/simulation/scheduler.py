@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import random
 
+from msgspec.structs import replace
+
 from rr_actors.registrar.model.catalog import Server
 from simulation.pending_steps import Key
-from simulation.process_faults import FIRST, HASTY_FIRST, Rough
+from simulation.process_faults import FIRST, HASTY_FIRST, IDLE_FIRST, Rough
 from simulation.world import Step, World
 
 REQUESTS = (b"p", b"q")
@@ -31,12 +33,23 @@ def _server(rng: random.Random, name: str) -> Server:
     return Server(name, linger_s, limit_s, recovery, rng.random() < 0.4, rng.random() < 0.4)
 
 
+def _with_pauses(rng: random.Random, plain: dict[str, tuple[Server, ...]]) -> dict[str, tuple[Server, ...]]:
+    """Some servers pause what idles, and unload it later: else it would be there when everybody has let go."""
+    some = rng.random()
+    return {
+        name: tuple(replace(s, pauses=True, paused_s=1.0) if rng.random() < some else s for s in servers)
+        for name, servers in plain.items()
+    }
+
+
 class Chance:
     """Draws the steps of one run. How often what happens differs from run to run: rare mixes are found sooner."""
 
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
         self.layout = layout(self.rng)
+        if seed >= IDLE_FIRST:
+            self.layout = _with_pauses(random.Random(f"idle {seed}"), self.layout)
         self.names = list(self.layout)
         self.providers = [name for name, servers in self.layout.items() if servers]
         draw = self.rng.random
@@ -126,7 +139,8 @@ class Chance:
             else:
                 provider = self.names[1 + int(draw() * level)]
             server = self.rng.choice(self.layout[provider]).name if self.layout[provider] else "none"
-            return (*key, "sub", provider, server, self.rng.choice(REQUESTS))
+            step = (*key, "sub", provider, server, self.rng.choice(REQUESTS))
+            return step if self.rough is None else self.rough.with_priority(step)
         if kind != "hear" and draw() < self.fails:
             return (*key, "raise")
         if kind == "recover" and draw() < 0.3:
@@ -173,4 +187,5 @@ class Chance:
         server = self.rng.choice(servers).name if self.rng.random() < 0.98 else "none"
         self.asked += 1
         direct = self.direct > 0 and self.rng.random() < self.direct
-        return ("load", f"q{self.asked}", name, provider, server, self.rng.choice(REQUESTS), direct)
+        step = ("load", f"q{self.asked}", name, provider, server, self.rng.choice(REQUESTS), direct)
+        return step if self.rough is None else self.rough.with_priority(step)

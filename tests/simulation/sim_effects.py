@@ -1,4 +1,4 @@
-"""Acting on effects in a simulated world: what registrar/engine/monitor.py does, with links and callbacks that
+"""Acting on effects in a simulated world: what registrar/engine/effect_runner.py does, with links and callbacks that
 are made up.
 """
 
@@ -12,7 +12,7 @@ from rr_actors.registrar.core.status_delivery import is_listened
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.messages import Loaded
-from rr_actors.registrar.model.rows import is_own
+from rr_actors.registrar.model.rows import is_own, is_revocation
 from simulation.oracle import Violation
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER
 from simulation.sim_process import SimShell
@@ -67,6 +67,14 @@ def _start_recover(shell: SimShell, effect: e.StartRecover) -> None:
     shell.start_run(kind, effect.resource.id, effect.resource.attempt, effect.resource)
 
 
+def _start_pause(shell: SimShell, effect: e.StartPause) -> None:
+    shell.start_run("pause", effect.resource.id, effect.resource.attempt, effect.resource)
+
+
+def _start_resume(shell: SimShell, effect: e.StartResume) -> None:
+    shell.start_run("resume", effect.resource.id, effect.resource.attempt, effect.resource)
+
+
 def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
     resource, notice = effect.resource, effect.notice
     now = shell.catalog.resources.get(resource.id)
@@ -87,14 +95,33 @@ def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
 def _hear(shell: SimShell, effect: e.Hear) -> None:
     if shell.state != "up":
         raise Violation("statuses", f"{effect.held.id} heard {effect.notice} before on_start had returned")
+    _check_window(shell, effect)
     excused = shell.world.may_be_lost(shell, effect.held)
     shell.world.ledger.hear(effect.held.id, effect.notice, shell.epoch, effect.repeated, excused)
-    holders = set(shell.catalog.holders.get(effect.held.parent, ())) - shell.begun
-    shell.world.ledger.must_go_on(shell.name, effect.held, effect.notice.event, holders)
+    if is_revocation(effect.notice):  # the whole is revoked, or lets its part go
+        shell.world.ledger.revoked.add(effect.held.id)
+        shell.world.ledger.given_up_parts.add((effect.held.parent, effect.notice.resource_id))
+    else:
+        holders = set(shell.catalog.holders.get(effect.held.parent, ())) - shell.begun
+        shell.world.ledger.must_go_on(shell.name, effect.held, effect.notice.event, holders)
     run = shell.start_run("hear", effect.held.id, effect.notice.event, None)
     run.notice = effect.notice
     if is_listened(shell.catalog, effect.held):
         run.listener = effect.held.parent
+
+
+def _check_window(shell: SimShell, effect: e.Hear) -> None:
+    """Of one query no more statuses wait at its holder than its provider may have on their way."""
+    hearing = shell.catalog.hearing.items()  # its holder itself says that it is lost, if there is no provider
+    deleted = shell.world.ledger.deleted
+    waiting = sum(bool(it.provider) and id.endswith(f":{effect.held.id}") and id not in deleted for id, it in hearing)
+    window = shell.world.registrars[effect.held.registrar].catalog.window
+    if waiting > window:
+        raise Violation("bounds", f"{waiting} statuses of {effect.held.id} wait at {shell.name}: more than {window}")
+
+
+def _fell_behind(shell: SimShell, effect: e.FellBehind) -> None:
+    shell.world.note(f"{shell.name}: {effect.origin} is behind with the statuses of {effect.query_id}")
 
 
 def _set_timer(shell: SimShell, effect: e.SetTimer) -> None:
@@ -118,12 +145,17 @@ def _connect(shell: SimShell, effect: e.Connect) -> None:
 def _answer(shell: SimShell, effect: e.Answer) -> None:
     ledger = shell.world.ledger
     ledger.ticket(effect.ticket, given=False)
+    ledger.wish_answered(effect.ticket, done=effect.failure is None)
     if effect.failure is None and effect.ticket in ledger.swaps:
         ledger.replaced.add(ledger.swaps[effect.ticket])
 
 
 def _happened(shell: SimShell, effect: e.Happened) -> None:
-    shell.world.note(f"{shell.name}: {effect.what} {effect.resource_id} {effect.detail}")
+    shell.world.note(f"{shell.name}: {effect.what} {effect.resource.id} {effect.detail}")
+
+
+def _died(shell: SimShell, effect: e.Died) -> None:
+    shell.world.note(f"{shell.name}: its last process died in {'; '.join(effect.runs)}")
 
 
 ACT: dict[type, Callable[[SimShell, Any], None]] = {
@@ -133,12 +165,16 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.StartLoad: _start_load,
     e.StartUnload: _start_unload,
     e.StartRecover: _start_recover,
+    e.StartPause: _start_pause,
+    e.StartResume: _start_resume,
     e.StartStatus: _start_status,
     e.SetTimer: _set_timer,
     e.LoadResolved: _load_resolved,
     e.UnloadResolved: _unload_resolved,
     e.Receive: _receive,
     e.Hear: _hear,
+    e.FellBehind: _fell_behind,
     e.Answer: _answer,
     e.Happened: _happened,
+    e.Died: _died,
 }

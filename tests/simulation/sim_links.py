@@ -30,7 +30,7 @@ class SimLink:
 class SimLine:
     """A direct line: one thread's own connection for one load, or for the unload of what that got."""
 
-    __slots__ = ("broken", "consumer", "epoch", "left", "provider", "query_id", "unloads", "ways")
+    __slots__ = ("broken", "consumer", "epoch", "left", "provider", "query_id", "run", "unloads", "ways")
 
     def __init__(self, query_id: str, consumer: str, provider: str, epoch: int, *, unloads: bool = False) -> None:
         self.query_id = query_id
@@ -38,6 +38,7 @@ class SimLine:
         self.consumer = consumer
         self.provider = provider
         self.epoch = epoch
+        self.run = 0  # the provider's epoch
         self.ways: tuple[deque[Any], deque[Any]] = (deque(), deque())
         self.broken = False
         self.left = False  # by the thread

@@ -6,13 +6,15 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
-from rr_actors.registrar.core import digests, holding
+from rr_actors.base.values.failure import Failure
+from rr_actors.registrar.core import holding
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
 from rr_actors.registrar.model.effects import Effect
-from rr_actors.registrar.model.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
-from rr_actors.registrar.model.rows import Content, Held, Hold, Notice, Phase, Resource, State, content_of
+from rr_actors.registrar.model.messages import Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
+from rr_actors.registrar.model.rows import HIGHEST, Content, Held, Hold, Notice, Phase, Resource, State, content_of
 from simulation.oracle import Ledger, Violation
 from simulation.pending_steps import Todo
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
@@ -24,6 +26,7 @@ class Surroundings(Protocol):
     ledger: Ledger
     todo: Todo
     hasty: frozenset[str]
+    left: set[str]
 
     @property
     def registrars(self) -> Mapping[str, SimShell]:
@@ -60,6 +63,10 @@ class Surroundings(Protocol):
 
     def may_be_lost(self, consumer: SimShell, held: Held) -> bool:
         """Whether a query may be said to be lost though no owner took it away."""
+        ...
+
+    def dependent(self) -> dict[str, int]:
+        """Return the resources that are loaded and have not dealt with a status, and the attempts of their loads."""
         ...
 
     def unload_ended(self, registrar: SimShell, query_id: str, failure: Failure | None) -> None:
@@ -103,8 +110,17 @@ class SimShell:
         self.disk_is_full = False
         self.state = "down"  # down, stopped, starting, up, gone
         self.epoch = 0
-        self.catalog = Catalog(name)
+        self.open(content_of(()))
         self.fresh()
+
+    def open(self, content: Content) -> None:
+        """The catalog in memory. Some registrars have few statuses of one query on their way, so that others wait.
+
+        The parts of some have no high priority.
+        """
+        self.catalog = Catalog(self.name, content, self.epoch)
+        self.catalog.window = (1, 2, 1000)[ord(self.name[-1]) % 3]
+        self.catalog.max_priority = (HIGHEST, 5, HIGHEST)[ord(self.name[-1]) % 3]
 
     def fresh(self) -> None:
         """Nothing of the process's memory."""
@@ -117,6 +133,8 @@ class SimShell:
         self.fetches = self.epoch << 32
         self.epochs: dict[int, int] = {}  # of the provider, by the number of the Fetch that opened a link to it
         self.asked: set[str] = set()
+        self.gone: set[str] = set()  # providers of which it knows that they are gone for good
+        self.closing: Any = None  # lives.Closing, while it is being closed
         self.routes = Routes()
         self.ending: list[SimLine] = []  # lines whose end is read when what has come in is dealt with
         self.runs: dict[tuple[Any, ...], Run] = {}
@@ -188,7 +206,7 @@ class SimShell:
                 self.answer(line, joined)
                 return
         if isinstance(message, (Load, Unload)):
-            self.routes.asked_by_line(line, message)
+            self.routes.asked_by_line(line, message, self.catalog.refused)
         if overtaking is None or not self.decide_at_once(message, line.consumer, overtaking):
             self.receive(message, line.consumer)
 
@@ -216,7 +234,8 @@ class SimShell:
         if not peering.reconciled and message.number == peering.number:
             self.clients[provider] = peering._replace(reconciled=True)
             event = self.world.new_event()
-            self.post(c.Reconcile(provider, message.queries, event, message.same, message.number))
+            run = self.epochs[message.number]
+            self.post(c.Reconcile(provider, message.queries, event, message.same, message.number, run, message.notices))
 
     # -- links ---------------------------------------------------------------------------------------------------
 
@@ -266,6 +285,8 @@ class SimShell:
         run = Run(self.name, kind, id, number, resource)
         self.runs[run.key] = run
         self.world.todo.add(run.key)
+        if resource is not None:
+            self.world.ledger.callback_began(self.name, kind, id)
         if resource is not None and kind in ("load", "unload", "reload"):
             request = (self.name, resource.server, resource.request)
             if kind == "unload" and resource.response is None:
@@ -274,6 +295,8 @@ class SimShell:
                 self.world.ledger.given_up.add((self.name, id))
             elif kind == "load" and id in self.unwanted:
                 raise Violation("callbacks", f"{id} is loaded again after a crash, and nobody wants it")
+            if kind == "unload" and id in self.catalog.revocations:
+                self.world.ledger.unload_began(id, self.world.dependent())
             self.world.ledger.run_started(self.name, id, kind, number, request, self.excused(resource))
         return run
 
@@ -287,7 +310,7 @@ class SimShell:
 
     def ask(self, ask: c.Ask, run: Run | None) -> None:
         """Load by the loop, for a callback or for somebody outside."""
-        self._asked(ask.query_id, ask.registrar, run)
+        self._asked(ask, run)
         self.post(ask)
 
     def begin_directly(self, ask: c.Ask, run: Run | None) -> Load | None:
@@ -296,13 +319,16 @@ class SimShell:
         if ask.parent and resource is None:
             return None
         attempt = 0 if resource is None else resource.attempt
-        self._asked(ask.query_id, ask.registrar, run)
-        held = self.catalog.in_flight[ask.query_id] = holding.pending(ask, attempt)
-        return Load(held.id, held.server, held.request, self.name, held.parent, attempt, held.seq)
+        priority = ask.priority if ask.own or resource is None else self.catalog.inherited(resource.id)
+        self._asked(ask, run)
+        held = self.catalog.in_flight[ask.query_id] = holding.pending(ask, attempt, priority)
+        return Load(held.id, held.server, held.request, self.name, held.parent, attempt, held.seq, priority, held.own)
 
-    def _asked(self, query_id: str, provider: str, run: Run | None) -> None:
+    def _asked(self, ask: c.Ask, run: Run | None) -> None:
+        query_id = ask.query_id
         self.world.ledger.fate[query_id] = "asked"
-        self.world.ledger.provider[query_id] = provider
+        self.world.ledger.provider[query_id] = ask.registrar
+        self.world.ledger.wishes[query_id] = [(0, None if ask.parent and not ask.own else ask.priority)]
         self.waiters[query_id] = run
         self.world.todo.add(("tire", self.name, query_id))
 
@@ -316,7 +342,9 @@ class SimShell:
         ledger = self.world.ledger
         if failure is None:
             provider = self.world.registrars[ledger.provider[query_id]]
-            on_disk = query_id in provider.disk["queries"] or query_id in ledger.taken
+            on_disk = (
+                query_id in provider.disk["queries"] or query_id in ledger.taken or provider.name in self.world.left
+            )
             ledger.loaded(query_id, on_disk)
         else:
             ledger.failed(query_id)

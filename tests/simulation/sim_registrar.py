@@ -5,13 +5,28 @@ from __future__ import annotations
 from typing import Any, cast
 
 from rr_actors.base.errors import CatalogError
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import holding, loading
+from rr_actors.registrar.core.callback_runs import ATTEMPTS, is_given_up
 from rr_actors.registrar.core.decide import decide, refuse_uncommitted
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Catalog, Decision
+from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.effects import Happened, Reply
-from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unloaded, UnloadRefused
-from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, is_own
+from rr_actors.registrar.model.messages import Load, Loaded, Message, Unloaded, UnloadRefused
+from rr_actors.registrar.model.rows import (
+    TABLE_OF,
+    CallbackRun,
+    Change,
+    Content,
+    Held,
+    Hold,
+    Notice,
+    Phase,
+    Put,
+    Query,
+    Resource,
+    is_own,
+)
 from simulation.oracle import Violation
 from simulation.sim_effects import ACT
 from simulation.sim_process import SimShell
@@ -32,7 +47,7 @@ class SimRegistrar(SimShell):
         self.fetches = self.epoch << 32
         self.state = "starting"
         content: Content = {table: dict(rows) for table, rows in self.disk.items()}
-        self.catalog = Catalog(self.name, content, self.epoch)
+        self.open(content)
         decision = decide(self.catalog, [(c.BeginAgain(), None)])
         loading = [row.id for row in self.catalog.resources.values() if row.phase is Phase.LOADING]
         self.unwanted.update(id for id in loading if id not in self.catalog.holders)
@@ -119,6 +134,7 @@ class SimRegistrar(SimShell):
         tables = self.disk
         ledger = self.world.ledger
         own: list[Notice] = []  # those that leave the disk
+        given_up: set[str] = set()
         for change in changes:
             if type(change) is Put:
                 row = change.row
@@ -130,8 +146,11 @@ class SimRegistrar(SimShell):
                     again = row.hold is Hold.HELD and owed
                     if again and row.id in self.refusals:
                         ledger.refused.add(row.id)
+                elif type(row) is Resource and row.phase is Phase.UNLOAD_FAILED:
+                    ledger.given_up_unload(self.name, row.id, died=is_given_up(self.catalog, "unload", row.id))
                 elif type(row) is Query:
                     ledger.begun(row.id)
+                    ledger.on[row.id] = row.resource_id
                     self.begun.add(row.id)
                 elif type(row) is Notice and is_own(row):
                     ledger.own_notice(row)
@@ -142,9 +161,15 @@ class SimRegistrar(SimShell):
                 if type(old) is Notice and is_own(old):
                     own.append(old)
                 if change.table == "resources":
-                    ledger.settled(self.name, change.id)
+                    was = cast("Resource | None", old)
+                    failed = change.id in given_up or (was is not None and was.phase is Phase.UNLOAD_FAILED)
+                    unserved = was is not None and was.server not in self.catalog.servers  # its owner clears all of it
+                    ledger.settled(self.name, change.id, cleared=failed or unserved)
                 elif change.table == "queries":
                     ledger.dropped(change.id)
+                elif type(old) is CallbackRun and old.deaths >= ATTEMPTS and old.id.startswith("unload:"):
+                    given_up.add(old.id.removeprefix("unload:"))  # its resource goes, without its server
+                    ledger.given_up_unload(self.name, old.id.removeprefix("unload:"), died=True)
         self._check_told_in_turn(changes, own)
 
     def _check_told_in_turn(self, changes: list[Change], own: list[Notice]) -> None:
@@ -158,7 +183,8 @@ class SimRegistrar(SimShell):
             if notice.resource_id in tables["resources"]:
                 queries = [cast("Query", row) for row in tables["queries"].values()]
                 on_it = [q.id for q in queries if q.resource_id == notice.resource_id and q.id not in self.begun]
-                self.world.ledger.own_dealt_with(notice, on_it)
+                passed_over = is_given_up(self.catalog, "status", notice.resource_id)
+                self.world.ledger.own_dealt_with(notice, on_it, passed_over)
 
     def owe(self, query_id: str, fault: str) -> bool:
         """As RegistrarState.owe."""
@@ -198,7 +224,7 @@ class SimRegistrar(SimShell):
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+        return loading.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
         """As RegistrarState.join, for a direct line."""
@@ -206,7 +232,7 @@ class SimRegistrar(SimShell):
         if query is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+        return loading.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def _joined(self, load: Load, fault: str) -> Query | None:
         """The row, on disk; None if it is to be decided as any load."""
@@ -224,14 +250,14 @@ class SimRegistrar(SimShell):
         return query
 
     def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
-        """As Monitor.put, of what a direct line brings."""
+        """As RegistrarMonitor.put, of what a direct line brings."""
         if self.inbox or self.state not in ("starting", "up"):
             return False
         self.take_up([(message, sender)], fault, 0)
         return True
 
     def tell(self, done: c.Command, fault: str) -> bool:
-        """As Monitor.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
+        """As RegistrarMonitor.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
         if self.inbox:
             return False
         decision = decide(self.catalog, [(done, None)])

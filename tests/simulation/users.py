@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.messages import Failure, Load, Loaded, LoadRefused, Unload, Unloaded, UnloadRefused
+from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import Hold, Phase, State
 from simulation.network import DOWN
 from simulation.network_faults import Trouble
@@ -13,32 +14,43 @@ from simulation.sim_registrar import Killed, SimRegistrar
 
 TIRED = Failure("LoadTimeout", "tired of waiting")
 LATE = Failure("Unavailable", "tired of waiting")
+OWED = (LATE.kind, DOWN.kind)  # kinds of failures after which a release is owed still
 
 _ENDED = ("failed", "released")  # its row may still be there, when the registrar has not taken up that it is over
 
 
 class People(Trouble):
-    """Steps: load, join, line, tire, unload, owe, late; own, reregister."""
+    """Steps: load, join, line, tire, rank, unload, owe, late; own, reregister."""
 
-    def load(self, query_id: str, name: str, provider: str, server: str, request: bytes, direct: bool = False) -> bool:
+    def load(
+        self,
+        query_id: str,
+        name: str,
+        provider: str,
+        server: str,
+        request: bytes,
+        direct: bool = False,
+        priority: int = 0,
+    ) -> bool:
         """Somebody asks for something."""
         registrar = self.registrars[name]
         if registrar.state not in ("up", "starting") or query_id in self.ledger.fate:
             return False
         self.asker[query_id] = name
-        ask = c.Ask(query_id, provider, server, request, "", registrar.next_seq())
+        ask = c.Ask(query_id, provider, server, request, "", registrar.next_seq(), priority, own=True)
         if not (direct and self.ask_directly(registrar, ask, None)):
             registrar.ask(ask, None)
         return True
 
     def ask_directly(self, registrar: SimShell, ask: c.Ask, run: Run | None) -> bool:
         """As Loads does, for somebody outside or for a callback; False: the loop is to ask."""
-        if not registrar.reaches(self.registrars[ask.registrar]):
+        if registrar.catalog.shut or not registrar.reaches(self.registrars[ask.registrar]):
             return False
         load = registrar.begin_directly(ask, run)
         if load is None:
             return False
         line = self.lines[ask.query_id] = SimLine(ask.query_id, registrar.name, ask.registrar, registrar.epoch)
+        line.run = self.registrars[ask.registrar].epoch
         line.ways[TO_PROVIDER].append(load)
         self.todo.add(("line", ask.query_id, TO_PROVIDER))
         return True
@@ -48,7 +60,7 @@ class People(Trouble):
         registrar = self.registrars[name]
         if registrar.state != "up" or query_id in self.ledger.fate:
             return False
-        if not registrar.reaches(registrar):
+        if registrar.catalog.shut or not registrar.reaches(registrar):
             return False
         ask = c.Ask(query_id, name, server, request, "", registrar.next_seq())
         try:
@@ -62,7 +74,7 @@ class People(Trouble):
             return False
         self.asker[query_id] = name
         registrar.begin_directly(ask, None)
-        if not registrar.hold(c.Got(query_id, joined.resource_id, joined.response)):
+        if not registrar.hold(c.Got(query_id, joined.resource_id, joined.response, joined.state)):
             raise AssertionError(query_id)
         registrar.load_ended(query_id, None)
         return True
@@ -108,7 +120,7 @@ class People(Trouble):
             elif message is None:
                 self._follow(consumer, query_id, c.SendAgain(query_id), fault)
             elif isinstance(message, Loaded):
-                got = c.Got(query_id, message.resource_id, message.response)
+                got = c.Got(query_id, message.resource_id, message.response, message.state, line.run)
                 if consumer.hold(got):
                     line.left = True
                     consumer.load_ended(query_id, None)
@@ -146,6 +158,17 @@ class People(Trouble):
             registrar.post(c.GiveUp(query_id, TIRED))
             return True
         self._follow(registrar, query_id, c.GiveUp(query_id, TIRED, unheard=True), fault)
+        return True
+
+    def rank(self, name: str, query_id: str, priority: int) -> bool:
+        """Somebody gives a query another priority."""
+        registrar = self.registrars[name]
+        held = registrar.catalog.held.get(query_id)
+        if registrar.state not in ("up", "starting") or held is None or held.hold is not Hold.HELD:
+            return False
+        ticket = self.new_ticket()
+        self.ledger.wished(query_id, ticket, priority)
+        registrar.post(c.SetPriority(query_id, priority, ticket))
         return True
 
     def unload(self, name: str, query_id: str) -> bool:
@@ -231,13 +254,15 @@ class People(Trouble):
 
     def unload_ended(self, registrar: SimShell, query_id: str, failure: Failure | None) -> None:
         """Whoever unloaded is told."""
+        if registrar.closing is not None:
+            registrar.closing.open.discard(query_id)
         if self.letting.pop(query_id, None) is None:
             return
         self.todo.discard(("late", registrar.name, query_id))
         if failure is None:
             provider = self.registrars[self.ledger.provider[query_id]]
             self.ledger.released(query_id, query_id in provider.disk["queries"] and provider.state != "gone")
-        elif failure is not LATE:
+        elif failure.kind not in OWED and not (registrar.closing and failure.kind == "UnknownQuery"):
             self.ledger.kept(query_id)
 
     # -- owners --------------------------------------------------------------------------------------------------
@@ -250,6 +275,7 @@ class People(Trouble):
         if what == "unregister":
             if target not in registrar.registered:
                 return False
+            self.ledger.forced.update(registrar.catalog.by_server.get(target, ()))
             registrar.post(c.Unregister(target, self.new_event(), self.new_ticket()))
             self.todo.add(("reregister", name, target))
             return True
@@ -263,8 +289,11 @@ class People(Trouble):
                 registrar.post(c.SetResponse(target, event, f"late:{event}".encode(), "", self.new_ticket()))
             case "swap":
                 return self._swap(registrar, target)
+            case "revoke":
+                registrar.post(c.Revoke(target, self.new_event(), "revoked", 1000, self.new_ticket()))
             case _:
-                registrar.post(c.ForceUnload(target, self.new_event(), self.new_ticket()))
+                self.ledger.forced.add(target)
+                registrar.post(c.ForceUnload(target, self.new_event(), self.new_ticket(), clears=True))
         return True
 
     def _swap(self, registrar: SimRegistrar, resource_id: str) -> bool:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.messages import Failure
-from rr_actors.registrar.model.rows import Hold, State
+from rr_actors.registrar.model.rows import Hold, State, is_revocation
+from simulation.lives import Lives
 from simulation.sim_process import Run, SimShell
 from simulation.sim_registrar import Killed, SimRegistrar
-from simulation.users import People
 
 Step = tuple[Any, ...]
 
@@ -22,7 +22,7 @@ RAISED = Failure("LoadFailed", "the callback raised")
 STUCK = Failure("UnloadFailed", "the callback raised")
 
 
-class World(People):
+class World(Lives):
     """Everything of one simulated run. Steps, besides those of the classes above: wake, save, register, timer, call."""
 
     def apply(self, step: Step) -> bool:
@@ -83,6 +83,8 @@ class World(People):
             return False
         self.todo.discard(key)
         registrar = self.registrars[name]
+        if timer.startswith("revoke:"):
+            self.ledger.forced.add(timer.removeprefix("revoke:"))
         registrar.post(registrar.timers.pop(timer))
         return True
 
@@ -107,8 +109,8 @@ class World(People):
         A status callback that raises is one that has dealt with the status; "say": it says something of its resource.
 
         Args:
-            place: of "sub", what it loads, and perhaps that its thread asks itself; of "tell", the disk's fault then;
-                of "say", the state.
+            place: of "sub", what it loads, and perhaps that its thread asks itself, and a priority; of "tell", the
+                disk's fault then; of "say", the state.
         """
         key = ("call", name, kind, id, number)
         if key not in self.todo:
@@ -119,9 +121,10 @@ class World(People):
         if how == "sub":
             run.subs += 1
             run.waits = f"{id}/{number}.{run.subs}"
-            provider, server, request, *directly = place
-            ask = c.Ask(run.waits, provider, server, request, run.id, registrar.next_seq())
-            if not (directly and self.ask_directly(registrar, ask, run)):
+            provider, server, request, *rest = place
+            own = [priority for priority in rest if isinstance(priority, int)]
+            ask = c.Ask(run.waits, provider, server, request, run.id, registrar.next_seq(), *own, own=bool(own))
+            if not ("directly" in rest and self.ask_directly(registrar, ask, run)):
                 registrar.ask(ask, run)
             return True
         if how == "say":
@@ -151,6 +154,7 @@ class World(People):
 
     def _outcome(self, registrar: SimShell, run: Run, *, ok: bool, with_change: bool) -> c.Command:
         name, ledger = registrar.name, self.ledger
+        ledger.callback_ended(name, run.kind, run.id)
         match run.kind:
             case "load":
                 ledger.run_ended(name, run.id, "loaded" if ok else "gone")
@@ -164,13 +168,21 @@ class World(People):
                 handled = bool(run.listener) and not ok
                 if handled:
                     ledger.handled.add((run.listener, run.number))
-                return c.Heard(run.id, run.number, handled)
+                return c.Heard(run.id, run.number, handled, run.notice is not None and is_revocation(run.notice))
             case "status":
                 assert run.notice is not None
                 ledger.own_heard.add((run.id, run.number))
                 if not ok:
                     ledger.handled.add((run.id, run.number))
                 return c.StatusDone(run.id, run.notice, not ok)
+            case "pause":
+                return c.PauseDone(run.id, run.number) if ok else c.PauseErred(run.id, run.number, RAISED)
+            case "resume":
+                event = self.new_event()
+                if not ok:
+                    return c.ResumeErred(run.id, run.number, RAISED, event)
+                new = f"{run.id}:{run.number}:{event}".encode() if with_change else None
+                return c.ResumeDone(run.id, run.number, new, event)
             case _:
                 event = self.new_event()
                 if not ok:
@@ -180,9 +192,9 @@ class World(People):
 
 
 _STEPS = (
-    *("wake", "act", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire"),
+    *("wake", "act", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "rank"),
     *("unload", "join", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal"),
-    *("dup", "full", "space", "listen"),
+    *("dup", "full", "space", "listen", "close", "closing", "delete", "generation"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 

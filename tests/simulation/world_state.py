@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rr_actors.registrar.model.catalog import Server
-from rr_actors.registrar.model.rows import Held, Phase
+from rr_actors.registrar.model.rows import Held, Phase, Resource
 from simulation.oracle import Ledger
 from simulation.pending_steps import Todo
 from simulation.sim_links import TO_CONSUMER, SimLine, SimLink
@@ -37,6 +37,9 @@ class WorldState:
         self.tickets = 0
         self.trace: list[str] | None = None
         self.retired: set[str] = set()
+        self.given_back: set[str] = set()  # released by closing, also parts of what could not be unloaded
+        self.unheard: set[str] = set()  # queries whose provider has closed before their holder had heard that it does
+        self.left: set[str] = set()  # those that were closed for good, or deleted, and may come back
         self.letting: dict[str, str] = {}  # query -> who waits for its unload
         self.asker: dict[str, str] = {}
         self.registrars: dict[str, SimRegistrar] = {
@@ -84,6 +87,23 @@ class WorldState:
         """Those that are not gone for good."""
         return [registrar for registrar in self.registrars.values() if registrar.state != "gone"]
 
+    def dependent(self) -> dict[str, int]:
+        """The resources that are loaded and have not dealt with a status, and the attempts of their loads."""
+        dealt = {id for id, _ in self.ledger.handled}
+        rows = [
+            (registrar.name, row)
+            for registrar in self.live()
+            if registrar.name not in self.left
+            for row in registrar.disk["resources"].values()
+            if isinstance(row, Resource) and row.id not in dealt
+        ]
+        lives = self.ledger.lives
+        return {
+            row.id: row.attempt
+            for name, row in rows
+            if (name, row.id) in lives and lives[name, row.id].stage == "loaded"
+        }
+
     def lingering(self, registrar: SimShell, resource_id: str) -> bool:
         """Whether an unheld resource is kept warm."""
         resource = registrar.catalog.resources[resource_id]
@@ -91,4 +111,5 @@ class WorldState:
 
     def may_be_lost(self, consumer: SimShell, held: Held) -> bool:
         """Whether a query may be said to be lost though no owner took it away."""
-        return held.registrar in self.retired or consumer.name in self.retired or held.id in self.ledger.losses
+        gone = self.retired | self.left
+        return held.registrar in gone or consumer.name in gone or held.id in self.ledger.losses

@@ -8,20 +8,23 @@ import resource
 import shutil
 import sqlite3
 import stat
+import threading
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
 
 import rr_actors as rr
 from fuzz import damage
-from rr_actors.base.errors import CatalogDamaged
-from rr_actors.registrar.model.rows import Change, Peer, Put, Query, rows_of
+from rr_actors.base.errors import CatalogDamaged, CatalogLocked
+from rr_actors.base.folder import Folder
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, rows_of
+from rr_actors.registrar.model.store import Store
+from rr_actors.storage import opening
 from rr_actors.storage.catalog_lock import Reached
-from rr_actors.storage.opening import Durability, open_store
-from rr_actors.storage.store import Store
-from rr_actors.storage.witness import Known, Witness
+from rr_actors.storage.opening import Durability, open_store, read_rows, remove_unneeded
+from rr_actors.storage.witness import Known, Witness, tell_of_missing
 from rr_actors.wire.name_service import open_state_dir
 from support_slow import few_now
 from support_stores import in_order
@@ -306,7 +309,141 @@ def test_records_that_cannot_be_reached_are_told_of_and_hold_up_nothing(
 ) -> None:
     (tmp_path / ".catalogs").write_bytes(b"something else")
     witness = Witness(tmp_path, "app")
-    for use in (witness.known, lambda: witness.note(Known("id", 1, "/nowhere")), witness.forget):
-        assert use() is None
+    for use in (witness.known, lambda: witness.note(Known("id", 1, "/nowhere")), lambda: witness.forget(1)):
+        assert not use()
         assert "cannot be read or written" in caplog.text
         caplog.clear()
+
+
+# -- catalogs that are not needed any more -----------------------------------------------------------------------------
+
+
+def test_the_epochs_of_a_catalog_that_was_removed_are_not_used_again(tmp_path: Path) -> None:
+    """A link or a line of an earlier incarnation must not be taken for one of a later."""
+    path, witness = tmp_path / "app" / "catalog.sqlite3", Witness(tmp_path, "app")
+    other = tmp_path / "other" / "catalog.sqlite3"
+    epochs: list[int] = []
+    for _ in range(4):
+        for _ in range(3):
+            store = open_store(path, witness=witness)
+            epochs.append(store.epoch)
+            store.close()
+        remove_unneeded(path, witness)
+        assert not path.parent.exists()
+        open_store(other, witness=Witness(tmp_path, "other")).close()
+        remove_unneeded(other, Witness(tmp_path, "other"))  # has epochs of its own, which change nothing
+    assert epochs == sorted(set(epochs))
+
+
+@pytest.mark.parametrize("spoil", [shutil.rmtree, lambda place: (place / "catalog.sqlite3").write_bytes(b"no catalog")])
+def test_the_epochs_of_a_catalog_that_is_lost_are_not_used_again(
+    tmp_path: Path, spoil: Callable[[Path], object]
+) -> None:
+    path, witness = tmp_path / "app" / "catalog.sqlite3", Witness(tmp_path, "app")
+    for _ in range(3):
+        open_store(path, witness=witness).close()
+    spoil(path.parent)
+    store = open_store(path, witness=witness, on_damage="aside")
+    assert store.epoch == 4
+    store.close()
+
+
+def test_a_catalog_with_a_row_is_not_removed_nor_one_that_is_open(tmp_path: Path) -> None:
+    path, witness = tmp_path / "app" / "catalog.sqlite3", Witness(tmp_path, "app")
+    store = open_store(path, witness=witness)
+    with pytest.raises(CatalogLocked):
+        remove_unneeded(path, witness)
+    store.commit([Put(Peer("hub"))])
+    store.close()
+    remove_unneeded(path, witness)
+    store = open_store(path, witness=witness)
+    assert rows_of(store.load()) == [Peer("hub")]
+    store.close()
+
+
+@pytest.mark.parametrize("durability", ["process", "power"])
+def test_a_crash_in_the_middle_of_a_removal_leaves_a_catalog_that_opens_and_that_nobody_misses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, durability: Durability
+) -> None:
+    path, witness = tmp_path / "app" / "catalog.sqlite3", Witness(tmp_path, "app")
+    unlink, left = os.unlink, 0
+
+    def dies(name: str, **options: int) -> None:
+        nonlocal left
+        left -= name.startswith("catalog.")
+        if left < 0:
+            raise KeyboardInterrupt
+        unlink(name, **options)
+
+    ends = 0
+    for at in range(10):
+        left = at
+        store = open_store(path, durability=durability, witness=witness)
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "unlink", dies)
+            try:
+                store.close(erase=True)
+            except KeyboardInterrupt:
+                ends += 1
+        tell_of_missing(tmp_path)
+        again = open_store(path, durability=durability, witness=witness)
+        assert again.epoch > store.epoch
+        again.close()
+    assert 2 <= ends < 10
+    assert caplog.messages == []
+
+
+def test_an_opening_waits_for_no_directory_that_is_being_removed_and_makes_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "app" / "catalog.sqlite3"
+    make_private, times = opening._make_private, 0
+
+    def removed_meanwhile(folder: Folder) -> None:
+        nonlocal times
+        times += 1
+        if times < 3:
+            path.parent.rmdir()
+        make_private(folder)
+
+    monkeypatch.setattr(opening, "_make_private", removed_meanwhile)
+    with closing(open_store(path)) as store:
+        store.commit([Put(Peer("hub"))])
+    assert times == 3
+    assert read_rows(path) == [Peer("hub")]
+
+
+def test_an_opening_that_meets_a_removal_finds_all_that_was_committed(tmp_path: Path) -> None:
+    path, witness = tmp_path / "app" / "catalog.sqlite3", Witness(tmp_path, "app")
+    ended = threading.Event()
+    failures: list[BaseException] = []
+
+    def remove() -> None:
+        while not ended.is_set():
+            try:
+                remove_unneeded(path, witness)
+            except CatalogLocked:
+                pass
+            except BaseException as error:
+                failures.append(error)
+
+    def opened_again() -> Store:
+        while True:
+            with suppress(CatalogLocked):
+                return open_store(path, witness=witness)
+
+    thread = threading.Thread(target=remove)
+    thread.start()
+    epochs = [0]
+    try:
+        for number in range(60):
+            store = opened_again()
+            assert rows_of(store.load()) == ([] if number % 2 == 0 else [Peer("hub")])
+            assert store.epoch > epochs[-1]
+            epochs.append(store.epoch)
+            store.commit([Put(Peer("hub"))] if number % 2 == 0 else [Drop("peers", "hub")])
+            store.close()
+    finally:
+        ended.set()
+        thread.join()
+    assert failures == []

@@ -33,12 +33,12 @@ from rr_actors.base.errors import (
 from rr_actors.base.values.canonical import Codec
 from rr_actors.managers.components import read_registry
 from rr_actors.managers.robots import read_robots
+from rr_actors.registrar.links import remote_calls
 from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Put, Query, Resource, Row, State, rows_of
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.supervision import control_channel
 from rr_actors.supervision.core.specs import Supervisor
-from rr_actors.system.hosting import remote_calls
 from rr_actors.wire.frames import FrameReader
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake
 from rr_actors.wire.transport import Hello

@@ -15,11 +15,11 @@ import pytest
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, rows_of
+from rr_actors.registrar.model.store import Store
 from rr_actors.storage import catalog_lock
 from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import SqliteStore
-from rr_actors.storage.store import Store
 from support_stores import Rows, after, in_order, part, query
 
 DISK = ("open", "pwrite", "ftruncate", "unlink", "rename", "replace")

@@ -14,8 +14,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, rows_of
+from rr_actors.registrar.model.store import Store
 from rr_actors.storage.opening import Durability, open_store, read_rows
-from rr_actors.storage.store import Store
 from support_stores import CHANGES, Rows, after, in_order, segments_of
 
 HEADER = 56  # bytes

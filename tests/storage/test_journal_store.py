@@ -26,17 +26,17 @@ import pytest
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import Folder
-from rr_actors.registrar.engine.monitor import CommitLog
+from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, rows_of
+from rr_actors.registrar.model.store import Store
 from rr_actors.storage import journaled_store, opening
 from rr_actors.storage import journaled_store as journaled_module
 from rr_actors.storage.catalog_lock import CatalogLock
 from rr_actors.storage.journaled_store import JournaledStore, Segment
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import SqliteStore
-from rr_actors.storage.store import Store
-from rr_actors.system.registrar_lookup import forget
+from rr_actors.supervision.given_up import forget
 from support import REPOSITORY
 from support_interrupts import interrupted
 from support_stores import belonging_to_another, in_order, part, query, segments_of
@@ -283,8 +283,15 @@ def test_a_commit_that_failed_first_of_all_leaves_nothing_behind(path: Path) -> 
     assert names(path) == ["catalog.lock", "catalog.sqlite3"]
 
 
+def open_tables(store: JournaledStore) -> None:
+    """Let SQLite open its files, which it does when it folds first."""
+    store.commit([Drop("queries", "none")])
+    store.tidy()
+
+
 def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_is_room(path: Path) -> None:
     store = journaled(path)
+    open_tables(store)
     wal = path.with_name(path.name + "-wal")
     rows: list[Row] = []
     for n in range(3):
@@ -293,11 +300,11 @@ def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_i
         with full_disk(wal.stat().st_size + 4096), pytest.raises(CatalogError, match=f"{path}: .*stay in the journal"):
             store.tidy()
         assert content(store) == in_order(read_rows(path)) == rows
-    assert segments(path) == [f"catalog.journal.{n}" for n in (1, 2, 3)]
+    assert segments(path) == [f"catalog.journal.{n}" for n in (2, 3, 4)]
     copy = left_by(path)
     with full_disk(wal.stat().st_size + 4096):
         store.close()
-    assert segments(path) == [f"catalog.journal.{n}" for n in (1, 2, 3)]
+    assert segments(path) == [f"catalog.journal.{n}" for n in (2, 3, 4)]
     for catalog in (path, copy):
         assert in_order(read_rows(catalog)) == rows
         store = journaled(catalog)
@@ -305,16 +312,75 @@ def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_i
         store.close()
 
 
+def test_the_first_changes_stay_in_the_journal_if_the_disk_has_no_room_for_the_files_of_sqlite(path: Path) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    for _ in range(2):
+        with full_disk(4096), pytest.raises(CatalogError, match=f"{path}: .*stay in the journal"):
+            store.tidy()
+        assert content(store) == in_order(read_rows(left_by(path))) == [query("a")]
+    store.tidy()
+    assert segments(path) == []
+    store.close()
+    assert read_rows(path) == [query("a")]
+
+
+def test_a_file_that_was_removed_before_the_first_folding_is_not_made_again(path: Path) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    aside = path.rename(path.with_name("aside"))
+    with pytest.raises(CatalogError, match=f"{path}: .*stay in the journal"):
+        store.tidy()
+    assert not path.exists()
+    aside.rename(path)
+    store.tidy()
+    store.close()
+    assert read_rows(path) == [query("a")]
+
+
+def test_no_commit_folds_or_waits_for_the_folding_however_many_changes_wait(path: Path) -> None:
+    """A tool keeps the SQLite file locked: a thread that folds waits for a second, and fails."""
+    store = journaled(path)
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as tool:
+        tool.execute("BEGIN IMMEDIATE")
+        store.commit([Put(query("a", n)) for n in range(100_001)])
+        store.commit([Put(query("b"))])
+        with pytest.raises(CatalogError, match="stay in the journal"):
+            store.tidy()
+        store.commit([Put(query("c"))])
+        tool.execute("ROLLBACK")
+    assert in_order(read_rows(left_by(path))) == [query("a", 100_000), query("b"), query("c")]
+    store.tidy()
+    assert segments(path) == []
+    store.close()
+    assert in_order(read_rows(path)) == [query("a", 100_000), query("b"), query("c")]
+
+
+def test_a_commit_that_finds_the_journal_full_is_refused_until_the_sqlite_file_takes_the_changes(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journaled_module, "_AT_MOST", 2)
+    store = journaled(path)
+    store.commit([Put(query("a")), Put(query("b"))])
+    for _ in range(2):
+        with pytest.raises(CatalogError, match=f"{path}: expected fewer than 2 changes in its journal, got 2"):
+            store.commit([Put(query("c"))])
+    assert content(store) == in_order(read_rows(left_by(path))) == [query("a"), query("b")]
+    store.tidy()
+    store.commit([Put(query("c"))])
+    store.close()
+    assert in_order(read_rows(path)) == [query("a"), query("b"), query("c")]
+
+
 def test_who_is_interrupted_while_he_folds_loses_nothing_that_was_committed(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journaled_module, "_AT_MOST", 0)
     store = journaled(path)
     store.commit([Put(query("a"))])
     with monkeypatch.context() as patch:
         patch.setattr(Segment, "close", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            store.commit([Put(query("b"))])
+            store.tidy()
     assert content(store) == [query("a")]
     store.commit([Put(query("c"))])
     assert in_order(read_rows(left_by(path))) == [query("a"), query("c")]
@@ -444,7 +510,9 @@ class Worker:
 @pytest.fixture
 def ledger(path: Path) -> tuple[CommitLog, Loop, JournaledStore]:
     loop, worker, store = Loop(), Worker(), journaled(path)
-    return CommitLog("app", RegistrarConfig("app"), store, loop, worker), loop, store  # type: ignore[arg-type]
+    lock = threading.RLock()
+    lock.acquire()  # as a registrar does before it commits: the test's own thread is the only one here
+    return CommitLog("app", RegistrarConfig("app"), store, loop, worker, lock), loop, store  # type: ignore[arg-type]
 
 
 def commit(ledger: CommitLog, *rows: Row) -> None:
@@ -475,6 +543,7 @@ def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room
     path: Path, ledger: tuple[CommitLog, Loop, JournaledStore], caplog: pytest.LogCaptureFixture
 ) -> None:
     noted, loop, store = ledger
+    open_tables(store)
     wal = path.with_name(path.name + "-wal")
     row = part("large", os.urandom(20_000))
     commit(noted, row)
@@ -484,7 +553,7 @@ def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room
             noted.save()
     assert 3 <= caplog.text.count("app: ") <= 6
     assert f"{path}: expected to take 1 change(s) from its journal" in caplog.text
-    assert (content(store), segments(path)) == ([row], ["catalog.journal.1"])
+    assert (content(store), segments(path)) == ([row], ["catalog.journal.2"])
     assert read_rows(left_by(path)) == [row]
     loop.advance(1.0)
     assert (segments(path), loop.timers) == ([], [])
@@ -547,7 +616,7 @@ def test_damage_is_refused_by_name_with_its_journal_as_it_is_or_set_aside_with_i
             path.parent.mkdir(exist_ok=True)
             file.rename(path.parent / file.name)
         if spoil is Path.unlink:
-            path.with_name("catalog.sqlite3-wal").unlink()
+            path.with_name("catalog.sqlite3-wal").unlink(missing_ok=True)
         spoil(path)
         lock = path.with_name("catalog.lock")
         lock.unlink()

@@ -12,10 +12,10 @@ import pytest
 
 from rr_actors.base.errors import CatalogDamaged, CatalogError, ConfigError, RrError
 from rr_actors.base.folder import Folder, NotAFile
+from rr_actors.hosting.run_files import Watched
 from rr_actors.registrar.model.rows import Peer, Put, rows_of
 from rr_actors.storage.opening import open_store
 from rr_actors.storage.witness import Known, Witness
-from rr_actors.system.hosting.run_files import Watched
 from rr_actors.wire.name_service import Directory, open_state_dir
 from rr_actors.wire.unix_sockets import SocketDir
 
@@ -139,6 +139,35 @@ def test_what_is_planted_while_a_catalog_is_open_is_not_written_to(
     assert planted.target_is_as_it_was()
     store.close()
     assert planted.target_is_as_it_was()
+
+
+@pytest.mark.parametrize("location", ["maker", "rooms/maker"])
+def test_a_link_in_the_place_of_a_catalogs_own_directory_is_refused_and_what_it_leads_to_left_as_it_is(
+    tmp_path: Path, location: str
+) -> None:
+    state, target = tmp_path / "state", tmp_path / "precious"
+    state.mkdir()
+    target.mkdir()
+    (target / "maker").mkdir()
+    target.chmod(0o775)
+    (target / "maker").chmod(0o775)
+    first = state / Path(location).parts[0]
+    first.symlink_to(target)
+    with pytest.raises(CatalogError, match="expected a directory of the catalog's own, got a symbolic link"):
+        open_store(state / location / "catalog.sqlite3", witness=Witness(state, "maker"))
+    assert first.is_symlink()
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (target, target / "maker")] == [0o775, 0o775]
+    assert [path.name for path in target.rglob("*")] == ["maker"]
+
+
+def test_a_location_that_a_user_has_chosen_may_be_a_link(tmp_path: Path) -> None:
+    state, other = tmp_path / "state", tmp_path / "other"
+    state.mkdir()
+    other.mkdir()
+    chosen = tmp_path / "chosen"
+    chosen.symlink_to(other)
+    open_store(chosen / "catalog.sqlite3", witness=Witness(state, "maker")).close()
+    assert (other / "catalog.sqlite3").exists()
 
 
 @pytest.mark.parametrize("plant", PLANTS)

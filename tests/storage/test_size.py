@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Query, Resource, State, rows_of
+from rr_actors.registrar.model.store import Store
 from rr_actors.storage import sqlite_store
 from rr_actors.storage.opening import Durability, open_store, read_rows
-from rr_actors.storage.store import Store
 from support import REPOSITORY
 from support_slow import few_now
 

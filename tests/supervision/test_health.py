@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import re
@@ -20,11 +21,35 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.specs import Backoff
-from rr_actors.supervision.heartbeat import Health
+from rr_actors.supervision.heartbeat import Health, Heartbeat
 from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_gone, wait_respawned
 from support_children import hear
 
 Start = Callable[..., rr.System]
+
+
+def test_time_without_a_processor_does_not_count_for_a_heartbeat() -> None:
+    limit_s = 0.02
+    starved = [0.0, limit_s, 2 * limit_s, 3 * limit_s]  # for as long as it was waited, three times; then no more
+    killed: list[tuple[str, int]] = []
+
+    def starved_s() -> float:
+        return starved.pop(0) if len(starved) > 1 else starved[0]
+
+    async def beat() -> None:
+        dead = asyncio.Event()
+
+        def kill(why: str) -> None:
+            killed.append((why, len(starved)))
+            dead.set()
+
+        heartbeat = Heartbeat(limit_s, lambda: None, kill, starved_s)
+        await asyncio.wait_for(dead.wait(), 10)
+        heartbeat.stop()
+
+    asyncio.run(beat())
+
+    assert killed == [("hung: its loop had not answered for 0.02 s (heartbeat_s)", 1)]
 
 
 class Frozen(rr.Manager):

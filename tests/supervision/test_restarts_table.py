@@ -8,7 +8,15 @@ from typing import Any
 
 import pytest
 
-from rr_actors.base.errors import AlreadyPresent, AlreadyStarted, ChildRestarting, ChildRunning, NotForDynamic, NotFound
+from rr_actors.base.errors import (
+    AlreadyPresent,
+    AlreadyStarted,
+    ChildRestarting,
+    ChildRunning,
+    NotForDynamic,
+    NotFound,
+    StartFailed,
+)
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.restarts import needs_restart
 from rr_actors.supervision.core.state import Exit, Phase, StopChild
@@ -421,3 +429,59 @@ def test_the_stop_action_says_how_long_it_may_take() -> None:
         seen.append(action)
         made.finish_stop(id)
     assert [(action.id, action.shutdown_s) for action in seen] == [("c", "infinity"), ("b", "brutal_kill"), ("a", 2.5)]
+
+
+# -- deaths in callbacks of resources ----------------------------------------------------------------------------------
+
+
+def died(callback: str = "") -> StartFailed:
+    """The failure of a start whose process died, perhaps while a callback of a resource ran."""
+    return StartFailed("exit code 3 before it was ready", id="b", **({"callback": callback} if callback else {}))
+
+
+def fails(made: World, id: str, error: StartFailed) -> None:
+    run = made.starts.pop(id).run
+    made.take(restarts.decide_start_failed(made.tree, id, run, error, made.now))
+
+
+def test_a_death_in_a_callback_of_a_resource_does_not_count_once_the_next_run_says_so() -> None:
+    made = world(child("a"), child("b"))
+    for _ in range(20):
+        made.exit("b", "killed")
+        assert [restart.id for restart in made.tree.restarts] == ["b"]
+        made.take(restarts.decide_uncounted(made.tree, "b", made.tree.children["b"].run))
+        assert made.tree.restarts == ()
+        made.settle()
+    assert made.states()["b"] == "running"
+
+
+def test_other_deaths_count_beside_those_in_callbacks_of_resources() -> None:
+    made = world(child("a"), child("b"))
+    made.exit("b", "killed")
+    made.settle()
+    made.exit("b", "killed")
+    made.take(restarts.decide_uncounted(made.tree, "b", made.tree.children["b"].run))
+    made.take(restarts.decide_uncounted(made.tree, "b", made.tree.children["b"].run))
+    assert [restart.id for restart in made.tree.restarts] == ["b"]
+
+
+def test_a_late_word_of_an_earlier_run_changes_nothing() -> None:
+    made = world(child("a"), child("b"))
+    earlier = made.tree.children["b"].run
+    made.exit("b", "killed")
+    before = made.tree
+    assert restarts.decide_uncounted(before, "b", earlier) == (before, [])
+
+
+def test_a_start_that_died_in_a_callback_of_a_resource_is_made_again_and_must_be_confirmed() -> None:
+    made = world(child("a"), child("b"))
+    made.exit("b", "killed")
+    counted = len(made.tree.restarts)
+    for _ in range(20):
+        fails(made, "b", died("the recover callback of shop/thing"))
+        assert len(made.tree.restarts) == counted
+        made.take(restarts.decide_uncounted(made.tree, "b", made.tree.children["b"].run))
+        counted = len(made.tree.restarts)
+    fails(made, "b", died("the recover callback of shop/thing"))
+    fails(made, "b", died("the recover callback of shop/thing"))  # nobody has said that it was so
+    assert len(made.tree.restarts) == counted + 1

@@ -294,6 +294,18 @@ def test_a_misspelt_key_of_a_tree_file_is_named_with_the_one_that_is_near(tmp_pa
             Supervisor.from_toml(written(tmp_path, text))
 
 
+def test_a_module_of_a_tree_file_that_ends_the_program_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "leaves_at_import.py").write_text("import sys\nsys.exit('no camera is attached')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    file = written(tmp_path, "[[children]]\nactor = 'leaves_at_import:Thing'")
+    with pytest.raises(
+        ConfigError, match=r"actor: .* got 'leaves_at_import:Thing' \(SystemExit: no camera is attached\)"
+    ):
+        Supervisor.from_toml(file)
+
+
 def test_the_name_of_a_field_in_python_is_no_key_of_a_tree_file(tmp_path: Path) -> None:
     for text, key in ((ACTOR, r"children\[0\]\.actor_class_or_manager"), ("children = []\n", "actor_class_or_manager")):
         file = written(tmp_path, f"{text}actor_class_or_manager = 'a:B'")

@@ -40,7 +40,7 @@ from rr_actors.base.errors import (
 from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
 from rr_actors.supervision.event_history import History, Record
-from rr_actors.wire.name_service import Entry, Status, actor_key, open_state_dir, registrar_key
+from rr_actors.wire.name_service import NameEntry, Presence, actor_key, open_state_dir, registrar_key
 from support import Gate, eventually, lives, quickly, wait_gone
 from support_supervision import Idle, Log, SlowToRegister, StuckManager, Threaded, Tree, Worker, let_go
 
@@ -492,7 +492,7 @@ def test_children_are_added_stopped_restarted_and_deleted(plant: Plant, log: Log
     assert [child.id for child in supervisor.which_children()] == ["a"]
     with pytest.raises(NotFound):
         supervisor.terminate_child("b")
-    assert tree.node.directory.lookup(actor_key("root/b")) == Entry(Status.GONE, "")
+    assert tree.node.directory.lookup(actor_key("root/b")) == NameEntry(Presence.GONE, "")
     assert supervisor.get_childspec("a").id == "a"
 
 
@@ -906,7 +906,7 @@ def test_a_manager_that_fails_after_it_was_abandoned_leaves_its_successors_regis
     assert not served.closed
 
 
-def _registrar(tree: Tree, name: str) -> Status | None:
+def _registrar(tree: Tree, name: str) -> Presence | None:
     entry = tree.node.directory.lookup(registrar_key(name))
     return None if entry is None else entry.status
 
@@ -915,16 +915,16 @@ def _registrar(tree: Tree, name: str) -> Status | None:
 def test_the_directory_says_where_a_managers_registrar_is(plant: Plant, placement: Any) -> None:
     tree = plant(ChildSpec(Idle, id="shop", placement=placement), ChildSpec(Idle, id="store", restart="temporary"))
     supervisor = tree.supervisor()
-    assert _registrar(tree, "shop") is Status.UP
+    assert _registrar(tree, "shop") is Presence.UP
     supervisor.terminate_child("shop")
-    assert _registrar(tree, "shop") is Status.STOPPED
+    assert _registrar(tree, "shop") is Presence.STOPPED
     supervisor.restart_child("shop")
-    assert _registrar(tree, "shop") is Status.UP
+    assert _registrar(tree, "shop") is Presence.UP
     supervisor.terminate_child("shop")
     supervisor.delete_child("shop")
-    assert _registrar(tree, "shop") is Status.GONE
+    assert _registrar(tree, "shop") is Presence.GONE
     tree.kill("root/store")
-    eventually(lambda: _registrar(tree, "store") is Status.GONE)
+    eventually(lambda: _registrar(tree, "store") is Presence.GONE)
 
 
 def test_managers_added_below_a_supervisor_that_is_killed_are_gone_and_the_others_come_back(plant: Plant) -> None:
@@ -933,11 +933,11 @@ def test_managers_added_below_a_supervisor_that_is_killed_are_gone_and_the_other
     eventually(
         lambda: [e["path"] for e in tree.events if e["kind"] == "manager"] == ["root/inner/shop", "root/inner/added"]
     )
-    assert (_registrar(tree, "shop"), _registrar(tree, "added")) == (Status.UP, Status.UP)
+    assert (_registrar(tree, "shop"), _registrar(tree, "added")) == (Presence.UP, Presence.UP)
     pid = tree.kill("root/inner")
     tree.pid("root/inner", not_=pid)
-    assert _registrar(tree, "shop") is Status.UP
-    eventually(lambda: _registrar(tree, "added") is Status.GONE)
+    assert _registrar(tree, "shop") is Presence.UP
+    eventually(lambda: _registrar(tree, "added") is Presence.GONE)
     with pytest.raises(pykka.ActorDeadError):
         tree.ask("root/inner/added", "anything")
 
@@ -951,8 +951,8 @@ def test_a_supervisor_that_gives_up_takes_leave_of_the_managers_added_to_it(
     tree.supervisor("root/inner").start_child(ChildSpec(Idle, id="added", placement="thread"))
     tree.kill("root/inner/a")
     eventually(lambda: tree.records("restarted"))
-    assert _registrar(tree, "shop") is Status.UP
-    assert _registrar(tree, "added") is Status.GONE
+    assert _registrar(tree, "shop") is Presence.UP
+    assert _registrar(tree, "added") is Presence.GONE
 
 
 def take_all_threads(workers: Workers, gate: Gate) -> None:

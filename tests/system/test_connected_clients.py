@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import gc
 import os
 import select
 import signal
@@ -31,10 +33,10 @@ from rr_actors.base.errors import (
     UsageError,
 )
 from rr_actors.base.values.canonical import encode
-from rr_actors.system.console import console_client, console_questions
-from rr_actors.system.console.client_registrars import ClientRegistrars
+from rr_actors.system.console import connected_client, console_client, console_server, console_view
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
-from rr_actors.system.console.console_messages import Find, Hold, Holding
+from rr_actors.system.console.console_commands import Hold
+from rr_actors.system.console.console_questions import Find
 from rr_actors.wire.unix_sockets import Peer
 from support import LIMIT_S, TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
 from support_interrupts import interrupted
@@ -143,6 +145,41 @@ def test_what_is_closed_is_released(client: rr.Client, provider: rr.Registrar) -
         client.open_registrar("worker")
 
 
+def test_clients_are_counted_and_not_their_connections(start: Start, state_dir: Path) -> None:
+    system = start(config=rr.SystemConfig(clients_limit=3))
+    serve(system.open_registrar("provider"), "camera")
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(rr.connect(state_dir)) for _ in range(3)]
+        for number, client in enumerate(clients):
+            for name in ("a", "b"):  # each has a connection of its own
+                client.open_registrar(f"{name}{number}").load("provider/camera", "front")
+        with pytest.raises(Unavailable, match=r"3 clients are connected already: .* clients_limit"):
+            rr.connect(state_dir)
+        clients.pop().close()
+        clients[0].open_registrar("another").load("provider/camera", "front")
+        eventually(lambda: connects(state_dir))
+
+
+def connects(state_dir: Path) -> bool:
+    """Return whether there is room for one more client now."""
+    try:
+        rr.connect(state_dir).close()
+    except Unavailable:
+        return False
+    return True
+
+
+def test_a_client_has_a_limited_number_of_connections_and_the_others_go_on(
+    client: rr.Client, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = client.open_registrar("first")
+    monkeypatch.setattr(console_server, "CONNECTIONS_LIMIT", 1)
+    with pytest.raises(Unavailable, match="this client has 1 connections already"):
+        client.open_registrar("more")
+    first.load("provider/camera", "front")
+    eventually(lambda: connects(state_dir))  # the refused connection counts until the console has closed it
+
+
 def test_a_response_has_the_type_that_the_client_asks_for(start: Start, workshop: Workshop, state_dir: Path) -> None:
     start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     with rr.connect(state_dir) as client:
@@ -161,6 +198,189 @@ def test_a_query_has_the_state_of_its_last_status(client: rr.Client, provider: r
     provider.send_status(query.id, rr.Status("WARNING", "dirty"))
 
     eventually(lambda: query.fetch_state() == "WARNING")
+
+
+def test_a_query_begins_with_the_state_that_the_resource_has_already(client: rr.Client, provider: rr.Registrar) -> None:
+    first = client.open_registrar("worker").load("provider/camera", "front")
+    provider.send_status(first.id, rr.Status("WARNING", "dirty"))
+    assert first.wait_status(timeout_s=LIMIT_S).state == "WARNING"
+
+    assert client.open_registrar("other").load("provider/camera", "front").state == "WARNING"
+
+
+def test_statuses_reach_a_client_as_they_reach_the_application(client: rr.Client, provider: rr.Registrar) -> None:
+    worker, own, of_server = client.open_registrar("worker"), Calls(), Calls()
+    worker.on_status("provider/camera", of_server)
+
+    async def on_status(status: rr.Status) -> None:
+        await asyncio.sleep(0)
+        own(status)
+
+    query = worker.load("provider/camera", "front", on_status=on_status)
+    provider.send_status(query.id, rr.Status("WARNING", "dirty"))
+    provider.update_response(query.id, "a new response", "cleaned")
+
+    heard = [query.wait_status(timeout_s=LIMIT_S) for _ in range(2)]
+    assert [(status.state, status.message) for status in heard] == [("WARNING", "dirty"), ("UPDATE", "cleaned")]
+    assert {(status.query_id, status.resource_id) for status in heard} == {(query.id, query.resource_id)}
+    assert (query.response, query.state) == ("a new response", rr.State.UPDATE)
+    eventually(lambda: list(own) == list(of_server) == heard)
+
+
+def test_a_client_that_is_slow_hears_all_statuses_in_their_order(client: rr.Client, provider: rr.Registrar) -> None:
+    gate, heard = Gate(), Calls()
+
+    def on_status(status: rr.Status) -> None:
+        gate()
+        heard(status.message)
+
+    query = client.open_registrar("worker").load("provider/camera", "front", on_status=on_status)
+    sent = [str(number) for number in range(2500)]
+    for message in sent:
+        provider.send_status(query.id, rr.Status("WARNING", message))
+    gate.open()
+    assert heard.wait(len(sent)) == sent
+    eventually(lambda: provider.stats()["notices"] == 0)
+
+
+def test_a_client_hears_all_statuses_that_come_before_the_answer_to_its_load(
+    client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = [str(number) for number in range(200)]
+    heard = Calls()
+    views = vars(connected_client)["_ClientViews"]
+    add = views.add
+
+    def add_late(self: Any, query: Any, options: Any) -> None:
+        for message in sent:
+            provider.send_status(query.id, rr.Status("WARNING", message))
+        eventually(lambda: provider.stats()["notices"] == 0)
+        add(self, query, options)
+
+    monkeypatch.setattr(views, "add", add_late)
+    client.open_registrar("worker").load("provider/camera", "front", on_status=lambda status: heard(status.message))
+    assert heard.wait(len(sent)) == sent
+
+
+def test_a_status_callback_that_raises_is_logged_and_the_next_status_is_heard(
+    client: rr.Client, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard = Calls()
+
+    def on_status(status: rr.Status) -> None:
+        heard(status.message)
+        raise ValueError("the callback's own")
+
+    query = client.open_registrar("worker").load("provider/camera", "front", on_status=on_status)
+    for message in ("one", "two"):
+        provider.send_status(query.id, rr.Status("WARNING", message))
+
+    eventually(lambda: list(heard) == ["one", "two"])
+    eventually(lambda: caplog.text.count("the callback's own") >= 2)
+
+
+def test_a_client_loads_and_unloads_by_every_form_that_the_application_has(
+    client: rr.Client, provider: rr.Registrar
+) -> None:
+    worker = client.open_registrar("worker")
+    later = worker.load("provider/camera", "a", block=False)
+    assert later.get(timeout=LIMIT_S).request == "a"
+    with worker.load_all([("provider/camera", "b"), ("provider/camera", "c")]) as (b, c):
+        assert (b.request, c.request) == ("b", "c")
+        assert len(worker.queries()) == 3
+    assert len(worker.queries()) == 1
+    worker.unload_client("provider/camera")
+    assert worker.queries() == []
+
+    async def use() -> None:
+        async with await worker.load_async("provider/camera", "d") as query:
+            assert query.request == "d"
+        query = await worker.load_async("provider/camera", "e")
+        await query.unload_async()
+        async with await worker.load_all_async([("provider/camera", "f")]):
+            assert len(worker.queries()) == 1
+        await worker.unload_async(await worker.load_async("provider/camera", "g"))
+
+    asyncio.run(use())
+    assert worker.queries() == []
+    worker.load("provider/camera", "h")
+    worker.unload_all()
+    assert provider.resources() == []
+
+
+def test_of_a_clients_group_all_are_held_or_none(client: rr.Client, camera: Served, provider: rr.Registrar) -> None:
+    worker = client.open_registrar("worker")
+
+    with pytest.raises(rr.UnknownServer) as raised:
+        worker.load_all([("provider/camera", "front"), ("provider/none", "back")])
+
+    assert raised.value.__notes__[0].startswith("load_all: request 2 of 2, provider/none")
+    eventually(lambda: worker.queries() == [])
+    eventually(lambda: provider.resources() == [])
+
+
+def test_a_block_with_a_clients_query_ends_well_if_its_provider_took_the_resource_away(
+    client: rr.Client, provider: rr.Registrar
+) -> None:
+    worker = client.open_registrar("worker")
+    with worker.load("provider/camera", "front") as query:
+        provider.unload(query.resource_id, force=True)
+
+
+def test_a_block_with_a_clients_query_hides_no_error_of_its_own(client: rr.Client, provider: rr.Registrar) -> None:
+    def block() -> None:
+        with client.open_registrar("worker").load("provider/camera", "back") as query:
+            provider.unload(query.resource_id, force=True)
+            raise KeyError("the block's own")
+
+    with pytest.raises(KeyError, match="the block's own"):
+        block()
+
+
+def test_a_client_gives_and_fetches_priorities(client: rr.Client, provider: rr.Registrar) -> None:
+    def served() -> list[int | None]:
+        return [info.priority for info in provider.resources()]
+
+    with client.open_registrar("worker") as worker:
+        query = worker.load("provider/camera", "front", priority=5)
+        assert (query.priority, served()) == (5, [5])
+        query.priority = 8
+        assert query.priority == 8
+        assert eventually(lambda: served() == [8])
+        query.standby()
+        assert [row.priority for row in worker.queries()] == [None]
+        assert eventually(lambda: served() == [None])
+        with pytest.raises(rr.UsageError, match="priority: expected a whole number from -1000 to 1000"):
+            query.priority = 1001
+        with pytest.raises(rr.UsageError, match="priority: expected a whole number from -1000 to 1000"):
+            worker.load("provider/camera", "rear", priority=True)
+        (other,) = worker.load_all([("provider/camera", "front")], priority=3)
+        assert eventually(lambda: served() == [3])
+        other.unload()
+        query.unload()
+        with pytest.raises(rr.UnknownQuery, match=query.id):
+            query.priority = 1
+
+
+def test_what_a_client_may_not_do_says_why(client: rr.Client, provider: rr.Registrar) -> None:
+    worker = client.open_registrar("worker")
+    query = worker.load("provider/camera", "front")
+    with pytest.raises(UsageError, match="only the application takes a resource away"):
+        worker.unload(query.resource_id, force=True)
+    with pytest.raises(UsageError, match="a client serves nothing"):
+        worker.load("provider/camera", "back", parent=query)
+    with pytest.raises(UsageError, match="progress is heard only in the process that holds the query"):
+        worker.load("provider/camera", "back", progress=print)
+    assert [row.id for row in worker.queries()] == [query.id]
+
+
+def test_a_clients_query_of_which_no_one_has_the_registrar_is_released(
+    client: rr.Client, provider: rr.Registrar
+) -> None:
+    client.open_registrar("worker").load("provider/camera", "front")
+    gc.collect()
+
+    eventually(lambda: provider.resources() == [])
 
 
 def test_errors_are_those_of_the_system(client: rr.Client, provider: rr.Registrar) -> None:
@@ -282,19 +502,19 @@ def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
     client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate, worker = Gate(), client.open_registrar("worker")
-    hold = ClientRegistrars.hold
+    hold = Hold.carry_out
 
     def held(*command: Any) -> Any:
         answer = hold(*command)
         gate()
         return answer
 
-    monkeypatch.setattr(ClientRegistrars, "hold", held)
+    monkeypatch.setattr(Hold, "carry_out", held)
     connection = client._connections.open()
 
     def load() -> None:
         with pytest.raises(NotRunning):
-            connection.ask(Hold("client.worker", "provider/camera", encode("front")), Holding)
+            connection.ask(Hold("client.worker", "provider/camera", encode("front")))
 
     loading = threading.Thread(target=load)
     loading.start()
@@ -311,9 +531,11 @@ def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
 def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
     client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    worker, copies = client.open_registrar("worker"), list[socket.socket]()
+    worker, copies, receive = client.open_registrar("worker"), list[socket.socket](), ConsoleClient._receive
 
-    def interrupted(connection: ConsoleClient, _timeout_s: float) -> None:
+    def interrupted(connection: ConsoleClient, timeout_s: float | None) -> Any:
+        if threading.current_thread() is not threading.main_thread():  # it waits for statuses
+            return receive(connection, timeout_s)
         assert select.select([connection._socket], [], [], LIMIT_S)[0]
         copies.append(connection._socket.dup())  # as a child has one that was forked while the connection was made
         raise KeyboardInterrupt
@@ -348,7 +570,7 @@ def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
     client: rr.Client, provider: rr.Registrar
 ) -> None:
     worker, connection = client.open_registrar("worker"), client._connections.open()
-    held = connection.ask(Hold("client.worker", "provider/camera", encode("front")), Holding)
+    held = connection.ask(Hold("client.worker", "provider/camera", encode("front")))
     connection.keep()
     connection.close()
 
@@ -362,7 +584,7 @@ def test_a_load_whose_connection_asks_for_something_else_before_its_keep_is_rele
 ) -> None:
     worker, connection = client.open_registrar("worker"), client._connections.open()
     for request in ("front", "rear"):
-        held = connection.ask(Hold("client.worker", "provider/camera", encode(request)), Holding)
+        held = connection.ask(Hold("client.worker", "provider/camera", encode(request)))
     connection.keep()
     connection.close()
 
@@ -558,6 +780,6 @@ def test_queries_that_are_not_known_are_no_empty_list(client: rr.Client, monkeyp
     worker = client.open_registrar("worker")
     query = worker.load("provider/camera", "front")
     assert [row.id for row in worker.queries()] == [query.id]
-    monkeypatch.setattr(console_questions, "page", refuse)
+    monkeypatch.setattr(console_view, "page", refuse)
     with pytest.raises(Unavailable, match=r"client.worker: its queries are not known: .*does not answer"):
         worker.queries()

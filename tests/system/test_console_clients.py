@@ -22,26 +22,25 @@ from rr_actors.base.errors import Unavailable
 from rr_actors.base.values.canonical import encode
 from rr_actors.system.console import console_client, console_server
 from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_commands import Hold, Load
 from rr_actors.system.console.console_messages import (
     ANSWER_LIMIT_BYTES,
     REQUEST_LIMIT_BYTES,
     VERSION,
-    Answer,
     Children,
     Follow,
     Hello,
-    Hold,
     Keep,
-    ListChildren,
-    ListResources,
-    Load,
     Refused,
     Resources,
     Welcome,
 )
+from rr_actors.system.console.console_protocol import ANSWERS, decoder_of
+from rr_actors.system.console.console_questions import ListChildren, ListResources
 from rr_actors.wire import unix_sockets
 from rr_actors.wire.frames import FrameReader, framed
 from support import Gate, Served, eventually, serve
+from support_inside import console_of, node_of
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
 
@@ -65,7 +64,7 @@ def dialled(system: rr.System, state_dir: Path) -> Iterator[Callable[[], socket.
 
 def said_until_cut_off(peer: socket.socket) -> list[Any]:
     """The answers until the other end closes the connection."""
-    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
+    reader = FrameReader[Any](decoder_of(ANSWERS), ANSWER_LIMIT_BYTES)
     answers: list[Any] = []
     with contextlib.suppress(ConnectionError):
         while data := peer.recv(65536):
@@ -125,7 +124,7 @@ def test_a_keep_is_no_greeting(dialled: Callable[[], socket.socket]) -> None:
     (said,) = said_until_cut_off(peer)
 
     assert isinstance(said, Refused)
-    assert "expected Hello of version 3, got Keep" in said.failure.message
+    assert f"expected Hello of version {VERSION}, got Keep" in said.failure.message
 
 
 @pytest.mark.parametrize("begin", [b"", HELLO[:3], HELLO[:-1], HELLO + b"\0\0", HELLO + b"\0\0\1\0abc"])
@@ -200,8 +199,7 @@ def test_a_client_that_asks_on_and_on_and_never_reads_has_one_answer_waiting_and
     peer.sendall(HELLO)
     peer.setblocking(False)
     request = framed(ListResources(), 1000)
-    console = system._console
-    assert console is not None
+    console = console_of(system)
     connection: Any = eventually(lambda: next((one for one in console.connections if one._greeted), None))
     with contextlib.suppress(ConnectionError):
         for _ in range(100_000):
@@ -220,7 +218,7 @@ def test_many_requests_at_once_are_answered_in_their_order(
 ) -> None:
     peer = dialled()
     peer.sendall(HELLO + framed(ListChildren(), 1000) * 20 + framed(ListResources(), 1000))
-    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
+    reader = FrameReader[Any](decoder_of(ANSWERS), ANSWER_LIMIT_BYTES)
     answers: list[Any] = []
     while len(answers) < 22:
         answers += reader.feed(peer.recv(65536))
@@ -228,11 +226,13 @@ def test_many_requests_at_once_are_answered_in_their_order(
     assert [type(answer) for answer in answers] == [Welcome, *[Children] * 20, Resources]
 
 
-def test_a_request_after_follow_is_refused(dialled: Callable[[], socket.socket], system: rr.System) -> None:
+@pytest.mark.parametrize("before", [b"", framed(ListChildren(), 1000)], ids=["at once", "behind a request"])
+def test_a_request_after_follow_is_refused(
+    dialled: Callable[[], socket.socket], system: rr.System, before: bytes
+) -> None:
     peer = dialled()
-    peer.sendall(HELLO + framed(Follow(), 1000))
-    node = system._node
-    assert node is not None
+    peer.sendall(HELLO + before + framed(Follow(), 1000))
+    node = node_of(system)
     eventually(lambda: bool(node.watched))
     peer.sendall(framed(ListChildren(), 1000))
 
@@ -288,11 +288,10 @@ def leave_unread(system: rr.System, app: rr.Registrar, peer: socket.socket) -> A
     app.load_all([("provider/thing", "x" * 300 + str(number)) for number in range(30)])
     peer.sendall(HELLO)
     assert peer.recv(1000)
-    console = system._console
-    assert console is not None
+    console = console_of(system)
     (connection,) = console.connections
     with ConsoleClient(find_console(system.state_dir)) as client:
-        length = len(framed(client.ask(ListResources(), Resources), ANSWER_LIMIT_BYTES))
+        length = len(framed(client.ask(ListResources()), ANSWER_LIMIT_BYTES))
     for number in range(1, 1000):
         peer.sendall(framed(ListResources(), 1000))
         eventually(lambda number=number: _waiting(peer) + _unsent(connection) == number * length)
@@ -326,8 +325,7 @@ def test_a_client_that_is_to_leave_and_does_not_read_is_cut_off(
     monkeypatch.setattr(console_server, "STALLED_S", 0.3)
     peer = dialled()
     connection = leave_unread(system, app, peer)
-    console = system._console
-    assert console is not None
+    console = console_of(system)
 
     how(peer)
 
@@ -340,7 +338,7 @@ def test_a_client_that_leaves_with_requests_unread_is_noticed_while_its_first_on
 ) -> None:  # fmt: skip
     monkeypatch.setattr(console_server, "LOOK_S", 0.1)
     serve(provider, "slow", load=gate)
-    console, peer = system._console, dialled()
+    console, peer = console_of(system), dialled()
     assert console is not None
     peer.sendall(HELLO + framed(Load("provider/slow", "1", keep=True), 1000) + framed(ListChildren(), 1000))
     gate.wait_arrived()
@@ -357,7 +355,7 @@ def test_a_load_that_its_client_cannot_hear_of_any_more_is_released_once(
     dialled: Callable[[], socket.socket], caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     slow = serve(provider, "slow", load=gate)
-    console, peer = system._console, dialled()
+    console, peer = console_of(system), dialled()
     assert console is not None
     connection = leave_unread(system, app, peer)
     with rr.connect(system.state_dir) as client:

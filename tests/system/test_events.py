@@ -15,6 +15,7 @@ from rr_actors.runtime import backlogs
 from rr_actors.supervision.core.state import Event as Reported
 from rr_actors.supervision.event_history import Record
 from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, serve, wait_respawned
+from support_inside import node_of
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -80,6 +81,20 @@ class Worker(rr.Actor):
     pass
 
 
+def pausing(app: rr.Registrar, provider: rr.Registrar) -> None:
+    """Load what is paused and resumed, and what cannot be paused."""
+
+    def pause(request: str, response: object) -> None:
+        if request == "stuck":
+            raise ValueError(request)
+
+    serve(provider, "motor", idle="pause", pause=pause, resume=lambda request, response: None)
+    app.load("provider/motor", "stuck").unload()
+    motor = app.load("provider/motor", "front", priority=None)
+    eventually(lambda: [info.phase for info in provider.resources() if info.id == motor.resource_id] == ["paused"])
+    motor.priority = 1
+
+
 def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop: Workshop) -> None:
     heard = Calls()
     system = start(
@@ -95,6 +110,7 @@ def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop:
     app, provider = system.open_registrar("app"), system.open_registrar("provider")
     served = serve(provider, "camera")
     query = app.load("provider/camera", "front")
+    query.priority = 5
     provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "low light"))
     served.do_unload = failing
     with pytest.raises(rr.UnloadFailed):
@@ -105,7 +121,9 @@ def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop:
     with pytest.raises(rr.LoadFailed):
         app.load("provider/camera", "back")
     served.do_load = lambda _: rr.current().progress(0.5, "opening")
-    app.load("provider/camera", "left")
+    left = app.load("provider/camera", "left")
+    provider.revoke(left, "in the way")
+    pausing(app, provider)
     app.load("shop/thing", Order("wheel"))
     wait_respawned(system, "shop", kill(system, "shop"))
     worker = system.ref("worker")
@@ -196,8 +214,7 @@ def test_events_wait_for_a_free_worker(start: Start) -> None:
     waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
     gate.wait_arrived(2)
     published = Calls()
-    assert system._node is not None
-    system._node.dispatcher.call(lambda: published(system._publish({"event": "progress"})))
+    node_of(system).dispatcher.call(lambda: published(system._publish({"event": "progress"})))
     published.wait()
     gate.open()
     for reply in waiting:

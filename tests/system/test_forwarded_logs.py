@@ -40,6 +40,18 @@ class OwnLogging(rr.Manager):
         return room
 
 
+class Careless(rr.Manager):
+    """Logs by a function of the module logging, as a module does that was never part of a larger program."""
+
+    def on_start(self) -> None:
+        logging.warning("careless start")  # noqa: LOG015
+
+    @rr.server("lamp")
+    def switch_on(self, room: str) -> str:
+        log.warning("on in %s", room)
+        return room
+
+
 class Chatty(rr.Manager):
     @rr.server("line")
     def say(self, count: int) -> int:
@@ -164,6 +176,15 @@ def test_a_manager_that_configures_its_own_logging_keeps_its_records(
     system.open_registrar("app").load("lamps/lamp", "hall")
     assert "here: on in hall" in capfd.readouterr().err
     assert list(heard) == []
+
+
+def test_a_manager_that_logs_by_the_module_logging_still_reaches_the_applications_handlers(
+    start: Start, heard: Calls
+) -> None:
+    system = start(rr.ChildSpec(Careless, id="lamps"))
+    system.open_registrar("app").load("lamps/lamp", "hall")
+
+    assert [record.getMessage() for record in heard.wait(1)] == ["on in hall"]
 
 
 def test_switched_off_records_go_to_the_standard_error_of_the_child(

@@ -16,7 +16,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.runtime import interpreter
-from rr_actors.system.hosting import node
+from rr_actors.storage import opening as catalogs
 from support import REPOSITORY, Workshop, eventually, serve
 from support_managers import Order, Shop
 
@@ -70,7 +70,7 @@ def test_a_registrar_whose_opening_is_interrupted_can_be_opened_again(
     state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opening, go_on = threading.Event(), threading.Event()
-    real = node.open_store
+    real = catalogs.open_store
 
     def slowly(*args: Any, **options: Any) -> Any:
         store = real(*args, **options)
@@ -83,7 +83,7 @@ def test_a_registrar_whose_opening_is_interrupted_can_be_opened_again(
         threading.Timer(0.2, go_on.set).start()
 
     with rr.System(state_dir=state_dir) as system:
-        monkeypatch.setattr(node, "open_store", slowly)
+        monkeypatch.setattr(catalogs, "open_store", slowly)
         with interrupted(wait_and_let_go):
             system.open_registrar("app")
         monkeypatch.undo()

@@ -17,6 +17,7 @@ import rr_actors as rr
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.runtime.thread_wakeup import EventBell
 from support import Calls, Workshop, eventually, serve
+from support_inside import actor_of
 from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
 from support_managers import Order, Shop
 
@@ -108,6 +109,7 @@ def _interrupt_before_it_waits(begin: Callable[[], Any]) -> int:
         loop.close()
 
 
+@pytest.mark.filterwarnings("error:coroutine .* was never awaited")
 def test_an_awaited_load_that_is_interrupted_before_it_waits_is_withdrawn(
     app: rr.Registrar, provider: rr.Registrar
 ) -> None:
@@ -116,10 +118,10 @@ def test_an_awaited_load_that_is_interrupted_before_it_waits_is_withdrawn(
     points = _interrupt_before_it_waits(lambda: app.load_async("provider/thing", next(numbers), on_status=heard))
     assert points > 50
     eventually(lambda: (app.queries(), app.stats()["loading"], provider.resources()) == ([], 0, []))
-    assert app._actor.catalog.listened == set()  # pyright: ignore[reportPrivateUsage]
+    assert actor_of(app).catalog.listened == set()
 
 
-@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")  # the interrupt came before
+@pytest.mark.filterwarnings("error:coroutine .* was never awaited")
 @pytest.mark.parametrize("how", ["load_async", "load_all_async"])
 def test_an_awaited_load_through_a_handle_that_is_interrupted_before_it_waits_is_released(
     start: Callable[..., rr.System], workshop: Workshop, how: str

@@ -1,9 +1,10 @@
-"""What completion shows: the names in docs/names.md, and no others."""
+"""What completion shows: the names in docs/names.md, which is made from the code, and no others."""
 
 from __future__ import annotations
 
 import itertools
 import re
+import runpy
 from typing import Any
 
 import pytest
@@ -13,12 +14,13 @@ from support import REPOSITORY, serve
 
 _numbers = itertools.count()
 PAGE = REPOSITORY / "docs" / "names.md"
+MAKER = runpy.run_path(str(REPOSITORY / "docs" / "_site" / "names.py"))
 
 
 def documented() -> dict[str, set[str]]:
     """The table of the page: each class with its public names, those of its bases in the table left out."""
-    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", PAGE.read_text(), re.MULTILINE)
-    assert len(rows) == len({name for name, _ in rows})
+    rows = re.findall(r"^\| \[`(\w+)`\]\(\S+\) \| .* \| (.*) \|$", PAGE.read_text(), re.MULTILINE)
+    assert [name for name, _ in rows] == sorted(rr.__all__, key=str.lower)
     return {name: set(re.findall(r"`(\w+)`", names)) for name, names in rows}
 
 
@@ -34,11 +36,14 @@ def described(cls: type) -> set[str]:
 
 def inherited(cls: type) -> set[str]:
     """What a class has from classes that are not ours: it is in their manuals."""
-    foreign = [base for base in cls.__mro__ if not base.__module__.startswith("rr_actors")]
-    return {name for base in foreign for name in shown(base)}
+    return MAKER["foreign_names"](cls)
 
 
 CLASSES = sorted((name for name in rr.__all__ if isinstance(getattr(rr, name), type)), key=str)
+
+
+def test_the_page_is_what_the_code_says() -> None:
+    assert PAGE.read_text() == MAKER["made"](), "run: make names"
 
 
 def test_the_package_shows_what_it_exports_and_nothing_else() -> None:
@@ -55,7 +60,8 @@ def test_the_page_has_no_names_that_are_not_there(system: rr.System) -> None:
     instances = {type(value).__name__: value for value in _instances(system)}
     for name, names in documented().items():
         value = instances.get({"ActorRef": "DistantRef", "RrError": "NotFound"}.get(name, name), getattr(rr, name))
-        assert {attribute for attribute in names if not hasattr(value, attribute)} == set(), name
+        declared = set(vars(value).get("__annotations__", ())) if isinstance(value, type) else set()
+        assert {attribute for attribute in names - declared if not hasattr(value, attribute)} == set(), name
 
 
 def test_objects_show_their_documented_names_and_no_others(system: rr.System) -> None:

@@ -20,10 +20,10 @@ from opentelemetry.trace import SpanKind, StatusCode
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError, LoadError, NotFound, UsageError
+from rr_actors.registrar.links import recorder
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import Entries
-from rr_actors.system.hosting import recorder
 from rr_actors.system.recording import figures, recordings
 from rr_actors.system.recording.figures import Counters, Figure, prometheus_text
 from rr_actors.system.recording.otel_export import register_metrics
@@ -32,6 +32,7 @@ from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.traces import trace_of
 from rr_actors.wire.unix_link import UnixLink
 from support import Calls, Gate, Workshop, eventually, quickly, serve, wait_gone
+from support_inside import node_of
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -384,8 +385,7 @@ def test_figures_are_prometheus_text(shops: rr.System) -> None:
 
 
 def test_nobody_records_by_default_and_after_the_last_has_stopped(system: rr.System) -> None:
-    assert system._node is not None
-    watched = system._node.watched
+    watched = node_of(system).watched
     assert not watched.recording
     with system.record() as one, system.record() as two:
         assert watched.recording
@@ -461,8 +461,7 @@ def test_a_recording_ends_with_its_system_and_a_restart_does_not_take_it_up(
     system.stop()
     before = recording.entries()
     system.start()
-    assert system._node is not None
-    assert not system._node.watched
+    assert not node_of(system).watched
     serve(system.open_registrar("provider"), "thing")
     app = system.open_registrar("app")
     app.load("provider/thing", "y")
@@ -648,8 +647,7 @@ def test_of_an_entry_that_is_too_long_for_a_line_the_facts_are_left_out(tmp_path
 
 def test_a_console_hears_what_is_recorded_and_only_while_it_listens(shops: rr.System, state_dir: Path) -> None:
     app = shops.open_registrar("app")
-    assert shops._node is not None
-    watched = shops._node.watched
+    watched = node_of(shops).watched
     heard = Calls()
     client = ConsoleClient(find_console(state_dir))
     parts = client.record()

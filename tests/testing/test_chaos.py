@@ -23,22 +23,22 @@ import rr_actors as rr
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, Row, State
 from rr_actors.testing.callback_log import Journal, Line, check_journal, read_journal
 from rr_actors.testing.invariants import check_at_rest, check_empty, check_told
+from rr_actors.testing.load_threads import Consumer, Sent
 from rr_actors.testing.monkey import Monkey
 from rr_actors.testing.report import KILLS, Report, Tally
 from rr_actors.testing.run import Options, _harm, run  # pyright: ignore[reportPrivateUsage]
 from rr_actors.testing.soak import slope
+from rr_actors.testing.victim_managers import Want
 from rr_actors.testing.watchdog import Interrupted, Watch
 from rr_actors.tools.inspection import Contents
-from support import REPOSITORY
+from support import REPOSITORY, eventually
 
 
 @pytest.mark.slow
 def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
     shown: list[str] = []
 
-    report = run(
-        Options.of(kills=20, seconds=10.0, seed=3, state_dir=tmp_path / "state", pace_s=0.1), show=shown.append
-    )
+    report = run(Options(kills=20, seconds=10.0, seed=3, state_dir=tmp_path / "state", pace_s=0.1), show=shown.append)
 
     assert report.violations == []
     assert report.kills >= 8
@@ -47,6 +47,59 @@ def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
     assert (report.catalogs, report.catalogs_damaged) == (12, 0)
     assert any("kills" in line for line in shown)
     assert json.loads(report.json())["passed"] is True
+
+
+@pytest.fixture
+def consumer(start: Callable[..., rr.System]) -> Consumer:
+    """A consumer that does only what the test calls, and holds one thing."""
+    system = start()
+    provider = system.open_registrar("provider")
+    provider.register_server("thing", lambda request: "made", lambda request, made: None, request_type=Want)
+    found = Consumer(system, system.open_registrar("app"), ("provider/thing",), 1, Tally())
+    found.load("provider/thing", Want(1), 20.0)
+    return found
+
+
+def wrongs(consumer: Consumer) -> list[str]:
+    """What the consumer finds when everything that was sent has arrived."""
+    provider = consumer.system.registrar("provider")
+    eventually(lambda: provider.stats()["notices"] == 0)
+    consumer.check_heard()
+    return consumer.tally.violations
+
+
+def test_a_consumer_expects_nothing_of_a_resource_after_the_fatal_but_what_is_heard_then(consumer: Consumer) -> None:
+    for state in (State.WARNING, State.FATAL, State.OK, State.WARNING, State.ERROR, State.UPDATE, State.FATAL):
+        consumer.send(0, state)
+
+    assert wrongs(consumer) == []
+
+
+@pytest.mark.parametrize("state", [State.FATAL, State.UPDATE])
+def test_a_consumer_misses_what_is_heard_even_after_a_fatal(consumer: Consumer, state: State) -> None:
+    consumer.send(0, State.FATAL)
+    consumer.held[0][1].append(Sent("told-0-lost", state, time.monotonic_ns()))
+
+    assert ["told-0-lost" in wrong for wrong in wrongs(consumer)] == [True]
+
+
+@pytest.mark.parametrize("fatal", [False, True])
+def test_a_consumer_misses_what_was_sent_before_a_fatal_or_without_one(consumer: Consumer, fatal: bool) -> None:
+    consumer.held[0][1].append(Sent("told-0-lost", State.WARNING, time.monotonic_ns()))
+    consumer.send(0, State.FATAL if fatal else State.ERROR)
+
+    assert ["told-0-lost" in wrong for wrong in wrongs(consumer)] == [True]
+
+
+def test_a_consumer_has_heard_what_comes_first_as_repeated_and_finds_only_what_comes_twice_unmarked(
+    consumer: Consumer,
+) -> None:
+    query, sent = consumer.held[0]
+    sent += [Sent(f"told-0-{name}", State.OK, time.monotonic_ns()) for name in ("late", "again", "twice")]
+    for name, repeated in (("late", True), ("again", False), ("again", True), ("twice", False), ("twice", False)):
+        consumer.hear(rr.Status("OK", f"told-0-{name}", query_id=query.id, repeated=repeated))
+
+    assert ["told-0-twice 2 times" in wrong for wrong in wrongs(consumer)] == [True]
 
 
 @pytest.mark.slow
@@ -71,11 +124,11 @@ def test_a_soak_says_how_much_each_figure_grew(tmp_path: Path) -> None:
 def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
     (tmp_path / "something").touch()
     with pytest.raises(rr.UsageError, match="expected an empty directory"):
-        Options.of(state_dir=tmp_path)
+        Options(state_dir=tmp_path)
     with pytest.raises(rr.UsageError, match="churn: expected a soak with it, got none"):
-        Options.of(churn_s=1.0)
+        Options(churn_s=1.0)
     with pytest.raises(rr.UsageError, match="kills: expected a number above 0, got 0"):
-        Options.of(kills=0)
+        Options(kills=0)
 
 
 def test_on_the_command_line_they_are_refused_in_words() -> None:
@@ -108,7 +161,7 @@ def test_a_slow_pace_is_no_violation(monkeypatch: pytest.MonkeyPatch) -> None:
     chaos = sys.modules[Options.__module__]
     monkeypatch.setattr(chaos, "Monkey", SlowMonkey)
     monkeypatch.setattr(chaos, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    _harm(cast("Any", None), Options.of(kills=5, pace_s=40.0), tally, Watch(20.0), lambda line: None)
+    _harm(cast("Any", None), Options(kills=5, pace_s=40.0), tally, Watch(20.0), lambda line: None)
     assert (tally.kills, tally.violations) == (5, [])
 
 
@@ -217,8 +270,8 @@ def test_a_standstill_ends_in_its_time_is_named_and_is_a_failure(what: str, tmp_
     assert ran.returncode == 1, ran.stderr
     said = json.loads(report.read_text())
     assert said["passed"] is said["verdict"] is False
-    (violation,) = said["violations"]
-    assert violation.startswith(f"standstill: {phase}")
+    violation = said["violations"][-1]  # the last: nothing is looked for after it
+    assert violation.startswith(f"standstill: {phase}"), said["violations"]
     assert "thread chaos:" in violation  # where it stands
     assert "no verdict on the rest" in ran.stdout
     shutil.rmtree(tmp_path / "state" / "run", ignore_errors=True)  # its sockets: nobody has stopped it

@@ -81,8 +81,9 @@ def test_inspect_shows_resources_and_who_holds_them(state: Path) -> None:
 def test_inspect_as_json_is_for_programs(state: Path) -> None:
     shown = json.loads(run("inspect", state, "--json").stdout)
 
-    assert shown["cameras"]["resources"][0]["queries"] == [{"id": "q1", "origin": "app", "parent": ""}]
-    assert shown["app"]["held"][0]["registrar"] == "cameras"
+    query = {"id": "q1", "origin": "app", "parent": "", "priority": 0}
+    assert shown["cameras"]["resources"][0]["queries"] == [query]
+    assert (shown["app"]["held"][0]["registrar"], shown["app"]["held"][0]["priority"]) == ("cameras", 0)
 
 
 def test_tree_shows_dependencies_below_what_depends_on_them(state: Path) -> None:
@@ -154,8 +155,9 @@ def test_check_finds_a_part_of_a_resource_that_does_not_exist(state: Path) -> No
     assert check(read_state(state)) == ["app: held query q2 belongs to resource nowhere, which does not exist"]
 
 
-def test_check_finds_one_request_loaded_twice(state: Path) -> None:
-    write(state, "cameras", resource("r2"))
+@pytest.mark.parametrize("phase", [Phase.LOADED, Phase.PAUSED])
+def test_check_finds_one_request_loaded_twice(state: Path, phase: Phase) -> None:
+    write(state, "cameras", resource("r2", phase=phase))
 
     (violation,) = check(read_state(state))
 
@@ -219,6 +221,18 @@ def test_a_missing_extra_is_an_error_of_one_line_that_says_what_to_install(tmp_p
         [sys.executable, "-m", "rr_actors", "version"], capture_output=True, text=True, env=environment
     )
     assert_one_line_error(ran, "pip install 'rr-actors[cli]'")
+
+
+def test_chaos_gives_its_options_to_a_program_of_its_own() -> None:
+    command = [sys.executable, "-m", "rr_actors", "chaos"]
+    helped = subprocess.run([*command, "--help"], capture_output=True, text=True)
+    refused = subprocess.run([*command, "--kills", "0"], capture_output=True, text=True)
+
+    assert helped.stdout.startswith("usage: rr-actors chaos")
+    for option in ("kills", "seconds", "seed", "state-dir", "json", "soak", "churn", "pace", "patience"):
+        assert f"--{option}" in helped.stdout
+    assert refused.returncode == 2
+    assert "rr-actors chaos: error: chaos: kills: expected a number above 0, got 0" in refused.stderr
 
 
 def test_an_unknown_command_is_refused() -> None:

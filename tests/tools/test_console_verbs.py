@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -22,10 +24,23 @@ import rr_actors as rr
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
+from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools import console_verbs, graphs
-from rr_actors.tools.explanations import ago
-from support import REPOSITORY, Calls, Gate, Workshop, eventually, kill, pid_of, serve, wait_gone, wait_respawned
+from support import (
+    LIMIT_S,
+    REPOSITORY,
+    Calls,
+    Gate,
+    Workshop,
+    eventually,
+    kill,
+    pid_of,
+    serve,
+    wait_gone,
+    wait_respawned,
+)
 from support_cli import run_cli
+from support_inside import console_of, node_of
 from support_managers import Order, Shop
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
@@ -69,6 +84,100 @@ def shop(start: Start, workshop: Workshop) -> rr.System:
 def app(shop: rr.System) -> rr.Registrar:
     """A consumer in this process."""
     return shop.open_registrar("app")
+
+
+# -- waiting, and one child ------------------------------------------------------------------------------------------
+
+
+def waiting(*arguments: object) -> subprocess.Popen[str]:
+    """A command that waits."""
+    return subprocess.Popen(command("wait", *arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_script_waits_for_a_system_that_does_not_run_yet_and_then_for_its_child(
+    start: Start, workshop: Workshop, tmp_path: Path
+) -> None:
+    with waiting("shop", "--state", tmp_path / "later", "--timeout", "60") as waits:
+        start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)), state_dir=tmp_path / "later")
+        out, _ = waits.communicate(timeout=LIMIT_S)
+    assert waits.returncode == 0
+    assert out.startswith("shop: running after ")
+    assert "no system with a console" in refused(3, "wait", "shop", "--timeout", "0", "--state", tmp_path / "never")
+
+
+def test_a_script_waits_for_a_resource_its_state_and_its_end(app: rr.Registrar) -> None:
+    name = 'shop/thing {"name":"lamp","parts":[]}'
+    with waiting(name) as waits:
+        query = app.load("shop/thing", Order("lamp"))
+        assert waits.wait(LIMIT_S) == 0
+    with waiting(query.id, "--for", "warning", "--json") as waits:
+        said("status", name, "WARNING", "hot")
+        facts = json.loads(waits.communicate(timeout=LIMIT_S)[0])
+    assert (waits.returncode, facts["target"], facts["state"], facts["done"]) == (0, query.id, "WARNING", True)
+    with waiting(name, "--for", "gone") as waits:
+        query.unload()
+        assert waits.wait(LIMIT_S) == 0
+
+
+def test_a_script_waits_for_the_end_of_a_system(shop: rr.System, state_dir: Path) -> None:
+    ended, other = (waiting("shop", "--for", wanted, "--state", state_dir) for wanted in ("gone", "stopped"))
+    with ended, other:
+        eventually(lambda: console_of(shop).clients.total() == 4)
+        shop.stop()
+        assert ended.wait(LIMIT_S) == 0
+        assert other.wait(LIMIT_S) in (0, 3)  # it may have seen the child stopped before the console ended
+
+
+def test_what_a_script_waits_for_in_vain_is_told_and_nonsense_is_refused(app: rr.Registrar) -> None:
+    for number in range(2):
+        app.load("shop/thing", Order(f"lamp {number}"))
+    ran = rr_actors("wait", "shop", "--for", "stopped", "--timeout", "0.2")
+    assert ran.returncode == 1
+    assert re.fullmatch(r"shop: running after [\d.]+ s\n", ran.stderr)
+    assert "nothing: gone after" in rr_actors("wait", "nothing", "--timeout", "0").stderr
+    told = "--for: expected running, starting, restarting, stopped, OK, UPDATE, WARNING, ERROR, FATAL, loaded, loading"
+    assert told in refused(2, "wait", "shop", "--for", "happy")
+
+
+def test_the_status_of_a_child_is_on_one_screen(app: rr.Registrar, shop: rr.System) -> None:
+    app.load("shop/thing", Order("lamp"))
+    kill(shop, "shop")
+    said("wait", "shop")
+    shown = said("status", "shop").splitlines()
+    assert shown[0] == "root/shop: running"
+    assert re.fullmatch(rf"    process {pid_of(shop, 'shop')}, up for .*, 1 restart", shown[1])
+    assert re.fullmatch(r"    [\d.]+ % of a core, \d+ MiB", shown[2])
+    assert shown[3].startswith("    registrar shop: up, serves shop/thing")
+    assert [word for line in shown for word in ("started", "exited") if word in line] == [
+        "started",
+        "exited",
+        "started",
+    ]
+    facts = json.loads(said("status", "root/shop", "--json"))
+    assert (facts["restarts"], len(facts["history"]), facts["registrars"][0]["name"]) == (1, 3, "shop")
+
+    said("terminate", "shop")
+    ran = rr_actors("status", "shop")
+    assert (ran.returncode, ran.stdout.splitlines()[0]) == (1, "root/shop: stopped")
+
+
+def test_the_status_of_a_resource_is_explained_and_of_nothing_refused(app: rr.Registrar) -> None:
+    query = app.load("shop/thing", Order("lamp"))
+    assert _without_ids_and_times(said("status", query.id)) == _without_ids_and_times(said("why", query.id))
+    assert "no query and no resource" in refused(2, "status", "nothing")
+
+
+def test_a_resource_is_revoked_from_outside(app: rr.Registrar) -> None:
+    heard: list[rr.Status] = []
+    query = app.load("shop/thing", Order("lamp"), on_status=heard.append)
+    name = 'shop/thing {"name":"lamp","parts":[]}'
+    assert said("revoke", name, "low battery", "--dry-run").startswith(f"would revoke {name} (")
+    assert said("revoke", name, "low battery", "--grace", "20").endswith(" from 1 holder\n")
+    assert [(str(status.state), status.message, status.reason) for status in heard] == [
+        ("FATAL", "low battery", "revoked")
+    ]
+    assert app.queries() == []
+    assert "no registrar serves a resource" in refused(2, "revoke", query.id, "again")
 
 
 # -- finding it ------------------------------------------------------------------------------------------------------
@@ -143,19 +252,100 @@ def test_ps_shows_each_child_with_its_process(shop: rr.System) -> None:
     assert rows[1]["restarts"] == 0
 
 
+def test_usage_shows_the_numbers_of_resources_and_why_others_are_not_known(app: rr.Registrar) -> None:
+    def usage(request: str, response: Any) -> dict[str, float]:
+        if request == "broken":
+            raise OSError("no meter")
+        return {"watts": len(request) / 2, "memory_bytes": 3 * 2**20}
+
+    assert rr_actors("usage").stderr == "no resource says what it uses\n"
+    serve(app, "lamp", usage=usage)
+    app.load("shop/thing", Order("chair"))  # its server does not say what it uses
+    broken, hall, attic = (app.load("app/lamp", request).resource_id for request in ("broken", "hall", "attic"))
+    ran = rr_actors("usage")
+    heads, *rows = ran.stdout.splitlines()
+    assert heads.split() == ["resource", "watts", "memory", "id"]
+    assert [row.split()[:-1] for row in rows] == [
+        ["app/lamp", '"hall"', "2", "3", "MiB"],
+        ["app/lamp", '"attic"', "2.5", "3", "MiB"],
+    ]
+    assert ran.stderr.startswith('not known: app/lamp "broken" (')
+    assert ran.stderr.endswith("): app/lamp: usage: OSError: no meter\n")
+    found = json.loads(said("usage", "-o", "json", "--sort-by", "watts"))
+    assert [row["id"] for row in found] == [attic, hall, broken]
+    assert found[0]["usage"] == {"watts": 2.5, "memory_bytes": 3 * 2**20}
+    assert (found[2]["usage"], found[2]["failure"]) == ({}, "app/lamp: usage: OSError: no meter")
+    assert said("usage", "attic", "-o", "name", "--registrar", "app") == 'app/lamp "attic"\n'
+    assert "1 more" in rr_actors("usage", "--limit", "2").stderr
+    told = "rr-actors: --sort-by: expected one of watts, memory_bytes, got 'volts'"
+    assert refused(2, "usage", "--sort-by", "volts") == told
+
+
 def test_resources_are_listed_and_chosen(app: rr.Registrar) -> None:
     query = app.load("shop/thing", Order("lamp"))
     app.load("shop/thing", Order("chair"))
 
-    assert said("resources", "lamp").splitlines()[1].split()[:2] == [query.resource_id, "shop/thing"]
+    assert said("resources", "lamp").splitlines()[1].split()[:2] == ["shop/thing", '{"name":"lamp","parts":[]}']
     (row,) = json.loads(said("resources", "lamp", "--json"))
     assert row["holders"] == [{"query_id": query.id, "origin": "app", "parent": ""}]
     assert "1 more" in rr_actors("resources", "--limit", "1").stderr
 
 
+def test_a_resource_is_named_and_every_command_takes_its_name_and_its_short_id(app: rr.Registrar) -> None:
+    heard = Calls()
+    queries = [app.load("shop/thing", Order(f"lamp {number}"), on_status=heard) for number in range(3)]
+    lines = said("resources").splitlines()[1:]
+    ids = [line.split()[-1] for line in lines]
+    name = 'shop/thing {"name":"lamp 1","parts":[]}'
+
+    assert [line.startswith(f'shop/thing {{"name":"lamp {number}"') for number, line in enumerate(lines)] == [True] * 3
+    assert all(len(id) == 8 and query.resource_id.endswith(id) for id, query in zip(ids, queries, strict=True))
+    assert _without_ids_and_times(said("why", ids[1])).endswith(_without_ids_and_times(said("why", name)))
+    assert f"{name} ({ids[1]}) is loaded" in said("why", ids[1])
+    assert not re.search(r"[0-9a-f]{32}", said("why", name))
+    assert "told 1 holder" in said("status", name, "WARNING", "hot")
+    assert "told 1 holder" in said("status", f"shop/thing/{ids[1]}", "OK")
+    assert said("unload", name).startswith("released query")
+    assert said("unload", ids[0]).startswith("released query")
+    assert said("unload", "--force", ids[2]).startswith('took shop/thing {"name":"lamp 2"')
+    assert "no query and no resource" in refused(2, "why", name)
+
+
+def test_lists_are_chosen_sorted_and_printed_as_names_for_other_commands(app: rr.Registrar, shop: rr.System) -> None:
+    other = shop.open_registrar("other")
+    first, second = (app.load("shop/thing", Order(name)) for name in "ab")
+    other.load("shop/thing", Order("b"))
+    said("status", f"shop/thing/{second.resource_id}", "WARNING", "hot")
+
+    names = said("resources", "-o", "name", "--sort-by", "holders").splitlines()
+    assert names == ['shop/thing {"name":"b","parts":[]}', 'shop/thing {"name":"a","parts":[]}']
+    assert said("resources", "-o", "name", "--holder", "other").splitlines() == names[:1]
+    assert said("resources", "-o", "name", "--status", "warning").splitlines() == names[:1]
+    assert said("resources", "-o", "name", "--status", "OK").splitlines() == names[1:]
+    assert [row["id"] for row in json.loads(said("resources", "-o", "json", "--status", "OK"))] == [first.resource_id]
+    assert rr_actors("resources", "--holder", "nobody").stderr == "no resource matches\n"
+    for name in names:
+        assert name in said("why", name)
+    assert set(said("ps", "-o", "name").splitlines()) == {"root", "root/shop"}
+    assert said("ps", "--sort-by", "memory").splitlines()[1].split()[0] in {"root", "root/shop"}
+    assert said("history", said("ps", "-o", "name").splitlines()[1])
+
+
+def test_a_long_name_is_shortened_in_the_middle_and_taken_back_so(app: rr.Registrar) -> None:
+    app.load("shop/thing", Order("begin" + "-" * 190 + "end"))
+    (name,) = re.findall(
+        r"^(shop/thing .*) \(\w+\) is loaded", said("why", said("resources").split()[-1]), re.MULTILINE
+    )
+
+    assert len(name) == 60
+    assert name.startswith('shop/thing {"name":"begin')
+    assert "…" in name
+    assert name.endswith('end","parts":[]}')
+    assert name in said("why", name)
+
+
 def test_events_are_followed_with_filters_as_lines_of_json(app: rr.Registrar, shop: rr.System) -> None:
-    node = shop._node
-    assert node is not None
+    node = node_of(shop)
     following = subprocess.Popen(
         command("events", "--follow", "--json", "--event", "loaded", "--about", "shop/thing", "--count", "2"),
         stdout=subprocess.PIPE,
@@ -171,12 +361,77 @@ def test_events_are_followed_with_filters_as_lines_of_json(app: rr.Registrar, sh
     assert [json.loads(line)["event"] for line in out.splitlines()] == ["loaded", "loaded"]
 
 
+def following(system: rr.System, *arguments: object) -> subprocess.Popen[str]:
+    """Follow the events by the command line; it has begun to listen."""
+    node = node_of(system)
+    process = subprocess.Popen(command("events", "--follow", *arguments), stdout=subprocess.PIPE, text=True)
+    eventually(lambda: bool(node.watched), timeout=30.0)
+    return process
+
+
+@contextlib.contextmanager
+def held_up(process: subprocess.Popen[str]) -> Iterator[None]:
+    """What happens meanwhile reaches the process at once, however busy the machine is."""
+    process.send_signal(signal.SIGSTOP)
+    yield
+    process.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.parametrize("wanted", [(), ("--about", "front"), ("--server", "maps"), ("--event", "status")])
+def test_a_status_that_spreads_is_one_line_with_its_source_its_reach_and_who_heard_it(
+    system: rr.System, wanted: tuple[str, ...]
+) -> None:
+    app, maps, cameras = map(system.open_registrar, ("app", "maps", "cameras"))
+    serve(cameras, "camera")
+    serve(maps, "map", load=lambda request: maps.load("cameras/camera", "front").id)
+    heard: list[rr.Status] = []
+    for name in ("kitchen", "hall", "stairs"):
+        app.load("maps/map", name, on_status=heard.append)
+    (camera,) = cameras.resources()
+
+    follows = following(system, "--count", 1, *wanted)
+    with held_up(follows):
+        cameras.send_status(camera.id, rr.Status("WARNING", "blurred"))
+        eventually(lambda: len(heard) == 3)
+    out, _ = follows.communicate(timeout=30)
+
+    (line,) = out.splitlines()
+    told = 'status cameras/camera "front" WARNING blurred → 3 resources in 2 managers, heard by app'
+    assert " ".join(line.split()[1:]) == told
+
+
+def test_events_that_say_the_same_are_one_line_with_their_number(system: rr.System) -> None:
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "lens")
+    heard: list[rr.Status] = []
+    query = app.load("provider/lens", "x", on_status=heard.append)
+
+    follows = following(system, "--count", 1)
+    with held_up(follows):
+        for _ in range(3):
+            provider.send_status(query.resource_id, rr.Status("WARNING", "dirty"))
+        eventually(lambda: len(heard) == 3)
+    out, _ = follows.communicate(timeout=30)
+
+    assert out.rstrip().endswith('provider/lens "x"  WARNING dirty → heard by app (3 times)')
+
+
+def test_events_of_a_child_are_those_of_all_below_it(start: Start) -> None:
+    loud = [rr.ChildSpec(Loud, id=id, placement="thread") for id in ("one", "two")]
+    system = start(rr.Supervisor([rr.Supervisor(loud, id="inner")], id="root"))
+    for id in ("one", "two"):
+        system.ref(id).tell("enough")
+    eventually(lambda: len(system.supervisor("root/inner").history()) == 6)
+
+    assert "two" not in said("events", "--child", "one")
+    for name in ("inner", "root/inner"):
+        assert {"one", "two"} <= set(re.findall("one|two", said("events", "--child", name)))
+    assert said("events", "--event", "exited", "--child", "one", "--about", "nothing like it") == ""
+
+
 def test_following_ends_with_the_system_and_with_ctrl_c(shop: rr.System) -> None:
-    node = shop._node
-    assert node is not None
     both = [subprocess.Popen(command("events", "-f"), stdout=subprocess.PIPE, stderr=subprocess.PIPE) for _ in range(2)]
-    console = shop._console
-    assert console is not None
+    console = console_of(shop)
     eventually(lambda: len(console.feed._readers) == 2, timeout=30.0)
 
     both[0].send_signal(signal.SIGINT)
@@ -189,6 +444,20 @@ def test_following_ends_with_the_system_and_with_ctrl_c(shop: rr.System) -> None
     assert both[1].returncode == 0
 
 
+def test_following_into_a_reader_that_has_enough_ends_with_0(shop: rr.System) -> None:
+    following = subprocess.Popen(command("events", "-f"), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    node = node_of(shop)
+    eventually(lambda: bool(node.watched), timeout=30.0)
+    assert following.stdout is not None
+    following.stdout.close()
+    wait_respawned(shop, "shop", kill(shop, "shop"))
+
+    assert following.wait(timeout=30) == 0
+    assert following.stderr is not None
+    assert following.stderr.read() == b""
+    following.stderr.close()
+
+
 def test_history_tells_why_a_child_ended(shop: rr.System) -> None:
     wait_respawned(shop, "shop", kill(shop, "shop"))
 
@@ -196,6 +465,52 @@ def test_history_tells_why_a_child_ended(shop: rr.System) -> None:
     lines = [json.loads(line) for line in said("history", "--json").splitlines()]
     assert [line["event"] for line in lines] == ["started", "exited", "restarted"]
     assert "exited" in said("events", "--event", "exited")
+
+
+def test_after_a_tree_has_given_up_its_exits_are_still_shown_and_looking_counts_nothing(
+    start: Start, state_dir: Path
+) -> None:
+    inner = rr.Supervisor([rr.ChildSpec(Loud, id="loud", placement="thread")], id="inner", max_restarts=0)
+    system = start(rr.Supervisor([inner], id="root", max_restarts=0))
+    system.ref("loud").tell("enough")
+    assert system.wait(LIMIT_S)
+    before = system.dead_letters().count
+
+    for looks in range(3):
+        history = said("history", "loud")
+        assert "ValueError: enough" in history
+        assert "Traceback" in history
+        assert "gave_up" in said("events")
+        rows = json.loads(said("ps", "--json"))
+        assert [(row["path"], row["state"]) for row in rows[:1]] == [("root", "stopped")], looks
+        system.figures()
+    assert system.dead_letters().count == before
+
+    system.stop()
+    assert "ValueError: enough" in said("history", "loud", "--state", state_dir)
+    told = "nobody: no such child has lived: root, root/inner, root/inner/loud"
+    assert told in refused(2, "history", "nobody", "--state", state_dir)
+
+
+def test_what_a_killed_system_has_done_is_read_from_its_state_directory(
+    running: Callable[..., subprocess.Popen[str]], state_dir: Path
+) -> None:
+    application = running()
+    said("kill", "shop", "--state", state_dir)
+    eventually(lambda: "restarted" in said("history", "shop", "--state", state_dir))
+    application.kill()
+    application.wait(LIMIT_S)
+    eventually(lambda: rr_actors("ps", "--state", state_dir).returncode == 3)
+
+    ran = rr_actors("history", "shop", "--state", state_dir)
+    assert (ran.returncode, ran.stderr) == (0, f"no system runs in {state_dir}: this is what it has left\n")
+    assert "SIGKILL" in ran.stdout
+    assert "SIGKILL" in rr_actors("events", "--event", "exited", "--state", state_dir).stdout
+
+    again = running()
+    assert "SIGKILL" in said("history", "shop", "--state", state_dir)
+    again.terminate()
+    again.wait(LIMIT_S)
 
 
 class Loud(rr.Actor):
@@ -250,19 +565,120 @@ def test_why_says_who_holds_it_for_whom_and_since_when(app: rr.Registrar, shop: 
     assert said("why", query.id[:-1]).split(" since ")[0] == whole.split(" since ")[0]
 
 
+def test_priorities_are_given_and_explained(app: rr.Registrar, shop: rr.System) -> None:
+    query = app.load("shop/thing", Order("whole", ("shop/thing:part",)), priority=5)
+    (part,) = shop.registrar("shop").children(query)
+    assert "Its priority is 5, the highest of its holders." in said("why", query.resource_id)
+    assert "for itself, with priority 5." in said("why", query.id)
+
+    assert said("priority", query.id, "-7", "--dry-run").startswith(f"would give priority -7 to query {query.id[-8:]}")
+    assert query.priority == 5
+    assert said("priority", query.id[-8:], "9").startswith(f"gave priority 9 to query {query.id[-8:]} of app")
+    assert eventually(lambda: f"{query.resource_id[-8:]}), with priority 9." in said("why", part.resource_id))
+    assert json.loads(said("priority", query.id, "standby", "--json"))["priority"] is None
+    assert query.priority is None
+    assert eventually(lambda: "all its holders have it on standby" in said("why", part.resource_id))
+
+
+def test_a_pause_is_shown_and_explained(app: rr.Registrar, shop: rr.System) -> None:
+    events: list[str] = []
+    shop.subscribe(lambda event: events.append(event["event"]))
+    provider = shop.open_registrar("provider")
+    provider.register_server(
+        "thing", lambda request: request, idle="pause", pause=lambda *_: None, resume=lambda *_: None
+    )
+    query = app.load("provider/thing", "x", priority=None)
+    assert ": paused" in said("wait", query.resource_id, "--for", "paused")
+    assert "is paused, as nobody needs it now. A load resumes it." in said("why", query.resource_id)
+    assert "paused" in said("resources")
+    query.priority = 0
+    said("wait", query.resource_id, "--for", "loaded")
+    assert eventually(lambda: [event for event in events if event in ("paused", "resumed")] == ["paused", "resumed"])
+
+
+def test_a_revocation_is_explained(app: rr.Registrar, shop: rr.System) -> None:
+    heard, goes_on = threading.Event(), threading.Event()
+
+    def on_status(_status: rr.Status) -> None:
+        heard.set()
+        goes_on.wait(60)
+
+    provider = shop.open_registrar("provider")
+    provider.register_server("thing", lambda request: request)
+    query = app.load("provider/thing", "x", on_status=on_status)
+    revoking = threading.Thread(target=provider.revoke, args=(query.resource_id, "too hot"), kwargs={"grace_s": 60})
+    revoking.start()
+    assert heard.wait(60)
+    assert "It is revoked (too hot): it is unloaded when its holders have let it go" in said("why", query.resource_id)
+    goes_on.set()
+    revoking.join()
+
+
+def test_a_load_takes_a_priority(app: rr.Registrar, shop: rr.System) -> None:
+    said("load", "shop/thing", '{"name": "x"}', "--as", "app", "--priority", "4")
+    assert [info.priority for info in shop.registrar("shop").resources()] == [4]
+    (row,) = json.loads(said("resources", "--json"))
+    assert row["priority"] == 4
+    app.queries()[0].standby()
+    assert eventually(lambda: "standby" in said("resources"))
+
+
+@pytest.mark.parametrize("wrong", ["1001", "-1001", "high", "1.0", ""])
+def test_a_priority_that_is_none_is_refused(app: rr.Registrar, wrong: str) -> None:
+    query = app.load("shop/thing", Order("x"))
+    expected = f"expected a whole number from -1000 to 1000, or standby, got {wrong!r}"
+    assert f"PRIORITY: {expected}" in refused(2, "priority", query.id, wrong)
+    assert f"--priority: {expected}" in refused(2, "load", "shop/thing", '{"name": "y"}', f"--priority={wrong}")
+    assert query.priority == 0
+    assert "nobody holds a query of this id" in refused(2, "priority", "0000000000", "5")
+
+
+def test_why_names_a_holder_that_is_slow_with_its_statuses(app: rr.Registrar, shop: rr.System) -> None:
+    gate = Gate()
+    query = app.load("shop/thing", Order("wheel"), on_status=lambda _: gate())
+    for number in range(3):
+        shop.registrar("shop").send_status(query.id, rr.Status(rr.State.WARNING, str(number)))
+
+    assert "app has not dealt with 3 of its statuses." in said("why", query.id)
+    gate.open()
+
+
+def test_why_says_why_a_resource_could_not_be_unloaded_and_what_to_do(system: rr.System) -> None:
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    jams = [True, False]
+
+    def unload(_request: str, _response: None) -> None:
+        if jams.pop(0):
+            raise OSError("the door jams")
+
+    provider.register_server("box", lambda _: None, unload=unload)
+    query = app.load("provider/box", "x")
+    with pytest.raises(rr.UnloadFailed):
+        query.unload()
+
+    text = said("why", query.resource_id)
+
+    assert "could not be unloaded: " in text
+    assert "the door jams" in text
+    assert "last status" not in text
+    assert f"rr-actors unload --force {query.resource_id[-8:]}" in text
+    said("unload", "--force", query.resource_id)
+    assert provider.resources() == []
+
+
 def test_why_prints_what_its_page_shows(system: rr.System) -> None:
     app, maps, cameras = map(system.open_registrar, ("app", "maps", "cameras"))
     serve(cameras, "camera")
     serve(maps, "map", load=lambda request: maps.load("cameras/camera", f"/dev/{request}").id)
     camera = app.load("maps/map", "kitchen").response
     page = (REPOSITORY / "docs" / "console.md").read_text()
-    _, shown, _ = re.split(r"^\$ rr-actors why \w+\n|```\n(?=\n## Live in)", page, flags=re.MULTILINE)
+    _, shown, _ = re.split(r"^\$ rr-actors why \w+\n|```\n(?=\n## After the end)", page, flags=re.MULTILINE)
 
     assert _without_ids_and_times(said("why", camera)) == _without_ids_and_times(shown)
 
 
 def _without_ids_and_times(text: str) -> str:
-    return re.sub(r"[0-9a-f]{32}", "ID", re.sub(r"since [\d:]+ \(\d+ s\)", "since TIME", text))
+    return re.sub(r"\b[0-9a-f]{8}\b", "ID", re.sub(r"since [\d:]+ \(\d+ s\)", "since TIME", text))
 
 
 def test_why_says_what_a_load_waits_for(system: rr.System, gate: Gate) -> None:
@@ -284,6 +700,16 @@ def test_why_says_what_a_load_waits_for(system: rr.System, gate: Gate) -> None:
 
 def test_why_of_what_nobody_knows_is_an_error(shop: rr.System) -> None:
     assert "no query and no resource" in refused(2, "why", "0123456789")
+
+
+def test_an_id_that_many_begin_with_is_refused_with_five_of_them(app: rr.Registrar) -> None:
+    queries = [app.load("shop/thing", Order(f"r{number}")) for number in range(8)]
+    start = queries[0].id[:4]
+
+    for verb in ("why", "unload"):
+        told = refused(2, verb, start)
+        assert len(re.findall(r"\b[0-9a-f]{8}\b", told)) == 5, told
+        assert "more; give more of the id" in told
 
 
 @pytest.mark.parametrize("of", ["tree", "dependencies", "both"])
@@ -329,6 +755,33 @@ def test_a_load_shows_its_response_and_is_held_if_it_is_to_be(app: rr.Registrar,
     assert shop.registrar("console").queries() == []
 
 
+@pytest.mark.parametrize("name", ["app", "shop"])
+def test_what_waits_for_a_server_that_is_gone_is_cleared_by_the_servers_name(
+    app: rr.Registrar, shop: rr.System, name: str
+) -> None:
+    def fail(_request: object, _response: object) -> None:
+        raise ValueError("stuck")
+
+    registrar = shop.registrar(name)
+    before = len(registrar.resources())
+    registrar.register_server("lens", lambda request: request, fail)
+    app.load(f"{name}/lens", "x")
+    assert "the server is registered" in refused(2, "unload", "--force", f"{name}/lens")
+    with pytest.raises(rr.UnloadFailed):
+        registrar.unregister_server("lens")
+
+    (waiting,) = [found for found in registrar.resources() if found.server == "lens"]
+    assert f"waits for its server '{name}/lens', which is not registered" in said("why", waiting.id)
+    assert f"would remove all resources of {name}/lens" in said("unload", "--force", "--dry-run", f"{name}/lens")
+    assert len(registrar.resources()) == before + 1
+    assert (
+        said("unload", "--force", f"{name}/lens") == f"removed all resources of {name}/lens, which is not registered\n"
+    )
+
+    assert len(registrar.resources()) == before
+    assert "no such server" in refused(2, "unload", "--force", f"{name}/lens")
+
+
 def test_errors_of_the_system_are_one_line_and_their_exit_codes_say_whose_fault_it_is(
     app: rr.Registrar, workshop: Workshop, shop: rr.System
 ) -> None:
@@ -369,6 +822,14 @@ def test_children_are_killed_stopped_restarted_and_added(shop: rr.System, worksh
     assert "second/thing" in shop.registrar("second").servers()
 
 
+def test_a_shutdown_that_waits_returns_when_no_child_runs(shop: rr.System) -> None:
+    pid = pid_of(shop, "shop")
+    assert "would stop" in said("shutdown", "--wait", "--dry-run")
+    assert "is stopping" in said("shutdown", "--wait")
+
+    assert not Path(f"/proc/{pid}").exists()
+
+
 def test_a_dry_run_says_what_would_be_done_and_changes_nothing(shop: rr.System, app: rr.Registrar) -> None:
     pid = shop.ref("shop").pid
 
@@ -393,6 +854,25 @@ def test_each_command_has_an_example_in_its_help() -> None:
     for name, example in examples.items():
         assert name in older or example.startswith(f"Example: rr-actors {name}"), name
     assert "Example: rr-actors kill" in said("kill", "--help")
+
+
+def test_the_help_has_each_command_once_in_a_group_with_its_whole_first_sentence() -> None:
+    script = (
+        "import typer\n"
+        "from rr_actors.tools.recording_verbs import app\n"
+        "from rr_actors.tools.console_verbs import app\n"
+        "print(*typer.main.get_command(app).commands)\n"
+    )
+    names = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+
+    shown = said("--help")
+    commands = shown.partition("running system:\n")[2]
+    assert "…" not in commands
+    assert "..." not in commands
+    listed = re.findall(r"^  ([a-z-]+)  ", commands, flags=re.MULTILINE)
+    assert sorted(listed) == sorted(names)
+    groups = re.findall(r"^(\w.*):$", shown, flags=re.MULTILINE)
+    assert groups[:4] == ["Options", "Look at a running system", "Change its resources", "Run, change and stop it"]
 
 
 def test_a_shell_completes_what_the_running_system_has(app: rr.Registrar) -> None:
@@ -559,8 +1039,7 @@ def test_events_about_something_are_those_that_mention_it_with_and_without_follo
     assert said("events", "--about", "root/nobody") == ""
     asked = command("events", "--follow", "--about", "shop/thi", "--count", 1)
     with subprocess.Popen(asked, stdout=subprocess.PIPE, text=True) as following:
-        assert shop._node is not None
-        watched = shop._node.watched
+        watched = node_of(shop).watched
         eventually(lambda: bool(watched))
         app.load("shop/thing", Order("lamp"))
         line, _ = following.communicate(timeout=30)
@@ -572,8 +1051,7 @@ def test_events_about_something_are_those_that_mention_it_with_and_without_follo
 
 def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Registrar, tmp_path: Path) -> None:
     file = tmp_path / "one.jsonl"
-    assert shop._node is not None
-    watched = shop._node.watched
+    watched = node_of(shop).watched
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
         eventually(lambda: watched.recording)
         query = app.load("shop/thing", Order("r2"))
@@ -591,6 +1069,10 @@ def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Regis
     entries = [json.loads(line) for line in said("sequence", query.id, "--file", file, "--json").splitlines()]
     assert entries[0]["name"] == "Load"
     assert "no query or resource" in refused(2, "sequence", "ffffffff", "--file", file)
+    picture = said("timeline", file)
+    assert picture.startswith("<svg")
+    assert "loaded  shop/thing {" in picture
+    assert str(tmp_path / "none") in refused(2, "timeline", tmp_path / "none")
     assert "there is a file already" in refused(2, "record", file)
 
 
@@ -606,9 +1088,7 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
 ) -> None:
     monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
     query = app.load("shop/thing", Order("chair"))
-    assert shop._node is not None
-    assert shop._console is not None
-    watched, feed = shop._node.watched, shop._console.feed
+    watched, feed = node_of(shop).watched, console_of(shop).feed
     asked = command("sequence", query.id, "--seconds", 4)
     with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drawing:
         eventually(lambda: watched.recording)
@@ -630,9 +1110,7 @@ def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so
     monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
     file = tmp_path / "slow.jsonl"
     query = app.load("shop/thing", Order("chair"))
-    assert shop._node is not None
-    assert shop._console is not None
-    watched, feed = shop._node.watched, shop._console.feed
+    watched, feed = node_of(shop).watched, console_of(shop).feed
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
         eventually(lambda: watched.recording)
         (reader,) = feed._readers
@@ -700,10 +1178,87 @@ def test_a_narrow_terminal_wraps_a_table_rather_than_leaving_out_its_columns(sho
     assert "…" not in shown
 
 
+def on_a_terminal(columns: int, *arguments: object) -> list[str]:
+    """Return the lines that a command prints on a terminal of so many columns, without the bold of the heading."""
+    ours, terminal = os.openpty()
+    try:
+        termios.tcsetwinsize(terminal, (24, columns))
+        subprocess.run(command(*arguments), stdin=terminal, stdout=terminal, stderr=subprocess.PIPE, check=True)
+        shown = os.read(ours, 65536).decode()
+    finally:
+        os.close(ours)
+        os.close(terminal)
+    return shown.replace("\x1b[1m", "").replace("\x1b[0m", "").splitlines()
+
+
+def test_a_long_request_gives_way_on_a_terminal_and_pads_no_line_in_a_pipe(app: rr.Registrar) -> None:
+    app.load("shop/thing", Order("x"))
+    query = app.load("shop/thing", Order("begin" + "-" * 190 + "end"))
+
+    narrow = on_a_terminal(120, "resources")
+    assert all(len(line) <= 120 for line in narrow)
+    (line,) = [line for line in narrow if line.endswith(query.resource_id[-8:])]
+    assert "begin" in line
+    assert 'end"' in line
+    assert any("-" * 190 in line for line in on_a_terminal(120, "resources", "--wide"))
+    assert sorted(len(line) > 200 for line in said("resources").splitlines()) == [False, False, True]
+
+
+def test_inspect_shows_each_row_on_one_line_with_its_whole_id(app: rr.Registrar, shop: rr.System) -> None:
+    query = app.load("shop/thing", Order("begin" + "-" * 190 + "end"))
+    shop.registrar("shop").save_catalog()
+    app.save_catalog()
+
+    shown = on_a_terminal(160, "inspect", shop.state_dir)
+    held, resource = (line for line in shown if line.startswith((query.id, query.resource_id)))
+    assert "begin" in held
+    assert held.endswith("  held  OK            0")
+    assert "begin" in resource
+    assert resource.endswith("  loaded  OK     app")
+
+
+def test_where_no_resource_matches_the_command_says_so(app: rr.Registrar) -> None:
+    ran = rr_actors("resources", "nowhere")
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "no resource matches\n")
+
+
+HOSTILE = "\x1b[2J\x07\x9b1m\u202e\nlast"
+
+
+def test_nothing_that_users_write_controls_the_terminal(app: rr.Registrar, shop: rr.System, tmp_path: Path) -> None:
+    registrar = shop.open_registrar("evil")
+
+    def fail(request: str) -> str:
+        if request == "fails":
+            raise ValueError(HOSTILE)
+        return request
+
+    serve(registrar, "thing", fail)
+    query = app.load("evil/thing", HOSTILE)
+    ran = [
+        rr_actors("resources"),
+        rr_actors("resources", "--json"),
+        rr_actors("why", query.id),
+        rr_actors("graph", "--format", "dot"),
+        rr_actors("graph", "--format", "mermaid"),
+        rr_actors("load", "evil/thing", json.dumps(HOSTILE)),
+        rr_actors("load", "evil/thing", '"fails"'),
+        rr_actors("check", tmp_path / HOSTILE),
+        rr_actors("start", tmp_path / HOSTILE),
+        rr_actors("sequence", query.id, "--file", tmp_path / HOSTILE),
+        rr_actors("inspect", shop.state_dir),
+        rr_actors("tree", shop.state_dir),
+    ]
+    for one in ran:
+        for line in (one.stdout + one.stderr).split("\n"):
+            assert line.isprintable(), (one.args, line)
+    assert json.loads(ran[5].stdout.splitlines()[-1]) == HOSTILE
+    assert [one.returncode for one in ran] == [0, 0, 0, 0, 0, 0, 4, 2, 2, 2, 0, 0]
+
+
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
     assert "recorded" in said("record", tmp_path / "one", "--seconds", "0.2")
-    assert shop._node is not None
-    watched = shop._node.watched
+    watched = node_of(shop).watched
     eventually(lambda: not watched.recording)
     with subprocess.Popen(command("record", tmp_path / "two"), stdout=subprocess.PIPE, text=True) as recording:
         eventually(lambda: watched.recording)
@@ -715,8 +1270,7 @@ def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_
 
 
 def test_sequence_without_a_file_draws_what_happens_now(shop: rr.System, app: rr.Registrar) -> None:
-    assert shop._node is not None
-    watched = shop._node.watched
+    watched = node_of(shop).watched
     query = app.load("shop/thing", Order("r2"))
     with subprocess.Popen(
         command("sequence", query.id, "--seconds", "3"), stdout=subprocess.PIPE, text=True

@@ -6,10 +6,12 @@ import asyncio
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import threading
 import time
+import types
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -20,10 +22,14 @@ from textual.pilot import Pilot
 import rr_actors as rr
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console import console_questions as questions
+from rr_actors.tools import process_usage
+from rr_actors.tools.process_usage import UsageWatch
 from rr_actors.tools.terminal.console_link import ConsoleLink
-from rr_actors.tools.terminal.terminal_app import EventsPane, Pane, Terminal
-from rr_actors.tools.terminal.terminal_rows import Served, Tree, Window
-from support import LIMIT_S, TEST_PATHS, Workshop, child, eventually, pid_of, serve
+from rr_actors.tools.terminal.terminal_app import Keys, Pane, Terminal
+from rr_actors.tools.terminal.terminal_rows import Served, Window
+from rr_actors.tools.terminal.terminal_tables import Tree
+from support import LIMIT_S, TEST_PATHS, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_respawned
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -39,7 +45,7 @@ class Person:
     async def press(self, *keys: str) -> None:
         await self._pilot.press(*keys)
 
-    def lines(self, pane: Pane | EventsPane) -> list[str]:
+    def lines(self, pane: Pane) -> list[str]:
         return [pane.render_line(y).text.rstrip() for y in range(pane.size.height)]
 
     @property
@@ -102,7 +108,7 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_key_each(shop: rr.Syst
 
     async def scene(person: Person) -> None:
         await person.chooses("  shop")
-        await person.press("k")
+        await person.press("K", "y")
         await person.sees(lambda: f"sent SIGKILL to root/shop (pid {pid})" in person.terminal.status)
         await person.sees(lambda: "restarted" in person.events and "1x" in person.tree)
         await person.sees(lambda: "SIGKILL" in person.chosen and "restarted" in person.chosen)
@@ -118,15 +124,40 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_key_each(shop: rr.Syst
     assert pid_of(shop, "shop") != pid
 
 
+def test_the_keys_of_vi_move_and_a_kill_asks_first(shop: rr.System, state_dir: Path) -> None:
+    async def scene(person: Person) -> None:
+        await person.chooses("  shop")
+        await person.press("k")
+        await person.sees(lambda: person.terminal.left.cursor == 0)
+        await person.press("j", "y", "K")
+        await person.sees(lambda: "kill root/shop? y: yes" in person.terminal.status)
+        await person.press("escape")
+        await person.sees(lambda: "root/shop was not killed" in person.terminal.status)
+        await person.press("y", "t")
+        await person.sees(lambda: "stopped root/shop" in person.terminal.status)
+        assert "SIGKILL" not in person.events
+
+    sit_down(state_dir, scene)
+
+
+def test_without_a_terminal_it_is_refused_in_one_line(shop: rr.System, state_dir: Path) -> None:
+    command = [sys.executable, "-m", "rr_actors", "top", "--state", str(state_dir)]
+    ran = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60.0)
+
+    assert ran.returncode == 2, ran.stdout + ran.stderr
+    assert "expected a terminal" in ran.stderr
+    assert len(ran.stderr.splitlines()) == 1
+
+
 def test_a_key_that_cannot_do_it_says_why(shop: rr.System, state_dir: Path) -> None:
     async def scene(person: Person) -> None:
         await person.chooses("root")
-        await person.press("k")
+        await person.press("K", "y")
         await person.sees(lambda: "it is the root supervisor" in person.terminal.status)
         await person.press("u")
         await person.sees(lambda: "choose a resource" in person.terminal.status)
         await person.chooses("@shop")
-        await person.press("k")
+        await person.press("K")
         await person.sees(lambda: "choose a child" in person.terminal.status)
 
     sit_down(state_dir, scene)
@@ -137,27 +168,51 @@ def test_resources_are_opened_to_their_holders_and_parts_and_unloaded(start: Sta
     provider, app = system.open_registrar("provider"), system.open_registrar("app")
     serve(provider, "lens", lambda request: "glass")
     served = serve(provider, "camera", lambda request: provider.load("provider/lens", request).response)
-    query = app.load("provider/camera", "front")
+    query = app.load("provider/camera", "front", priority=5)
 
     async def scene(person: Person) -> None:
         await person.chooses("@provider")
         await person.sees(lambda: 'camera "front"' in person.chosen and 'lens "front"' in person.chosen)
+        await person.sees(lambda: "provider, priority 5" in person.chosen)  # the lens inherits it
         await person.press("enter")
         while (row := person.terminal.right.row) is None or not row.text.startswith("camera"):
             await person.press("down")
         await person.press("enter")
-        await person.sees(lambda: "app, for itself" in person.chosen and 'provider/lens "front"' in person.chosen)
+        await person.sees(
+            lambda: "app, for itself, priority 5" in person.chosen and 'provider/lens "front"' in person.chosen
+        )
         await person.press("escape")
         await person.sees(lambda: person.terminal.right.rows == Served("provider"))
         await person.sees(lambda: person.terminal.right.row is not None)
         assert person.terminal.right.row.resource == query.resource_id  # the cursor is where it was
         await person.press("u")
-        await person.sees(lambda: f"released query {query.id}" in person.terminal.status)
+        await person.sees(lambda: f"released query {query.id[-8:]}" in person.terminal.status)
         await person.sees(lambda: "camera" not in person.chosen)
 
     sit_down(state_dir, scene)
 
     served.unloads.wait()
+
+
+def test_a_holder_that_is_slow_with_its_statuses_is_named(start: Start, state_dir: Path) -> None:
+    system, gate = start(), Gate()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "camera")
+    query = app.load("provider/camera", "front", on_status=lambda _: gate())
+    for number in range(3):
+        provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, str(number)))
+
+    async def scene(person: Person) -> None:
+        await person.sees(lambda: "3 unheard" in person.tree)
+        await person.chooses("@provider")
+        await person.sees(lambda: "camera" in person.chosen)
+        await person.press("enter", "enter")
+        await person.sees(lambda: "app, for itself, 3 unheard" in person.chosen)
+
+    try:
+        sit_down(state_dir, scene)
+    finally:
+        gate.open()
 
 
 def test_a_resource_of_several_holders_is_taken_from_one_of_them_or_from_all(start: Start, state_dir: Path) -> None:
@@ -176,7 +231,7 @@ def test_a_resource_of_several_holders_is_taken_from_one_of_them_or_from_all(sta
         while (row := person.terminal.right.row) is None or "two," not in row.text:
             await person.press("down")
         await person.press("u")
-        await person.sees(lambda: f"released query {queries['two'].id}" in person.terminal.status)
+        await person.sees(lambda: f"released query {queries['two'].id[-8:]}" in person.terminal.status)
         await person.sees(lambda: "held by 2" in person.chosen)
         assert len(served.unloads) == 0
         await person.press("escape")
@@ -223,15 +278,102 @@ def test_a_system_that_stops_is_told_and_found_again(start: Start, state_dir: Pa
     sit_down(state_dir, scene)
 
 
+def test_the_children_are_sorted_by_each_column_and_the_resources_by_their_state(
+    start: Start, state_dir: Path, workshop: Workshop
+) -> None:
+    shops = [rr.ChildSpec(Shop, id=id, args=(str(workshop.root),)) for id in ("quiet", "often")]
+    system = start(rr.Supervisor(shops, id="root", max_restarts=9))
+    wait_respawned(system, "often", kill(system, "often"))
+    app = system.open_registrar("app")
+    queries = [app.load("quiet/thing", Order(name)) for name in ("lamp", "chair")]
+    system.registrar("quiet").send_status(queries[1].resource_id, rr.Status("ERROR", "broken"))
+
+    def first(person: Person) -> list[str]:
+        return person.tree.splitlines()[1].split()
+
+    async def scene(person: Person) -> None:
+        await person.sees(lambda: "often" in person.tree)
+        await person.press("z")
+        await person.sees(lambda: first(person)[0] == "root" and person.tree.split()[0] == "cpu")
+        for head, top in (("cpu", ""), ("memory", ""), ("restarts", "root/often"), ("mailbox", "")):
+            await person.press("s")
+            await person.sees(lambda head=head, top=top: f"▼{head}" in person.tree and top in first(person)[0])
+        await person.press("s")
+        await person.sees(lambda: first(person)[0] == "root/quiet" and first(person)[-1] == "2")
+        await person.press("s")
+        await person.sees(lambda: "▼" not in person.tree and first(person)[0] == "root")
+
+        await person.press("2", "s")
+        await person.sees(lambda: '{"name":"chair"' in person.tree.splitlines()[1] and "ERROR" in person.tree)
+        await person.press("enter")
+        await person.sees(lambda: "ERROR: broken" in person.chosen and person.terminal.right.has_focus)
+        await person.press("escape", "u")
+        await person.sees(lambda: f"released query {queries[1].id[-8:]}" in person.terminal.status)
+        await person.press("1")
+        await person.sees(lambda: "often" in person.tree)
+
+    sit_down(state_dir, scene)
+
+
+def test_the_events_alone_have_the_screen_and_their_filter_and_the_help_ends_by_a_key(
+    shop: rr.System, state_dir: Path
+) -> None:
+    app = shop.open_registrar("app")
+
+    async def scene(person: Person) -> None:
+        await person.sees(lambda: "started" in person.events)
+        for number in range(15):
+            await app.load_async("shop/thing", Order(f"lamp {number}"))
+        assert len(person.lines(person.terminal.events)) < 10
+        await person.press("3")
+        await person.sees(lambda: "lamp 0" in person.events and "lamp 14" in person.events)
+        await person.press("slash", *"lamp", "space", "1", "3", "enter")
+        await person.sees(lambda: "lamp 13" in person.events and "lamp 14" not in person.events)
+        await person.press("escape", "escape")
+        await person.sees(lambda: "shop" in person.tree and len(person.lines(person.terminal.events)) < 10)
+        await person.press("question_mark", "K")
+        await person.sees(lambda: isinstance(person.terminal.screen, Keys))
+        assert "kill" not in person.terminal.status
+        await person.press("escape")
+        await person.sees(lambda: not isinstance(person.terminal.screen, Keys))
+
+    sit_down(state_dir, scene)
+
+
+def test_a_curve_shows_when_a_process_had_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    later_s = 0.0
+    began = time.monotonic()
+    clock = types.SimpleNamespace(monotonic=lambda: 1500.0 + time.monotonic() - began + later_s)
+    monkeypatch.setattr(process_usage, "time", clock)
+    usages = UsageWatch()
+    works = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        eventually(lambda: (usage := usages.look(works.pid)) is not None and usage.cpu_percent > 20.0)
+        assert usages.curve(works.pid).strip() == "█"
+        works.send_signal(signal.SIGSTOP)
+        later_s = 60.0
+        usages.look(works.pid)
+        later_s = 120.0
+        resting = usages.look(works.pid)
+        assert resting is not None
+        assert resting.cpu_percent == 0.0
+        assert usages.curve(works.pid).lstrip() == "█   ▁   ▁"
+    finally:
+        works.kill()
+        works.wait()
+    assert usages.look(works.pid) is None
+    assert usages.curve(works.pid) == ""
+
+
 class Silent(ConsoleLink):
     """A system that answers no question while it is to be silent."""
 
     is_silent = False
 
-    def ask(self, request: Any, expected: Any, timeout_s: float | None = None) -> Any:
+    def ask(self, request: Any, timeout_s: float | None = None) -> Any:
         if self.is_silent:
             raise rr.Unavailable("it has not answered within 10 s")
-        return super().ask(request, expected, timeout_s)
+        return super().ask(request, timeout_s)
 
 
 def test_a_system_that_does_not_answer_is_told_until_it_does(start: Start, state_dir: Path) -> None:
@@ -268,7 +410,7 @@ def test_a_thread_that_follows_ends_when_the_link_is_closed(start: Start, state_
     following.join(LIMIT_S)
     assert not following.is_alive()
     with pytest.raises(rr.Unavailable, match="is closed"):
-        link.ask(c.ListChildren(), c.Children)
+        link.ask(questions.ListChildren())
 
 
 class Crowd(ConsoleLink):
@@ -280,21 +422,21 @@ class Crowd(ConsoleLink):
         super().__init__(state_dir)
         self.asked: list[Any] = []
 
-    def ask(self, request: Any, expected: Any, timeout_s: float | None = None) -> Any:
+    def ask(self, request: Any, timeout_s: float | None = None) -> Any:
         self.asked.append(request)
         match request:
-            case c.ListChildren(_, offset, limit):
+            case questions.ListChildren(_, offset, limit):
                 rows = [c.ChildRow(f"root/child{n}", 1, "worker", "running") for n in range(self.CHILDREN)]
                 return c.Children(self.CHILDREN, rows[offset : offset + limit])
-            case c.ListRegistrars(_, offset, limit):
+            case questions.ListRegistrars(_, offset, limit):
                 return c.Registrars(1, [c.RegistrarRow("store", "up", ["store/thing"])][offset : offset + limit])
-            case c.ListResources(_, offset, limit):
+            case questions.ListResources(_, offset, limit):
                 numbers = range(self.RESOURCES)[offset : offset + limit]
                 return c.Resources(self.RESOURCES, [a_resource(number) for number in numbers])
-            case c.ListQueries():
+            case questions.ListQueries():
                 return c.Queries(0, [])
             case _:
-                return super().ask(request, expected, timeout_s)
+                return super().ask(request, timeout_s)
 
 
 def a_resource(number: int) -> ResourceRow:
@@ -317,7 +459,11 @@ def test_only_what_is_visible_is_asked_for(start: Start, state_dir: Path) -> Non
             await person.press("tab", "end")
             await person.sees(lambda: f'"thing {Crowd.RESOURCES - 1}"' in person.chosen)
             height = terminal.left.size.height
-        lists = [one for one in crowd.asked if isinstance(one, c.ListChildren | c.ListResources | c.ListRegistrars)]
+        lists = [
+            one
+            for one in crowd.asked
+            if isinstance(one, questions.ListChildren | questions.ListResources | questions.ListRegistrars)
+        ]
         assert height < 24
         assert max(one.limit for one in lists) == height
         assert len(lists) < 200
@@ -383,7 +529,9 @@ def test_it_runs_in_a_real_terminal(shop: rr.System, state_dir: Path, tmp_path: 
     tmux("new-session", "-d", "-x", "80", "-y", "24", f"{top}; echo exit code $?; read line")
     try:
         eventually(lambda: "  shop" in tmux("capture-pane", "-p"), timeout=30.0)
-        tmux("send-keys", "Down", "k")
+        tmux("send-keys", "j", "K")
+        eventually(lambda: "kill root/shop?" in tmux("capture-pane", "-p"), timeout=30.0)
+        tmux("send-keys", "y")
         eventually(lambda: f"(pid {pid})" in tmux("capture-pane", "-p"), timeout=30.0)
         eventually(lambda: "restarted" in tmux("capture-pane", "-p"), timeout=30.0)
         tmux("send-keys", "/", "k", "/", "t")  # at once, as a slow line has it: no letter of it is a command

@@ -1,4 +1,4 @@
-"""What `rr-actors top` looks like at 80x24: whole screens of a system that is made up, as they are in tools/screens.
+"""What `rr-actors top` looks like, mostly at 80x24: screens of a system that is made up, as they are in tools/screens.
 
 A screen that is to look different is written anew by `RR_RENEW_SCREENS=1 pytest tests/tools/test_terminal_screens.py`,
 and looked at in the difference before it is committed.
@@ -21,8 +21,10 @@ from textual.pilot import Pilot
 from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console import console_questions as questions
+from rr_actors.system.recording import event_texts
 from rr_actors.tools import explanations
-from rr_actors.tools.terminal import terminal_app, terminal_rows
+from rr_actors.tools.terminal import event_lines, terminal_app, terminal_rows
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import Terminal
 from support import LIMIT_S
@@ -47,9 +49,9 @@ CHILDREN = [
     c.ChildRow("root/inner/spare", 2, "worker", "stopped"),
 ]
 REGISTRARS = [
-    c.RegistrarRow("app", "up"),
-    c.RegistrarRow("cameras", "up", ["cameras/camera"]),
-    c.RegistrarRow("lenses", "up", ["lenses/lens", "lenses/filter"]),
+    c.RegistrarRow("app", "up", counts={"resources": 0, "queries": 2, "mailbox": 0}),
+    c.RegistrarRow("cameras", "up", ["cameras/camera"], {"resources": 2, "queries": 1, "mailbox": 3}),
+    c.RegistrarRow("lenses", "up", ["lenses/lens", "lenses/filter"], {"resources": 1, "queries": 0, "mailbox": 0}),
     c.RegistrarRow("planner", "down"),
 ]
 SERVED = {
@@ -70,10 +72,11 @@ HISTORY = [
            -9, "SIGKILL", restarts=2, up_s=87.5),
     Record("restarted", "root/inner/cameras", "manager", 5, NOW - 12, "running", PID + 3, restarts=2, ready_s=0.125),
 ]  # fmt: skip
+_DUSTY = {"detail": "WARNING dusty", "status_id": "s", "source": "lenses/lens"}
 EVENTS = [
-    c.Event(1, NOW - 12.5, "exited", {"path": "root/inner/cameras", "kind": "manager", "signal": "SIGKILL"}),
-    c.Event(2, NOW - 12, "restarted", {"path": "root/inner/cameras", "kind": "manager", "pid": PID + 3}),
-    c.Event(3, NOW - 3, "status", {"registrar": "lenses", "server": "lenses/lens", "detail": "WARNING dusty"}),
+    c.Event(1, NOW - 3, "status", {"server": "cameras/camera", "request": '"/dev/video0"', "heard_by": "app"} | _DUSTY),
+    c.Event(2, NOW - 3, "status", {"server": "lenses/lens", "request": '"front"', "heard_by": ""} | _DUSTY),
+    c.Event(3, NOW - 2, "loaded", {"server": "cameras/camera", "request": '"/dev/video1"', "detail": ""}),
 ]
 
 
@@ -84,20 +87,21 @@ class Stage(ConsoleLink):
         self.state_dir = "/srv/robot"
         self._closed = threading.Event()
 
-    def ask(self, request: Any, expected: Any, timeout_s: float | None = None) -> Any:
+    def ask(self, request: Any, timeout_s: float | None = None) -> Any:
         match request:
-            case c.ListChildren(match, offset, limit):
+            case questions.ListChildren(match, offset, limit):
                 children = [row for row in CHILDREN if match in row.path]
                 return c.Children(len(children), children[offset : offset + limit])
-            case c.ListRegistrars(match, offset, limit):
+            case questions.ListRegistrars(match, offset, limit):
                 registrars = [row for row in REGISTRARS if match in row.name]
                 return c.Registrars(len(registrars), registrars[offset : offset + limit])
-            case c.ListResources(match, offset, limit, registrar):
-                served = [row for row in SERVED.get(registrar, []) if match in row.request]
+            case questions.ListResources(match, offset, limit, registrar):
+                served = SERVED.get(registrar, []) if registrar else [row for rows in SERVED.values() for row in rows]
+                served = [row for row in served if match in row.request]
                 return c.Resources(len(served), served[offset : offset + limit])
-            case c.ListHistory(path, _):
+            case questions.ListHistory(path, _):
                 return c.Happenings([record for record in HISTORY if record.path.startswith(path)])
-            case c.Find(id):
+            case questions.Find(id):
                 part = QueryRow(id, "cameras", "lenses/lens", LENS, FRONT, '"front"', "held", "WARNING")
                 found = [row for rows in SERVED.values() for row in rows if row.id == id]
                 return c.Found(found, [part] if id == id_of(9, 88) else [])
@@ -120,7 +124,7 @@ def _it_is_always_now(monkeypatch: pytest.MonkeyPatch) -> None:
         return time.strftime(form, time.gmtime(NOW) if at is None else at)
 
     clock = types.SimpleNamespace(time=lambda: NOW, monotonic=time.monotonic, localtime=time.gmtime, strftime=strftime)
-    for module in (explanations, terminal_app, terminal_rows):
+    for module in (event_texts, event_lines, explanations, terminal_app, terminal_rows):
         monkeypatch.setattr(module, "time", clock)
 
 
@@ -176,17 +180,48 @@ async def a_filter(terminal: Terminal, pilot: Pilot[None]) -> None:
 
 async def a_key_that_cannot(terminal: Terminal, pilot: Pilot[None]) -> None:
     await a_chosen_registrar(terminal, pilot)
-    await pilot.press("k")
+    await pilot.press("K")
     await shows(terminal, pilot, "choose a child")
 
 
+async def the_tree_alone(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await the_tree(terminal, pilot)
+    await pilot.press("z", "s", "s", "s", "s")
+    await shows(terminal, pilot, "children by mailbox", "▼mailbox", "root/inner/cameras")
+
+
+async def the_resources(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await the_tree(terminal, pilot)
+    await pilot.press("2", "s")
+    await shows(terminal, pilot, "resources by state", "unplugged", "id 00000003")
+
+
+async def the_help(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await the_tree(terminal, pilot)
+    await pilot.press("question_mark")
+    await shows(terminal, pilot, "the pane alone")
+
+
+async def a_wide_screen(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await the_tree(terminal, pilot)
+    await shows(terminal, pilot, "cpu, last 5 min", "@planner")
+
+
+SMALL = (80, 24)
+
+
 @pytest.mark.parametrize(
-    "look", [the_tree, a_chosen_child, a_chosen_registrar, a_chosen_resource, a_filter, a_key_that_cannot]
+    ("look", "size"),
+    [
+        *((look, SMALL) for look in (the_tree, a_chosen_child, a_chosen_registrar, a_chosen_resource, a_filter)),
+        *((look, SMALL) for look in (a_key_that_cannot, the_tree_alone, the_resources, the_help)),
+        (a_wide_screen, (250, 70)),
+    ],
 )
-def test_a_screen_looks_as_it_did(look: Look) -> None:
+def test_a_screen_looks_as_it_did(look: Look, size: tuple[int, int]) -> None:
     async def play() -> str:
         terminal = Terminal(Stage())
-        async with terminal.run_test(size=(80, 24)) as pilot:
+        async with terminal.run_test(size=size) as pilot:
             await look(terminal, pilot)
             await pilot.pause()
             return screen_of(terminal)
@@ -196,6 +231,6 @@ def test_a_screen_looks_as_it_did(look: Look) -> None:
         SCREENS.mkdir(exist_ok=True)
         file.write_text(seen)
 
-    assert len(seen.splitlines()) == 24
-    assert max(map(len, seen.splitlines())) <= 80
+    assert len(seen.splitlines()) == size[1]
+    assert max(map(len, seen.splitlines())) <= size[0]
     assert seen == file.read_text()

@@ -51,6 +51,7 @@ def test_the_tree_shows_the_children_and_the_chosen_ones_history(shop: rr.System
         tab.goes_to(page.url)
         tab.sees(node("root"), "root", "one_for_one, 3 in 5 s", "0/3")
         tab.sees(node("root/shop"), "●", "running", str(pid_of(shop, "shop")))
+        tab.sees("body", "Choose a child to see its history.")
         tab.do(tab.locate(node("root/shop")).click())
         tab.sees(".rr-rows", "running, pid", "started")
         assert page.url.partition("token=")[2] not in tab.page.url
@@ -62,6 +63,12 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.S
         tab.goes_to(page.url)
         tab.do(tab.locate(node("root/shop")).click())
         tab.clicks("kill -9")
+        tab.sees(".q-dialog", "Kill root/shop?")
+        tab.clicks("cancel")
+        tab.waits(lambda: not tab.do(tab.locate(".q-dialog").count()), "the end of the question")
+        assert pid_of(shop, "shop") == pid
+        tab.clicks("kill -9")
+        tab.clicks("kill")
         tab.sees("body", f"sent SIGKILL to root/shop (pid {pid})")
         tab.sees(node("root"), "1/3")  # first: the window empties by itself
         tab.sees(node("root/shop"), "↻1", "running")
@@ -105,6 +112,10 @@ def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
         while tab.do(tab.page.evaluate(focused)) != "kill -9":
             tab.presses("Tab")
         tab.presses("Enter")
+        tab.sees(".q-dialog", "Kill root/shop?")
+        while tab.do(tab.page.evaluate(focused)) != "kill":
+            tab.presses("Tab")
+        tab.presses("Enter")
         tab.sees("body", f"sent SIGKILL to root/shop (pid {pid})")
         tab.sees(node("root/shop"), "↻1", "running")
 
@@ -113,9 +124,27 @@ def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
 def test_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
     with shop.serve_web() as page:
         tab.goes_to(page.url)
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.sees(".rr-rows", "running, pid")
+        shop.supervisor().terminate_child("shop")
+        tab.sees(node("root/shop"), "stopped")
+        tab.clicks("kill -9")
+        tab.clicks("kill")
+        tab.sees(".q-notification", "kill -9:", "root/shop")
+
+
+@pytest.mark.slow
+def test_the_root_has_no_buttons_as_none_of_them_would_work(shop: rr.System, tab: Tab) -> None:
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.sees(".rr-rows", "running, pid")
+        assert tab.do(tab.page.get_by_role("button", name="stop", exact=True).count()) == 1
         tab.do(tab.locate(node("root")).click())
-        tab.clicks("stop")
-        tab.sees("body", "it is the root supervisor")
+        tab.waits(
+            lambda: not tab.do(tab.page.get_by_role("button", name="stop", exact=True).count()),
+            "the end of the buttons",
+        )
 
 
 @pytest.mark.slow
@@ -154,7 +183,7 @@ CHART = """(() => {
 
 def titles(tab: Tab) -> str:
     """What the graph draws, as ECharts has it: names, labels, sizes."""
-    return tab.do(tab.page.evaluate(f"({LOOKS})({CHART})"))
+    return tab.do(tab.page.evaluate(f"({LOOKS})({CHART})")).replace("\\n", " ")
 
 
 def keep_pictures(tab: Tab) -> None:
@@ -172,6 +201,24 @@ def keep_pictures(tab: Tab) -> None:
 
 def sees_drawn(tab: Tab, *words: str) -> None:
     tab.waits(lambda: all(word in titles(tab) for word in words), f"{words} in the graph")
+
+
+def clicks_node(tab: Tab, name: str, *words: str) -> None:
+    """Click a node of the graph with the mouse, until the graph has these words."""
+    place = f"""(() => {{
+        const chart = {CHART}, box = chart.getDom().getBoundingClientRect();
+        const node = chart.getOption().series[1].data.find((one) => one.name === {json.dumps(name)});
+        const [x, y] = node ? chart.convertToPixel({{xAxisIndex: 0, yAxisIndex: 0}}, node.value) : [0, 0];
+        return [box.left + x, box.top + y];
+    }})()"""
+
+    def clicked() -> bool:
+        if all(word in titles(tab) for word in words):
+            return True
+        tab.do(tab.page.mouse.click(*tab.do(tab.page.evaluate(place))))
+        return False
+
+    tab.waits(clicked, f"{words} in the graph after a click at {name}")
 
 
 @pytest.fixture
@@ -239,6 +286,30 @@ def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System,
         tab.clicks("unload from all")
         tab.sees("body", "away from 1 holder")
         tab.waits(lambda: not app.queries(), "taken away")
+        app.load("provider/other", "stool")
+        sees_drawn(tab, '["other \\"stool\\"",1,0]')  # not dim, though what was chosen has gone
+
+
+@pytest.mark.slow
+def test_what_a_button_did_is_said_although_another_row_was_chosen_meanwhile(camera: rr.System, tab: Tab) -> None:
+    begun, may_end = threading.Event(), threading.Event()
+
+    def unload(request: str, response: str) -> None:
+        begun.set()
+        may_end.wait(LIMIT_S)
+
+    camera.registrar("provider").register_server("slow", lambda request: "made", unload, request_type=str)
+    camera.registrar("app").load("provider/slow", "oven")
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.do(tab.locate('.ag-cell:has-text("oven")').first.click())
+        tab.clicks("unload")
+        tab.waits(begun.is_set, "its unload has begun")
+        tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
+        tab.sees(".rr-rows", 'provider/camera "front"')  # the button that was clicked is gone
+        may_end.set()
+        tab.sees("body", "released query", "oven")
 
 
 @pytest.mark.slow
@@ -314,12 +385,12 @@ def test_the_table_stays_usable_with_100_000_resources(start: Start, tab: Tab) -
 
         tab.goes_to(page.url)
         tab.goes_to(page.url.partition("?")[0] + "resources")
-        sees_drawn(tab, f"provider: {MANY} resources")
+        sees_drawn(tab, f"thing {MANY:,}")
         tab.sees(cells, "provider/thing")
 
         quickly(lambda: rows(offset=MANY - 100, limit=100)[1], PAGE_S)
         quickly(lambda: rows(match="lamp 99999", offset=0, limit=100)[1], SEARCH_S)
-        assert [row["request"] for row in rows(match="lamp 99999")[0]["rows"]] == ['"lamp 99999"']
+        assert [row["resource"] for row in rows(match="lamp 99999")[0]["rows"]] == ['provider/thing "lamp 99999"']
         last = rows(offset=MANY - 1, limit=MANY)[0]
         assert (last["total"], len(last["rows"])) == (MANY, 1)
         assert len(rows(offset=0, limit=MANY)[0]["rows"]) == 500
@@ -333,7 +404,7 @@ def test_the_table_stays_usable_with_100_000_resources(start: Start, tab: Tab) -
         began = time.monotonic()
         tab.do(tab.page.evaluate(f"{grid}.ensureIndexVisible({MANY - 1})"))
         at_end = rows(offset=MANY - 3, limit=3)[0]["rows"]
-        tab.sees(cells, *(row["request"] for row in at_end))
+        tab.sees(cells, *(row["resource"] for row in at_end))
         print(f"scrolled to the end in {time.monotonic() - began:.2f} s, {grown / 2**20:.0f} MiB more")
         shown = tab.do(tab.page.evaluate(f"document.querySelectorAll('{cells} .ag-row').length"))
         assert 0 < shown < 100
@@ -348,18 +419,32 @@ PAGE_S, SEARCH_S = 1.0, 3.0
 
 
 @pytest.mark.slow
-def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for_what_is_visible(
+def test_from_300_resources_on_the_graph_shows_servers_opens_them_and_shows_one_with_its_neighbours(
     start: Start, tab: Tab
 ) -> None:
     system = start()
-    provider, app = system.open_registrar("provider"), system.open_registrar("app")
-    serve(provider, "thing")
-    app.load_all([("provider/thing", number) for number in range(301)])
+    lenses, cameras, app = map(system.open_registrar, ("lenses", "cameras", "app"))
+    serve(lenses, "lens")
+    serve(cameras, "camera", load=lambda request: cameras.load("lenses/lens", request).id)
+    app.load_all([("cameras/camera", number) for number in range(151)])
+    (lens,) = [row for row in lenses.resources() if row.request == 77]
+    lenses.send_status(lens.id, rr.Status("ERROR", "dark"))
     with system.serve_web() as page:
         tab.goes_to(page.url)
         tab.goes_to(page.url.partition("?")[0] + "resources")
-        sees_drawn(tab, "provider: 301 resources", "app: 0 resources", ",1]")
-        tab.sees(".ag-center-cols-container", "provider/thing")
+        sees_drawn(tab, "lens 151 1 ERROR", "camera 151 1 ERROR", "@app")
+        tab.sees(".rr-note", "302 resources")
+        tab.sees(".ag-center-cols-container", "cameras/camera")
+
+        clicks_node(tab, "#lenses/lens", "lens 111 more", "lens 77", "camera 151 1 ERROR")
+        clicks_node(tab, lens.id, "lens 77", "camera 77", "@app")
+        assert "camera 151" not in titles(tab)
+        tab.sees(".rr-note", "all above and below it")
+        tab.sees(".rr-rows", "ERROR: dark")
+        lenses.send_status(lens.id, rr.Status("WARNING", "dim"))
+        sees_drawn(tab, "! lens 77", "! camera 77")
+        tab.clicks("all")
+        sees_drawn(tab, "lens 151 1 WARNING", "camera 151 1 WARNING")
     asked = [url for url in tab.asked if "/rows/" in url]
     assert asked
     assert all("limit=100" in url for url in asked)
@@ -377,6 +462,8 @@ def test_a_load_and_a_crash_are_drawn_as_sequences_to_copy_and_to_save(
     with system.serve_web() as page:
         tab.goes_to(page.url)
         tab.clicks("Sequence", role="link")
+        tab.sees("body", "Press record, and choose what has happened")
+        assert not tab.do(tab.locate(".rr-sequence svg").count())
         tab.clicks("record")
         tab.sees(".rr-note", "recording")
         app.load("shop/thing", Order("chair"))
@@ -495,6 +582,9 @@ def test_a_page_that_stays_open_shows_the_system_that_starts_again(
         tab.sees(node("root/shop"), "running", str(pid_of(system, "shop")))
         system.stop()
         tab.sees(".rr-status", "waiting for it")
+        tab.sees(".rr-banner", "No answer since")
+        tab.sees(node("root/shop"), "?", "unknown since")
+        assert "●" not in tab.text(node("root/shop"))
         with rr.System(children, state_dir=state_dir) as again:
             tab.sees(node("root/shop"), "running", str(pid_of(again, "shop")))
             tab.sees(".rr-status", f"pid {os.getpid()}")
@@ -524,6 +614,34 @@ def test_the_slider_shows_the_tree_as_it_was_and_now_again(start: Start, worksho
         assert str(before) in tab.text(node("root/shop"))
         tab.clicks("now")
         tab.sees(node("root/shop"), "stopped")
+
+
+@pytest.mark.slow
+def test_a_mouse_moves_the_slider_and_the_page_says_that_it_shows_the_past(
+    start: Start, workshop: Workshop, tab: Tab
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    before = pid_of(system, "shop")
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.sees(node("root/shop"), str(before))
+        kill(system, "shop")
+        tab.sees(node("root/shop"), "↻1", "running")
+        slider = tab.locate(".q-slider__track-container")
+        tab.do(slider.click(position={"x": 2, "y": 5}))
+        tab.sees(node("root/shop"), str(before))
+        tab.sees(".rr-banner", "This is the picture of", "buttons are off")
+        tab.waits(lambda: tab.do(tab.page.get_by_role("button", name="stop", exact=True).is_disabled()), "off")
+        box = tab.do(slider.bounding_box())
+        assert box is not None
+        tab.do(tab.page.mouse.move(box["x"] + 2, box["y"] + 5))
+        tab.do(tab.page.mouse.down())
+        tab.do(tab.page.mouse.move(box["x"] + box["width"], box["y"] + 5, steps=5))
+        tab.do(tab.page.mouse.up())
+        tab.sees(node("root/shop"), "↻1")
+        tab.waits(lambda: not tab.do(tab.locate(".rr-banner").is_visible()), "now, without a word about the past")
+        tab.waits(lambda: tab.do(tab.page.get_by_role("button", name="stop", exact=True).is_enabled()), "on")
 
 
 @pytest.mark.slow
@@ -651,3 +769,40 @@ def test_where_a_page_cannot_be_served_is_refused_before_anything_starts(
 ) -> None:
     with pytest.raises(rr.UsageError, match=f"serve_web: {told}"):
         system.serve_web(**where)
+
+
+# -- how it looks ----------------------------------------------------------------------------------------------------
+
+CUT = """(() => {
+    const cut = (element) => {
+        const mine = element.getBoundingClientRect(), panel = element.closest('.rr-panel').getBoundingClientRect();
+        return mine.left < panel.left || mine.right > panel.right || element.scrollWidth > element.clientWidth;
+    };
+    return [...document.querySelectorAll('.rr-node')].filter(cut).map(element => element.innerText);
+})()"""
+
+
+@pytest.mark.parametrize("width", [420, 1400, 2560])
+def test_no_page_is_wider_than_the_screen_and_no_child_is_cut_off(start: Start, chromium: Chromium, width: int) -> None:
+    inner = rr.Supervisor([rr.ChildSpec(rr.Actor, id="somewhat-long-name")], id="inner")
+    with start(rr.ChildSpec(rr.Actor, id="a"), inner).serve_web() as page, chromium.tab(width, 900) as tab:
+        tab.goes_to(page.url)
+        for path in ("", "timeline", "resources", "sequence"):
+            tab.do(tab.page.goto(page.url.partition("?")[0] + path))
+            tab.sees(".rr-status", "pid")
+            assert tab.do(tab.page.evaluate("document.documentElement.scrollWidth")) <= width, path
+            if path in ("", "resources"):
+                tab.sees(node("root/inner/somewhat-long-name"), "running")
+                assert tab.do(tab.page.evaluate(CUT)) == []
+
+
+def test_the_page_is_dark_where_the_system_is(shop: rr.System, tab: Tab) -> None:
+    looks = """['.rr-node', 'body'].map((selector) => {
+        const colour = getComputedStyle(document.querySelector(selector)).backgroundColor;
+        return Math.max(...colour.match(/[0-9]+/g).slice(0, 3));
+    })"""
+    with shop.serve_web() as page:
+        tab.do(tab.page.emulate_media(color_scheme="dark"))
+        tab.goes_to(page.url)
+        tab.sees(node("root/shop"), "running")
+        assert max(tab.do(tab.page.evaluate(looks))) < 80

@@ -6,19 +6,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.registrar.pages import Holder, ResourceRow
+from rr_actors.registrar.pages import Holder, ResourceRow, ServerRow
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Entries, Event, Events, RegistrarRow
+from rr_actors.system.console.console_questions import ListServers
+from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.web import sequence_page
-from rr_actors.tools.web.graph_picture import around, chart, edges_in, travels
+from rr_actors.tools.web.graph_picture import Chart, around, chart, edges_in, neighbours_of, rows_of_server, travels
 from rr_actors.tools.web.sequence_page import Recorder
 from rr_actors.tools.web.watch import Moment, Watch
 from support import Gate, child, eventually, kill, serve
+from support_inside import node_of
 
 Start = Callable[..., rr.System]
 
@@ -79,15 +83,85 @@ def test_a_request_is_no_markup_in_a_tooltip() -> None:
     assert "<img" not in node["tooltip"]["formatter"]
 
 
-def test_too_many_resources_are_shown_as_their_registrars() -> None:
-    registrars = tuple(RegistrarRow(name, "up", [], {"resources": 400}) for name in ("app", "cameras", "lenses"))
-    options = chart(Moment(1.0, registrars=registrars, resources=(LENS, FRONT), total=400))["series"][1]
+MANY = Moment(
+    1.0,
+    registrars=(RegistrarRow("app", "up"), RegistrarRow("radar", "dormant")),
+    total=19_999,
+    servers=(
+        ServerRow("app", {}, {"cameras/camera": 2}),
+        ServerRow("guard", {}, {"cameras/camera": 1}),
+        ServerRow("cameras/camera", {"OK": 12_000, "ERROR": 3, "WARNING": 7_000}, {"lenses/lens": 19_000}),
+        ServerRow("lenses/lens", {"OK": 996}),
+    ),
+)
 
-    assert {node["name"] for node in options["data"]} == {"@app", "@cameras", "@lenses"}
-    assert {(link["source"], link["target"]) for link in options["links"]} == {
-        ("@cameras", "@lenses"),
-        ("@app", "@cameras"),
+
+def nodes_of(options: Chart) -> dict[str, Any]:
+    return {node["name"]: node for node in options["series"][1]["data"]}
+
+
+def links_of(options: Chart) -> set[tuple[str, str]]:
+    return {(link["source"], link["target"]) for link in options["series"][1]["links"]}
+
+
+def test_too_many_resources_are_shown_as_their_servers_with_counts_in_the_colour_of_the_worst() -> None:
+    options = chart(MANY)
+    nodes = nodes_of(options)
+
+    assert nodes["#cameras/camera"]["label"]["formatter"] == "✖ camera\n19,003\n3 ERROR\n7,000 WARNING"
+    assert nodes["#lenses/lens"]["label"]["formatter"] == "lens\n996"
+    assert nodes["@radar"]["label"]["formatter"].endswith("@radar: dormant")
+    bad = nodes_of(chart(Moment(1.0, resources=(resource("bad", "a/b", state="ERROR"),), total=1)))["bad"]
+    assert nodes["#cameras/camera"]["itemStyle"]["color"] == bad["itemStyle"]["color"]
+    assert nodes["#lenses/lens"]["itemStyle"]["color"] != bad["itemStyle"]["color"]
+    assert links_of(options) == {
+        ("@app", "#cameras/camera"),
+        ("@guard", "#cameras/camera"),
+        ("#cameras/camera", "#lenses/lens"),
     }
+
+
+def test_an_opened_server_has_its_rows_and_a_node_for_those_that_are_left() -> None:
+    broken = resource("broken", "cameras/camera", ("app", ""), state="ERROR")
+    options = chart(MANY, opened={"cameras/camera": [broken], "lenses/lens": [LENS]})
+
+    assert nodes_of(options)["#cameras/camera"]["label"]["formatter"] == (
+        "✖ camera\n19,002 more\n2 ERROR\n7,000 WARNING"
+    )
+    assert nodes_of(options)["broken"]["label"]["formatter"] == '✖ camera "broken"'
+    assert ("@app", "broken") in links_of(options)
+    assert ("@guard", "broken") not in links_of(options)  # it holds another camera
+    assert ("#cameras/camera", "lens") in links_of(options)
+
+
+def test_the_servers_of_a_system_are_counted_and_opened_the_worst_first_and_a_resource_has_its_neighbours(
+    start: Start, state_dir: Path
+) -> None:
+    system = start()
+    app, maps, cameras = map(system.open_registrar, ("app", "maps", "cameras"))
+    serve(cameras, "camera")
+    serve(cameras, "spare")
+    serve(maps, "map", load=lambda request: maps.load("cameras/camera", request).id)
+    top = app.load("maps/map", "hall")
+    app.load_all([("cameras/camera", f"unused {number}") for number in range(50)])
+    (hall,) = [row for row in cameras.resources() if row.request == "hall"]
+    cameras.send_status(hall.id, rr.Status("ERROR", "dark"))
+    link = ConsoleLink(state_dir)
+    try:
+        eventually(lambda: app.queries()[0].state == "ERROR")
+        servers = {row.server: row for row in link.ask(ListServers()).rows}
+        opened = rows_of_server(link.ask, "cameras/camera", servers["cameras/camera"].states)
+        near = neighbours_of(link.ask, hall.id)
+    finally:
+        link.close()
+
+    assert servers["cameras/camera"].states == {"OK": 50, "ERROR": 1}
+    assert servers["cameras/spare"] == ServerRow("cameras/spare")
+    assert servers["maps/map"].holds == {"cameras/camera": 1}
+    assert servers["app"] == ServerRow("app", {}, {"maps/map": 1, "cameras/camera": 50})
+    assert opened[0].id == hall.id
+    assert len(opened) == 40
+    assert [row.id for row in near] == [hall.id, top.resource_id]
 
 
 def test_a_watch_keeps_what_was_and_shares_what_has_not_changed(start: Start, state_dir: Path) -> None:
@@ -183,8 +257,7 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> Gate:
 
 
 def is_recorded(system: rr.System) -> bool:
-    assert system._node is not None
-    return system._node.watched.recording
+    return node_of(system).watched.recording
 
 
 def test_two_clicks_on_record_leave_one_recording_and_stop_ends_it(

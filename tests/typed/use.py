@@ -55,6 +55,17 @@ class Cameras(rr.Manager):
     def me(self) -> rr.ActorRef[Any]:
         return self.actor_ref
 
+    @rr.server("zoom")
+    def zoom(self, device: str, factor: float = 1.0) -> Feed:
+        return Feed(f"{device} at {factor}")
+
+    @zoom.unload
+    def end_zoom(self, device: str, response: Feed) -> None: ...
+
+    @rr.server("all")
+    def open_all(self) -> list[str]:
+        return []
+
     @rr.server("anything")
     def anything(self, request: Any) -> Any:
         return request
@@ -104,6 +115,10 @@ def use(app: rr.Registrar, block: bool) -> None:
     assert_type(of_subclass.response, Feed)
     rate: rr.Query[float] = app.load(Cameras.measure_rate, "/dev/video0")  # of async callbacks mypy knows Any
     assert rate.response == 30.0
+
+    assert_type(app.load(Cameras.zoom, {"device": "a", "factor": 2}), rr.Query[Feed])
+    assert_type(app.load(Cameras.open_all), rr.Query[list[str]])
+    app.load("cameras/all")
 
     later = app.load("cameras/camera", OpenCamera("b"), block=False)
     assert_type(later, pykka.Future[rr.Query[Any]])

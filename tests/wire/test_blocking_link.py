@@ -16,6 +16,7 @@ from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import deadline_of, left_until
 from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.segments import Segments
 from rr_actors.wire.transport import Link, Welcome
 from rr_actors.wire.unix_link import Wire
 from rr_actors.wire.unix_sockets import SocketDir
@@ -175,7 +176,7 @@ def test_a_thread_hears_that_the_connection_is_lost(peer: Peer, line: BlockingLi
 def test_a_message_over_the_limit_leaves_it_as_it_was(peer: Peer) -> None:
     wire = Wire(msgspec.msgpack.Decoder(Note), 100)
     sockets = SocketDir(peer.directory)
-    line = BlockingLink(sockets, KEY, peer.transport.address, HELLO, wire, 5.0)
+    line = BlockingLink(sockets, KEY, peer.transport.address, HELLO, wire, 5.0, Segments(0))
     with pytest.raises(NotSerializable, match="100"):
         line.exchange(LONG, deadline_of(1.0))
     assert line.exchange(SHORT, deadline_of(1.0)) == SHORT

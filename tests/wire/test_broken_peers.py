@@ -18,6 +18,7 @@ import rr_actors as rr
 from fuzz.packed import changed, samples
 from rr_actors.actors.remote import protocol
 from rr_actors.base.values.canonical import encode
+from rr_actors.registrar.links import remote_calls
 from rr_actors.registrar.links.provider_link import THREADS as DIRECT
 from rr_actors.registrar.model.messages import (
     Describe,
@@ -31,11 +32,11 @@ from rr_actors.registrar.model.messages import (
     Unload,
     Unloaded,
 )
-from rr_actors.system.hosting import remote_calls
 from rr_actors.wire.frames import GOODBYE
 from rr_actors.wire.handshake import DiallerHandshake
 from rr_actors.wire.transport import Hello
 from support import Workshop, eventually, pid_of
+from support_inside import actor_of, node_of
 from support_managers import Order, Shop
 from support_transports import frame
 
@@ -63,8 +64,7 @@ def app(shop: rr.System) -> rr.Registrar:
 
 def let_in(peer: socket.socket, system: rr.System, hello: Hello) -> None:
     """Prove on a fresh connection that one has the key, and be welcomed."""
-    node = system._node
-    assert node is not None
+    node = node_of(system)
     handshake = DiallerHandshake(node.info.key, hello)
     while not handshake.done:
         data = peer.recv(4096)
@@ -164,10 +164,9 @@ def test_messages_with_a_part_that_is_wrong_harm_nobody_else(
 def test_an_answer_that_a_provider_gives_unasked_or_twice_is_nobodys(shop: rr.System, app: rr.Registrar) -> None:
     """The link to a good provider, on which answers come again: whatever was lost may have been sent twice."""
     held = app.load("shop/thing", Order("held"))
-    actor: Any = app._actor
+    actor: Any = actor_of(app)
     client = actor.clients["shop"]
-    node = shop._node
-    assert node is not None
+    node = node_of(shop)
 
     async def say() -> None:
         for _ in range(3):

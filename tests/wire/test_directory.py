@@ -19,7 +19,15 @@ import pytest
 
 from rr_actors.base.errors import CatalogLocked, ConfigError, InvalidName, UsageError
 from rr_actors.tools.inspection import read_state
-from rr_actors.wire.name_service import Directory, Entry, StateDir, Status, actor_key, open_state_dir, registrar_key
+from rr_actors.wire.name_service import (
+    Directory,
+    NameEntry,
+    Presence,
+    StateDir,
+    actor_key,
+    open_state_dir,
+    registrar_key,
+)
 from support import Calls
 from support_asks import Background
 
@@ -84,22 +92,22 @@ def as_somebody_else(*paths: Path) -> Iterator[None]:
 
 def test_a_published_name_is_found_at_its_address(directory: Directory) -> None:
     directory.publish("r.cameras", "4711-0a1b.sock")
-    assert directory.lookup("r.cameras") == Entry(Status.UP, "4711-0a1b.sock")
+    assert directory.lookup("r.cameras") == NameEntry(Presence.UP, "4711-0a1b.sock")
 
 
 def test_an_announced_name_is_starting_at_the_address_where_it_will_be(directory: Directory) -> None:
-    directory.mark("r.cameras", Status.STARTING)
+    directory.mark("r.cameras", Presence.STARTING)
     directory.announce("r.cameras", "4711-0a1b.sock")
-    assert directory.lookup("r.cameras") == Entry(Status.STARTING, "4711-0a1b.sock")
-    directory.mark("r.cameras", Status.STARTING)
-    assert directory.lookup("r.cameras") == Entry(Status.STARTING, "")
+    assert directory.lookup("r.cameras") == NameEntry(Presence.STARTING, "4711-0a1b.sock")
+    directory.mark("r.cameras", Presence.STARTING)
+    assert directory.lookup("r.cameras") == NameEntry(Presence.STARTING, "")
 
 
-@pytest.mark.parametrize("status", [status for status in Status if status is not Status.UP])
-def test_a_marked_name_has_its_status_and_no_address(directory: Directory, status: Status) -> None:
+@pytest.mark.parametrize("status", [status for status in Presence if status is not Presence.UP])
+def test_a_marked_name_has_its_status_and_no_address(directory: Directory, status: Presence) -> None:
     directory.publish("r.cameras", "somewhere")
     directory.mark("r.cameras", status)
-    assert directory.lookup("r.cameras") == Entry(status, "")
+    assert directory.lookup("r.cameras") == NameEntry(status, "")
 
 
 def test_a_name_that_was_never_there_is_none(directory: Directory) -> None:
@@ -109,14 +117,25 @@ def test_a_name_that_was_never_there_is_none(directory: Directory) -> None:
 def test_names_lists_them_sorted(directory: Directory) -> None:
     assert directory.names() == []
     directory.publish("r.b", "x")
-    directory.mark("a.root~a", Status.STARTING)
+    directory.mark("a.root~a", Presence.STARTING)
     assert directory.names() == ["a.root~a", "r.b"]
 
 
 def test_what_another_directory_object_writes_is_seen_at_once(directory: Directory) -> None:
     other = Directory(directory.run_dir)
     other.publish("r.cameras", "here")
-    assert directory.lookup("r.cameras") == Entry(Status.UP, "here")
+    assert directory.lookup("r.cameras") == NameEntry(Presence.UP, "here")
+
+
+def test_an_entry_that_says_the_same_is_not_made_again_and_one_that_another_object_changed_is(tmp_path: Path) -> None:
+    mine, other = Directory(tmp_path), Directory(tmp_path)
+    mine.mark("a.root", Presence.STARTING)
+    made = os.lstat(tmp_path / "names" / "a.root").st_ino
+    mine.mark("a.root", Presence.STARTING)
+    assert os.lstat(tmp_path / "names" / "a.root").st_ino == made
+    other.publish("a.root", "/address")
+    mine.mark("a.root", Presence.STARTING)
+    assert mine.lookup("a.root") == NameEntry(Presence.STARTING, "")
 
 
 def test_a_foreign_file_under_a_name_is_no_entry(directory: Directory) -> None:
@@ -131,12 +150,12 @@ def test_names_that_are_no_file_names_are_refused(directory: Directory, name: st
     with pytest.raises(UsageError):
         directory.publish(name, "x")
     with pytest.raises(UsageError):
-        directory.mark(name, Status.GONE)
+        directory.mark(name, Presence.GONE)
 
 
 def test_up_cannot_be_marked_without_an_address(directory: Directory) -> None:
     with pytest.raises(UsageError, match="publish"):
-        directory.mark("r.x", Status.UP)
+        directory.mark("r.x", Presence.UP)
 
 
 def test_publishing_in_a_directory_that_was_removed_is_a_config_error_naming_it(directory: Directory) -> None:
@@ -172,7 +191,7 @@ def test_two_threads_that_miss_the_directory_at_once_make_it_once(
     directory.publish("r.cameras", "here")
     other.result(timeout=10)
     assert len(made) == 1
-    assert directory.lookup("r.cameras") == Entry(Status.UP, "here")
+    assert directory.lookup("r.cameras") == NameEntry(Presence.UP, "here")
 
 
 def test_keys_of_registrars_and_actors_do_not_collide_and_are_checked() -> None:
@@ -192,13 +211,13 @@ def test_a_deep_path_has_a_key_of_its_own_that_fits_a_file_name(directory: Direc
     for key in keys:
         assert len(key) < 250
         directory.publish(key, "x")
-        assert directory.lookup(key) == Entry(Status.UP, "x")
+        assert directory.lookup(key) == NameEntry(Presence.UP, "x")
 
 
 def test_no_entry_is_longer_than_any_file_system_allows(directory: Directory) -> None:
     classes = [f"robots.cameras.Camera{number}" for number in range(200)]
     directory.put_classes("cameras", classes)
-    directory.mark(registrar_key("cameras"), Status.STOPPED, "why " * 1000)
+    directory.mark(registrar_key("cameras"), Presence.STOPPED, "why " * 1000)
     names = directory.run_dir / "names"
     assert max(len(os.fsencode(os.readlink(path))) for path in names.iterdir()) <= 1023  # XFS
     kept = directory.manager_classes()["cameras"]
@@ -214,13 +233,13 @@ def test_readers_see_the_old_entry_or_the_new_and_never_none(directory: Director
     def read() -> None:
         while not done.is_set():
             entry = directory.lookup("r.cameras")
-            if entry is None or (entry.status is Status.UP and not entry.address.isdigit()):
+            if entry is None or (entry.status is Presence.UP and not entry.address.isdigit()):
                 problems.append(entry)
 
     def write(offset: int) -> None:
         for number in range(500):
             directory.publish("r.cameras", str(offset + number))
-            directory.mark("r.cameras", Status.STARTING)
+            directory.mark("r.cameras", Presence.STARTING)
 
     readers = [threading.Thread(target=read) for _ in range(2)]
     writers = [threading.Thread(target=write, args=(1000 * number,)) for number in range(3)]
@@ -270,8 +289,8 @@ def test_a_registrar_that_is_not_there_is_told_of_with_those_that_are(tmp_path: 
     directory = Directory(tmp_path)
     assert str(directory.no_registrar("cam")).endswith("it has: none")
     directory.publish(registrar_key("cameras"), "a")
-    directory.mark(registrar_key("maps"), Status.STARTING)
-    directory.mark(registrar_key("camera"), Status.GONE)
+    directory.mark(registrar_key("maps"), Presence.STARTING)
+    directory.mark(registrar_key("camera"), Presence.GONE)
     directory.publish(actor_key("root/cameras"), "a")
 
     error = directory.no_registrar("camera")
@@ -340,7 +359,7 @@ def test_a_second_system_in_the_same_process_is_refused_with_the_pid(tmp_path: P
         with pytest.raises(CatalogLocked, match=rf"by a system of this same process \(pid {os.getpid()}\)") as caught:
             open_state_dir(tmp_path)
         assert caught.value.details == {"path": str(tmp_path), "pid": os.getpid()}
-        assert Directory(first.run_dir).lookup("r.cameras") == Entry(Status.UP, "x")
+        assert Directory(first.run_dir).lookup("r.cameras") == NameEntry(Presence.UP, "x")
     with opened(tmp_path):
         pass
 

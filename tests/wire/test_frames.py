@@ -16,9 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rr_actors.base.errors import ConfigError, LoadFailed, NotSerializable, RrError, Unavailable, UnknownServer
-from rr_actors.registrar.model.messages import PROTOCOL, Describe, Load, Loaded, Message, failure_of
+from rr_actors.base.values.failure import failure_of
+from rr_actors.registrar.model.messages import Describe, Load, Loaded, Message
 from rr_actors.wire.frames import GOODBYE, FrameReader, framed
-from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
+from rr_actors.wire.handshake import PROTOCOL, AcceptorHandshake, DiallerHandshake, check_key
 from rr_actors.wire.transport import Hello, Welcome
 from support_transports import frame
 

@@ -326,7 +326,7 @@ class Provider:
 
     def join_here(self, _load: Load, _hello: object) -> None: ...
 
-    def received_directly(self, *_: object) -> None: ...
+    def received_here(self, *_: object) -> None: ...
 
     def lost_directly(self, _line: LocalLine) -> None: ...
 
@@ -341,7 +341,8 @@ def provider() -> Provider:
 
 @pytest.fixture
 def line(provider: Provider) -> LocalLine:
-    return LocalLine(provider, provider, HELLO)
+    both: Any = provider
+    return LocalLine(both, both, HELLO)
 
 
 LOAD = Load("q", "thing", b"", "app", "", 0, 1)

@@ -23,13 +23,15 @@ import rr_actors as rr
 from rr_actors.actors.remote import protocol
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.values.canonical import encode
+from rr_actors.registrar.links import remote_calls
 from rr_actors.registrar.links.provider_link import THREADS as DIRECT
-from rr_actors.registrar.model.messages import PROTOCOL, Describe, Described, Fetched, Load, Message
-from rr_actors.system.hosting import remote_calls
-from rr_actors.wire.name_service import Directory, Status, registrar_key
+from rr_actors.registrar.model.messages import Describe, Described, Fetched, Load, Message
+from rr_actors.wire.handshake import PROTOCOL
+from rr_actors.wire.name_service import Directory, Presence, registrar_key
 from rr_actors.wire.transport import Hello, Link
 from rr_actors.wire.unix_transport import STRANGERS_LIMIT, UnixTransport
 from support import Workshop, eventually, pid_of
+from support_inside import node_of
 from support_managers import Order, Shop
 from support_transports import frame
 
@@ -58,7 +60,7 @@ def socket_of(state_dir: Path, registrar: str) -> Path:
     """The socket of the process that a registrar is in."""
     entry = Directory(run_dir(state_dir)).lookup(registrar_key(registrar))
     assert entry is not None
-    assert entry.status is Status.UP
+    assert entry.status is Presence.UP
     return run_dir(state_dir) / entry.address
 
 
@@ -118,6 +120,26 @@ def test_who_does_not_prove_himself_is_cut_off_and_nobody_else_notices(
             assert cut_off(peer)
     use(app, "another")
     assert [query.id for query in app.queries()] == [held.id]
+
+
+def test_many_bad_connections_are_counted_and_summed_up_in_the_log(
+    system: rr.System, state_dir: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.wire.unix_sockets.REFUSALS_S", 0.5)
+    system.open_registrar("app")
+    for _ in range(50):
+        with dialled(socket_of(state_dir, "app"), 6) as peers:
+            for peer in peers:
+                peer.sendall(WORDS["HTTP"])
+            assert all(map(cut_off, peers))
+
+    def counted() -> tuple[int, int]:
+        said = [record.getMessage() for record in caplog.records]
+        more = [int(text.split()[0]) for text in said if " more connections were refused within " in text]
+        return sum(text.startswith("closing a connection of pid") for text in said) + sum(more), len(said)
+
+    eventually(lambda: counted()[0] == 300)
+    assert counted()[1] < 30
 
 
 def test_a_peer_with_another_systems_key_is_refused(shop: rr.System, state_dir: Path) -> None:
@@ -238,8 +260,7 @@ def test_the_same_frames_from_a_peer_with_the_key_do_open_it(shop: rr.System, st
     """So the test above would see it: the frames are right, it is the key that is missing."""
     sprung = tmp_path / "sprung"
     trap = pickle.dumps(Trap(sprung))
-    node = shop._node
-    assert node is not None
+    node = node_of(shop)
     key = node.info.key
     codecs = {remote_calls.KIND: remote_calls.HandleMessage, protocol.KIND: protocol.Letter}
 
@@ -274,8 +295,7 @@ def test_a_peer_that_says_what_it_may_not_loses_its_link_alone(
 ) -> None:
     """Even with the key: the registrar goes on, and so does everyone else."""
     pid = pid_of(shop, "shop")
-    node = shop._node
-    assert node is not None
+    node = node_of(shop)
     key = node.info.key
 
     async def dial() -> None:
@@ -312,8 +332,7 @@ def test_a_pickle_in_place_of_a_request_stays_bytes(shop: rr.System, app: rr.Reg
 
 def test_the_key_is_in_no_file_environment_or_command_line(shop: rr.System, app: rr.Registrar, state_dir: Path) -> None:
     use(app, "something")
-    node = shop._node
-    assert node is not None
+    node = node_of(shop)
     key = node.info.key
     secrets = (key, key.hex().encode(), base64.b64encode(key))
     processes = [os.getpid(), pid_of(shop, "shop")]

@@ -22,9 +22,8 @@ from typing import Any
 import pytest
 
 from rr_actors.base.errors import ConfigError, MailboxFull, NotSerializable, Unavailable, UsageError
-from rr_actors.registrar.model.messages import PROTOCOL
 from rr_actors.wire import unix_link, unix_transport
-from rr_actors.wire.handshake import DiallerHandshake
+from rr_actors.wire.handshake import PROTOCOL, AcceptorHandshake, DiallerHandshake
 from rr_actors.wire.transport import Hello, Welcome
 from rr_actors.wire.unix_transport import STRANGERS_LIMIT, UnixTransport
 from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, authenticated, frame, loop_of, stream
@@ -419,13 +418,39 @@ def test_connecting_to_one_that_closes_at_once_is_tried_again_until_the_time_lim
     async def scenario() -> None:
         server = await asyncio.start_unix_server(close_at_once, tmp_path / "busy")
         async with transports(tmp_path, handshake_timeout_s=0.5) as [transport]:
-            with pytest.raises(Unavailable, match=r"closes each connection at once|did not send its greeting"):
+            with pytest.raises(Unavailable, match=r"closes each connection|did not send its greeting"):
                 await transport.connect("busy", HELLO, Inbox().attach)
         server.close()
         await server.wait_closed()
 
     run(scenario())
     assert tries > 2
+
+
+@pytest.mark.usefixtures("others_sockets")
+def test_one_whose_handshake_made_room_for_others_tries_again(run: Run, tmp_path: Path) -> None:
+    """A provider that was busy for PATIENCE_S greets, and gives the place to another before it reads the answer."""
+
+    async def scenario() -> None:
+        door = Door()
+        async with transports(tmp_path, 2) as [provider, consumer]:
+            await provider.listen(door)
+
+            async def make_room(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+                writer.write(AcceptorHandshake(KEY).greeting)
+                await reader.read(1)
+                await asyncio.sleep(unix_transport.PATIENCE_S)
+                (tmp_path / provider.address).rename(tmp_path / "busy")  # from now on there is room
+                writer.close()
+
+            server = await asyncio.start_unix_server(make_room, tmp_path / "busy")
+            link = await consumer.connect("busy", HELLO, Inbox().attach)
+            assert door.hellos == [HELLO]
+            link.close()
+            server.close()
+            await server.wait_closed()
+
+    run(scenario())
 
 
 @pytest.mark.usefixtures("others_sockets")

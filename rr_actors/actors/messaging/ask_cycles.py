@@ -47,6 +47,9 @@ class Awaited(Protocol):
 activity: ContextVar[Activity | None] = ContextVar("rr_actors_activity", default=None)
 """The handler that the current code belongs to."""
 
+INSTEAD = "start a thread for it, and return"
+"""What code can do that would wait for its own end."""
+
 _lock = threading.Lock()
 _waits: dict[str, list[Awaited]] = {}  # by the urn of the actor whose handler waits
 
@@ -70,6 +73,14 @@ def check_chain(target: Target, asked_by: Chain) -> None:
     for position, blocked in enumerate(asked_by):
         if blocked.urn == target.urn:
             raise _ring_error([*(other.name for other in asked_by[position:]), target.name])
+
+
+def check_end(urn: str, what: str) -> None:
+    """Raise UsageError if the call `what` ends the actor `urn`, and it or one below it waits for the call."""
+    for asker in chain():
+        if f"{asker.urn}/".startswith(f"{urn}/"):
+            text = f"{what} waits for the end of {asker.name}, which waits for this call: it would wait for itself"
+            raise UsageError(f"{text}; {INSTEAD}")
 
 
 def begin_wait(awaited: Awaited) -> str | None:

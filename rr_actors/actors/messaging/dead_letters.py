@@ -8,7 +8,6 @@ EVENTS_A_SECOND letters a second reach the listener.
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 import time
@@ -19,9 +18,10 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import Unavailable, shown
+from rr_actors.base.reporting.log import Log
 from rr_actors.runtime import event_loop
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 KEPT = 1000
 """How many letters are kept; older ones are dropped."""

@@ -7,10 +7,8 @@ actor gets it at the first watch. Pykka reports no end: so the actor's `actor_st
 from __future__ import annotations
 
 import itertools
-import logging
 import sys
 import threading
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -18,9 +16,11 @@ import pykka
 
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.base.errors import text_of
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import trace_of
 from rr_actors.runtime import event_loop
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 Fire = Callable[[ExitReport], None]
 """Called once, from any thread, with the report of the actor's end; must not block."""
@@ -92,5 +92,5 @@ def _how_it_ends() -> ExitReport:
     error = sys.exc_info()[1]
     if error is None or (isinstance(error, SystemExit) and not error.code):
         return ExitReport("normal", "stopped")
-    text = "".join(traceback.format_exception(error))
+    text = trace_of(error)
     return ExitReport("abnormal", text_of(error), error, text)

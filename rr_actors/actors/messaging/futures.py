@@ -10,11 +10,11 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import functools
-import logging
 import queue
 import sys
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import pykka
@@ -23,14 +23,17 @@ from pykka import ActorDeadError
 from rr_actors.actors.messaging import ask_cycles
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.base.errors import ActorUnavailable, UsageError
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import traceback_of
 from rr_actors.runtime import event_loop
+from rr_actors.runtime.callback_errors import log_raised, raised_by
 from rr_actors.runtime.shielding import is_interruptible, shielded
 from rr_actors.runtime.time_limits import time_limit
 
 if TYPE_CHECKING:
     from types import TracebackType
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 T = TypeVar("T")
 
@@ -58,7 +61,8 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     _open: Callable[[], Any] | None = None
     _running = False
     _cancelled = False
-    _callbacks: list[Callable[[], object]] | None = None
+    _callbacks: list[Callable[[], object]] | None = None  # this package's
+    _listeners: list[Callable[[Reply[T]], object]] | None = None  # a user's
     _watchers: list[Any] | None = None
     _gate: threading.Condition | None = None
     _hook_lock: threading.RLock | None = None
@@ -231,14 +235,31 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             self._hook_lock = threading.RLock()
 
     def add_done_callback(self, fn: Callable[[Reply[T]], object]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Call fn(this future) when it is set, in the thread that sets it; if it is set already, call fn now.
+        """Call fn(this future) soon after it is set, in a worker thread; if it is set already, call fn now.
+
+        Threads and coroutines that wait for the future do not wait for fn. What fn raises is logged. Without a running
+        loop of rr_actors the thread that sets the future calls fn.
 
         For a future from map(), join() and the like, this computes the value, in a new thread.
         """
-        self._on_set(functools.partial(fn, self))
+        if type(fn) is FunctionType and fn.__module__ == "asyncio.futures":  # of wrap_future(): it only wakes a loop
+            self.when_set(functools.partial(fn, self))
+        elif not self._listen(fn):
+            self._hear((fn,))
         self._run_hook()
 
-    def _on_set(self, callback: Callable[[], object]) -> None:
+    def _listen(self, fn: Callable[[Reply[T]], object]) -> bool:
+        """Keep a user's callback; return False if the future is set already."""
+        with self._lock:
+            if self._set:
+                return False
+            if self._listeners is None:
+                self._listeners = []
+            self._listeners.append(fn)
+            return True
+
+    def when_set(self, callback: Callable[[], object]) -> None:
+        """Call this package's callback, which must not block, in the thread that sets the future; now if it is set."""
         with self._lock:
             if not self._set:
                 if self._callbacks is None:
@@ -252,10 +273,9 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             loop = asyncio.get_running_loop()
         except RuntimeError:  # no asyncio loop runs the coroutine: do as Pykka does
             return (yield from super().__await__())
-        if self._hook_lock is not None:
-            return (yield from loop.run_in_executor(None, self.get).__await__())
+        self._run_hook()
         if not self._set:
-            yield from self._wait_on(loop).__await__()
+            yield from self._wait_on(loop)
         if self._open is not None and (process := event_loop.current()) is not None and process.is_loop_thread():
             yield from process.workers.run(self._unpack).__await__()
         return self.get()
@@ -323,6 +343,18 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 callback()
             except Exception:
                 logger.exception("a callback of %r raised", self)
+        if self._listeners is not None:
+            listeners, self._listeners = self._listeners, None
+            event_loop.aside(functools.partial(self._hear, listeners))
+
+    def _hear(self, listeners: Iterable[Callable[[Reply[T]], object]]) -> None:
+        for listener in listeners:
+            try:
+                listener(self)
+            except BaseException as error:
+                if isinstance(error, KeyboardInterrupt) and is_interruptible():
+                    raise
+                log_raised(logger, raised_by(error), "a callback of %r raised", self)
 
     def _run_hook(self) -> None:
         """Call get() in a new thread if there is a get hook: a caller waits for the value without get()."""
@@ -361,7 +393,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         waiter.acquire()
         waiting = ask_cycles.begin_wait(self)
         try:
-            self._on_set(waiter.release)
+            self.when_set(waiter.release)
             if not waiter.acquire(timeout=-1 if limit_s is None else limit_s):
                 self._forget(waiter.release)
                 if not self._set:
@@ -369,7 +401,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         finally:
             ask_cycles.end_wait(waiting, self)
 
-    async def _wait_on(self, loop: asyncio.AbstractEventLoop) -> None:
+    def _wait_on(self, loop: asyncio.AbstractEventLoop) -> Generator[Any, None, None]:
         waiter: asyncio.Future[None] = loop.create_future()
 
         def wake() -> None:
@@ -381,14 +413,21 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 loop.call_soon_threadsafe(wake)
             except RuntimeError:
                 logger.debug("%r was set after the loop that awaited it had closed", self)
+                self.unawaited()
 
         waiting = ask_cycles.begin_wait(self)
         try:
-            self._on_set(call_back)
-            await waiter
+            self.when_set(call_back)
+            yield from waiter
+        except BaseException:  # cancelled, perhaps in the moment in which this was set
+            self.unawaited()
+            raise
         finally:
             self._forget(call_back)
             ask_cycles.end_wait(waiting, self)
+
+    def unawaited(self) -> None:
+        """Note that a task that awaited this future was cancelled, or its loop closed. A load is withdrawn."""
 
     def _forget(self, callback: Callable[[], object]) -> None:
         with self._lock:
@@ -418,6 +457,25 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         return "a future" if self.target is None else f"the reply of {self.target.name}"
 
 
+def _derive(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return Pykka's method, which makes a future of the class of its first argument, for subclasses of Reply too.
+
+    Theirs have constructors with arguments.
+    """
+
+    @functools.wraps(method)
+    def derive(self: Reply[Any], *args: Any) -> Any:
+        plain: Reply[Any] = Reply()
+        plain.set_get_hook(lambda timeout: self.get(timeout=timeout))
+        return method(plain, *args)
+
+    return derive
+
+
+for _name in ("filter", "join", "map", "reduce"):
+    setattr(Reply, _name, _derive(getattr(pykka.Future, _name)))
+
+
 class StopReply(Reply[bool]):
     """The future of a stop: True, or False if the actor was dead already."""
 
@@ -440,7 +498,7 @@ class StopReply(Reply[bool]):
 
 def fail(reply: pykka.Future[Any], error: BaseException) -> None:
     """Set the exception that get() raises, with its traceback so far."""
-    reply.set_exception((type(error), error, error.__traceback__))
+    reply.set_exception((type(error), error, traceback_of(error)))
 
 
 def error_of(exc_info: ExcInfo | BaseException | None) -> BaseException:
@@ -450,6 +508,6 @@ def error_of(exc_info: ExcInfo | BaseException | None) -> BaseException:
     kind, error, traceback = exc_info or sys.exc_info()
     if error is None:
         error = kind() if kind is not None else RuntimeError("an exception was set without saying which")
-    if traceback is not None and error.__traceback__ is not traceback:
-        error = error.with_traceback(traceback)
+    if traceback is not None and traceback_of(error) is not traceback:
+        error = BaseException.with_traceback(error, traceback)
     return error

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import signal
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -25,15 +27,15 @@ from rr_actors.base.steps import Steps
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.shielding import Flag
-from rr_actors.wire.name_service import Directory, Status, actor_key
+from rr_actors.wire.name_service import Directory, Presence, actor_key
 from rr_actors.wire.transport import Attach, Hello, Link, Welcome
-from rr_actors.wire.unix_sockets import pid_of
+from rr_actors.wire.unix_sockets import paused, pid_of
 from rr_actors.wire.unix_transport import UnixTransport
 
 ASK_TIMEOUT_S = 30.0
 
 WATCH_S = 1.0
-"""How long monitor() waits until the other process confirms the watch."""
+"""How long monitor() waits until a process that a signal has stopped confirms the watch."""
 
 CUT_S = 1.0
 """How long, after its link is lost, a process may take to die before it counts as alive."""
@@ -123,8 +125,10 @@ class ActorHub:
 
     def ask(self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain) -> Callable[[], None]:
         """Send the message; `reply` is set later. Return what to call when nobody waits for the reply any more."""
-        body = pickling.dumps(message, f"message to {where.target.name}")
-        return self._call(where, reply, lambda number: Ask(number, where.target.urn, body, chain))
+        body = pickling.dumps_large(message, f"message to {where.target.name}")
+        return self._call(
+            where, reply, lambda number, line: Ask(number, where.target.urn, line.parcels.pack(body), chain)
+        )
 
     def line_to(self, where: Whereabouts) -> Line | None:
         """Return the line to the actor's process, or None if there is no line yet."""
@@ -146,10 +150,13 @@ class ActorHub:
             TimeoutError: no reply came in time.
             NotSerializable: the message cannot be pickled, or is too long.
         """
-        body = pickling.dumps(message, f"message to {where.target.name}")
+        body = pickling.dumps_large(message, f"message to {where.target.name}")
         call = Call(line.next_number(), reply, where)
         try:
-            answer = line.ask(Ask(call.number, where.target.urn, body, chain), timeout_s)
+            if isinstance(body, bytes):
+                answer = line.ask(Ask(call.number, where.target.urn, body, chain), timeout_s)
+            else:
+                answer = line.ask(Ask(call.number, where.target.urn, b"", chain), timeout_s, body)
         except TimeoutError:
             raise
         except OSError as error:
@@ -164,39 +171,66 @@ class ActorHub:
 
     def tell(self, where: Whereabouts, message: Any) -> None:
         """Send the message. If the actor ends before it arrives, the message is lost, and logged."""
-        body = pickling.dumps(message, f"message to {where.target.name}")
-        self._line(self._locate(where)).put(Tell(where.target.urn, body))
+        body = pickling.dumps_large(message, f"message to {where.target.name}")
+        line = self._line(self._locate(where))
+        line.put(Tell(where.target.urn, line.parcels.pack(body)))
 
     def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
         """Ask the actor's process about the actor: "alive", "class" or "attributes"."""
         reply: Reply[Any] = Reply()  # without a target: the process replies, so the actor's own handler may wait for it
-        self._call(where, reply, lambda number: Inquire(number, where.target.urn, what))
+        self._call(where, reply, lambda number, _: Inquire(number, where.target.urn, what))
         return reply
 
     def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
         """Send the actor a stop; `reply` is set when the actor has ended."""
-        return self._call(where, reply, lambda number: Halt(number, where.target.urn, reason, final))
+        address = self._locate(where)
+
+        def ended() -> None:
+            with contextlib.suppress(Exception):  # it was not stopped
+                if reply.get(timeout=0) and (where.path is None or self._has_own_process(where.path)):
+                    where.ended_at = address
+
+        reply.when_set(ended)
+        return self._call(where, reply, lambda number, _: Halt(number, where.target.urn, reason, final))
 
     def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
         """Call fire(reason, detail), as for a Down, once, when the actor has ended. Return what ends the watch.
 
-        Where waiting is allowed, this waits up to WATCH_S until the actor's process confirms the watch.
+        Where waiting is allowed, this waits until the actor's process confirms the watch: as long as for an answer, or
+        WATCH_S if a signal has stopped it.
         """
         address = self._locate(where)
         pid = pid_of(address)
-        if pid is not None and lifeline.wait_gone((pid,), 0.0):
+        if _is_gone(address):
             raise self.missing(where)
         reply: Reply[Over] = Reply()
 
-        def gone(has_gone: bool | None, _error: BaseException | None = None) -> None:
-            if has_gone:
-                fire("killed", f"its process ({pid}) ended without a word")
-            else:
-                fire("noconnection", f"the link to its process at {address} is lost")
-
         placed = Flag()
+        confirmed = False
 
-        def told(reply: Reply[Over]) -> None:
+        def begun() -> None:
+            nonlocal confirmed
+            confirmed = True
+            placed.set()
+
+        def died(killed: bool | None, _error: BaseException | None = None) -> None:
+            if killed is False:  # it ended before it could take the watch
+                fire("noproc", str(self.missing(where)))
+            else:
+                fire("killed", f"its process ({pid}) ended without a word")
+
+        def gone(has_gone: bool | None, _error: BaseException | None = None) -> None:
+            if not has_gone:
+                fire("noconnection", f"the link to its process at {address} is lost")
+            elif confirmed:
+                died(True)
+            else:
+                try:
+                    self._dispatcher.workers.submit(self._was_killed, where, address, done=died, patient=True)
+                except Unavailable:
+                    died(True)
+
+        def told() -> None:
             placed.set()
             try:
                 over = reply.get()
@@ -215,15 +249,39 @@ class ActorHub:
 
         line = self._line(address)
         number = line.next_number()
-        reply.add_done_callback(told)
-        line.put(Watch(number, where.target.urn), Call(number, reply, where, placed.set))
+        reply.when_set(told)
+        line.put(Watch(number, where.target.urn), Call(number, reply, where, begun))
         if self._dispatcher.may_block():
-            placed.wait(WATCH_S)
+            deadline = time.monotonic() + self.ask_timeout_s
+            while not placed.wait(WATCH_S) and not paused(address) and time.monotonic() < deadline:
+                pass
         return lambda: line.call_off(number)
+
+    def _was_killed(self, where: Whereabouts, address: str) -> bool:
+        """Return whether the actor's process was killed, when its supervisor has said how it ended.
+
+        True if that cannot say it any more: its system has ended, or the actor was started again meanwhile.
+        """
+        while where.path is not None and not self._closed:
+            entry = self._directory.lookup(actor_key(where.path))
+            if entry is None or entry.address not in ("", address):
+                break
+            if not entry.address:
+                return bool(entry.why) if entry.status is Presence.STARTING else entry.why.startswith("killed")
+            top = self._directory.lookup(actor_key(_top(where.path)))
+            if top is None or _is_gone(top.address):
+                break
+            time.sleep(0.01)
+        return True
 
     def pid(self, where: Whereabouts) -> int | None:
         """Return the id of the actor's process; None if the actor is not up, or the process is not known."""
         return pid_of(self._address(where))
+
+    def paused(self, where: Whereabouts) -> str:
+        """Return words, "; it is ...", for an error if a signal has stopped the actor's process; "" else."""
+        why = paused(self._address(where))
+        return why and f"; it is {why}"
 
     def kill(self, where: Whereabouts) -> bool:
         """Kill the actor's process (SIGKILL); return False if the actor is not up.
@@ -244,7 +302,7 @@ class ActorHub:
     def _has_own_process(self, path: str) -> bool:
         mine = self._directory.lookup(actor_key(path))
         above = self._directory.lookup(actor_key(path.rpartition("/")[0]))
-        return mine is None or mine.status is not Status.UP or above is None or above.address != mine.address
+        return mine is None or mine.status is not Presence.UP or above is None or above.address != mine.address
 
     def missing(self, where: Whereabouts) -> ActorDeadError | ActorUnavailable:
         """Return the error for an actor that was not found: dead or being respawned, by its entry in the directory."""
@@ -253,14 +311,14 @@ class ActorHub:
         if entry is None:
             return ActorDeadError(f"{name} not found: it has ended, or never was")
         match entry.status:
-            case Status.UP if entry.once:
+            case Presence.UP if entry.once:
                 return ActorDeadError(f"{name} not found: it has ended, and is temporary: it is not started again")
-            case Status.UP:  # the supervisor has not handled its end yet, or is still stopping it
+            case Presence.UP:  # the supervisor has not handled its end yet, or is still stopping it
                 return ActorUnavailable(
                     f"{name} is being started again, or is stopping; this reference works again if it comes back",
                     id=where.path,
                 )
-            case Status.STARTING:
+            case Presence.STARTING:
                 return ActorUnavailable(
                     f"{name} is being started again; this reference works again when it is up", id=where.path
                 )
@@ -283,22 +341,25 @@ class ActorHub:
             steps.take("closing a visitor's link", link.close)
         steps.end("the way to actors of other processes: not closed altogether")
 
-    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[int], Letter]) -> Callable[[], None]:
+    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[int, Line], Letter]) -> Callable[[], None]:
         line = self._line(self._locate(where))
         number = line.next_number()
-        line.put(letter(number), Call(number, reply, where))
+        line.put(letter(number, line), Call(number, reply, where))
         return lambda: line.give_up(number)
 
     def _address(self, where: Whereabouts) -> str:
         """Return the address of the actor's process; "" if the actor is not up."""
-        if where.path is None:
-            return where.address
-        entry = self._directory.lookup(actor_key(where.path))
-        return entry.address if entry is not None and entry.status is Status.UP else ""
+        address = where.address
+        if where.path is not None:
+            entry = self._directory.lookup(actor_key(where.path))
+            address = entry.address if entry is not None and entry.status is Presence.UP else ""
+        return "" if address == where.ended_at else address
 
     def _locate(self, where: Whereabouts) -> str:
         """Return the address of the actor's process, or raise the error for a missing actor."""
         address = self._address(where)
+        if where.path is None and address not in self._lines and _is_gone(address):
+            address = ""  # nobody starts its actors again
         if not address or address == self.address:  # an actor of this process would have been found before
             raise self.missing(where)
         return address
@@ -329,7 +390,15 @@ class ActorHub:
 
     def _attach(self, kind: type[Visitor], link: Link) -> Visitor:
         self._visitors.add(link)
-        return kind(self.local, self._dispatcher, link, self._visitors.discard)
+        return kind(
+            self.local, self._dispatcher, link, self._visitors.discard, self._transport.segments.parcels(link.pid)
+        )
+
+
+def _is_gone(address: str) -> bool:
+    """Return whether the process at this address has ended."""
+    pid = pid_of(address)
+    return pid is not None and lifeline.wait_gone((pid,), 0.0)
 
 
 _hubs: dict[str, ActorHub] = {}  # by the first part of the paths of their actors: one for each System of the process

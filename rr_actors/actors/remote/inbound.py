@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -33,11 +31,14 @@ from rr_actors.actors.remote.protocol import (
 from rr_actors.actors.remote.proxy import attributes_of
 from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable, shortened, text_of
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import trace_of
 from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.wire.segments import Parcel, Parcels
 from rr_actors.wire.transport import Link
 from rr_actors.wire.unix_link import UnixLink
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 Outgoing = Answered | Raised | Dead | Watching | Over
 Find = Callable[[str], "pykka.ActorRef[Any] | None"]
@@ -49,13 +50,17 @@ class Visitor:
     Args:
         find: returns the reference to the actor of this process with a URN, or None.
         forget: called with the link when it is lost.
+        parcels: the large values on the link.
     """
 
-    def __init__(self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None]) -> None:
+    def __init__(
+        self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None], parcels: Parcels
+    ) -> None:
         self._find = find
         self._dispatcher = dispatcher
         self._link = link
         self._forget = forget
+        self._parcels = parcels
         self._dirty = False
         self._watches: dict[int, Callable[[], None]] = {}
 
@@ -85,6 +90,7 @@ class Visitor:
     def lost(self, link: Link, reason: Exception | None) -> None:
         """End the watches: no answer can be sent any more. Actors still handle the messages that have arrived."""
         self._forget(link)
+        self._parcels.close()
         for unwatch in self._watches.values():
             unwatch()
         self._watches.clear()
@@ -92,8 +98,10 @@ class Visitor:
     def answer(self, call: int, value: Any, name: str) -> None:
         """Send the value that a handler returned. From any thread, which pickles it."""
         try:
-            body = pickling.dumps(value, f"reply of {name}")
-        except Exception as error:
+            body = pickling.dumps_large(value, f"reply of {name}")
+            if not isinstance(body, bytes):
+                body = self._parcels.pack(body)
+        except BaseException as error:
             self.raised(call, error)
         else:
             self.post(Answered(call, body))
@@ -105,10 +113,10 @@ class Visitor:
             return
         try:
             body = pickling.dumps(error, "exception")
-        except Exception as reason:
+        except BaseException as reason:  # of its class
             logger.debug("an exception travels as text: %s", reason)
             body = b""
-        trace = "".join(traceback.format_exception(error))
+        trace = trace_of(error)
         self.post(Raised(call, body, text_of(error), trace))
 
     def post(self, letter: Outgoing) -> None:
@@ -138,9 +146,10 @@ class Visitor:
         self._dirty = False
         self._link.flush()
 
-    def _deliver(self, to: str, body: bytes, call: int | None, chain: Chain) -> None:
+    def _deliver(self, to: str, body: bytes | Parcel, call: int | None, chain: Chain) -> None:
         ref = self._find(to)
-        packed = Packed(lambda: pickling.loads(body), len(body))
+        opens = (lambda: pickling.loads(body)) if isinstance(body, bytes) else self._parcels.claim(body)
+        packed = Packed(opens, len(body))
         if ref is None:
             self._undeliverable(to, call, packed)
         elif _opens_packed(ref):
@@ -239,8 +248,10 @@ class Visitor:
 class Asker(Visitor):
     """Takes one ask at a time from a waiting thread of another process; the thread that has the answer writes it."""
 
-    def __init__(self, find: Find, dispatcher: Dispatcher, link: UnixLink, forget: Callable[[Link], None]) -> None:
-        super().__init__(find, dispatcher, link, forget)
+    def __init__(
+        self, find: Find, dispatcher: Dispatcher, link: UnixLink, forget: Callable[[Link], None], parcels: Parcels
+    ) -> None:
+        super().__init__(find, dispatcher, link, forget, parcels)
         link.open_outlet()
         self._answering = link.answering
 

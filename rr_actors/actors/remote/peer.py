@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import logging
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -39,14 +38,18 @@ from rr_actors.actors.remote.protocol import (
 )
 from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import add_note
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import deadline_of
 from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.segments import Lie
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Hello, Link
+from rr_actors.wire.unix_sockets import pid_of
 from rr_actors.wire.unix_transport import UnixTransport
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 WAITING_LIMIT = 100_000
 RETRY_S = 0.01
@@ -54,18 +57,20 @@ RETRY_S = 0.01
 _numbers = itertools.count(1)
 
 
-class Whereabouts(msgspec.Struct, frozen=True):
+class Whereabouts(msgspec.Struct):
     """Where to find an actor.
 
     Attributes:
         target: the actor's URN and its name for people.
         path: its path in the tree, if it is supervised; the directory has the address of its process.
         address: otherwise, the address of its process.
+        ended_at: the address where it has ended, as this process knows; it is not there again.
     """
 
     target: Target
     path: str | None
     address: str
+    ended_at: str = ""
 
 
 class Call(msgspec.Struct, frozen=True):
@@ -81,12 +86,21 @@ class Call(msgspec.Struct, frozen=True):
     begun: Callable[[], None] | None = None
 
 
+class Arrived(msgspec.Struct, frozen=True):
+    """An Answered whose body is a Parcel. `open` makes the value."""
+
+    open: Callable[[], Any]
+
+
 class Cut(Exception):
     """The link to the actor's process was lost, or could not be opened."""
 
 
 class Line:
     """The messages for one address. Call its methods on the loop, except where they say otherwise.
+
+    Attributes:
+        parcels: the large values on the link.
 
     Args:
         hello: the Hello with which the link is opened; its `to` is the address.
@@ -103,6 +117,7 @@ class Line:
         forget: Callable[[Line], None],
     ) -> None:
         self.address = hello.to
+        self.parcels = transport.segments.parcels(pid_of(hello.to))
         self._dispatcher = dispatcher
         self._transport = transport
         self._hello = hello
@@ -154,12 +169,18 @@ class Line:
         """Whether ask() may succeed: no earlier letter may be in flight. From any thread."""
         return self._unsettled is None and self._link is not None and not (self._left or self._dispatcher.closed)
 
-    def ask(self, letter: Ask, timeout_s: float | None) -> Answered | Raised | Dead | None:
+    def ask(
+        self, letter: Ask, timeout_s: float | None, large: pickling.Large | None = None
+    ) -> Answered | Arrived | Raised | Dead | None:
         """Send the letter by a connection of the calling thread alone, and wait; None if this is impossible now.
 
         From any thread that may block.
 
+        Args:
+            large: the value to send, instead of the letter's body.
+
         Raises:
+            MailboxFull: no segment has room for the value.
             TimeoutError: no answer came in time.
             OSError: the connection is lost; the letter may have arrived.
             NotSerializable: the letter is too long for a frame.
@@ -169,11 +190,18 @@ class Line:
         if line is None:
             return None
         try:
+            if large is not None:
+                letter = msgspec.structs.replace(letter, body=line.parcels.pack(large))
             answer = line.exchange(letter, deadline)
             if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
+                if type(answer) is Answered and not isinstance(answer.body, bytes):
+                    answer = Arrived(line.parcels.claim(answer.body))
                 self._asks.give_back(line)
                 return answer
-        except NotSerializable:
+        except Lie as error:
+            self._asks.drop(line)
+            raise ConnectionResetError(f"the process at {self.address} is cut off: {error}") from error
+        except (NotSerializable, Unavailable):
             self._asks.give_back(line)
             raise
         except TimeoutError:
@@ -219,24 +247,33 @@ class Line:
             if call is not None and call.begun is not None:
                 call.begun()
             return
+        answer = message
+        if type(answer) is Answered and not isinstance(answer.body, bytes):
+            answer = Arrived(self.parcels.claim(answer.body))
         with self._lock:
             if self._unsettled == message.call:
                 self._unsettled = None
         call = self._calls.pop(message.call, None)
         if call is not None:  # not given up
-            self.answer(call, message)
+            self.answer(call, answer)
 
-    def answer(self, call: Call, message: Answered | Raised | Dead | Over) -> None:
+    def answer(self, call: Call, message: Answered | Arrived | Raised | Dead | Over) -> None:
         """Set the call's reply. From any thread."""
         match message:
             case Answered():
-                call.reply.set_unopened(lambda: pickling.loads(message.body))
+                body = message.body
+                if isinstance(body, bytes):  # a Parcel has become an Arrived
+                    call.reply.set_unopened(lambda: pickling.loads(body))
+            case Arrived():
+                call.reply.set_unopened(message.open)
             case Raised():
                 origin = f"{call.where.target.name} in {self._peer}"
                 call.reply.set_unopened(lambda: _reraise(message, origin), raises=True)
             case Over():
                 call.reply.set(message)
             case Dead():
+                if call.where.path is None:
+                    call.where.ended_at = call.where.address
                 fail(call.reply, self._missing(call.where))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
@@ -305,6 +342,7 @@ class Line:
 
     def _fail(self, reason: Exception | None) -> None:
         self._forget(self)
+        self.parcels.close()
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
@@ -384,9 +422,9 @@ def _reraise(raised: Raised, origin: str) -> Any:
     if raised.error:
         try:
             error = pickling.loads(raised.error)
-        except Exception as reason:
+        except BaseException as reason:  # of its class
             logger.debug("an exception of %s cannot be made here: %r", origin, reason)
     if not isinstance(error, Exception):
         error = RrError(raised.text)
-    error.add_note(f"raised by {origin}:\n{raised.trace.rstrip()}")
+    add_note(error, f"raised by {origin}:\n{raised.trace.rstrip()}")
     raise error

@@ -2,7 +2,7 @@
 
 The process that dialled sends Ask, Tell, Inquire, Halt, Watch and Unwatch; the other one answers with Answered, Raised,
 Dead, Watching or Over. Bodies are pickled (the channel is private and authenticated) and are opened in a worker, or in
-the thread that asked.
+the thread that asked. A large body is a Parcel, which says where in shared memory it is.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.actors.messaging.ask_cycles import Chain
+from rr_actors.wire.segments import Parcel
 
 KIND = "actors"
 """The Hello.kind of these links."""
@@ -28,7 +29,7 @@ class Ask(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
     call: int
     to: str
-    body: bytes
+    body: bytes | Parcel
     chain: Chain
 
 
@@ -36,7 +37,7 @@ class Tell(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """A message for the actor `to`, without an answer."""
 
     to: str
-    body: bytes
+    body: bytes | Parcel
 
 
 class Inquire(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -60,7 +61,7 @@ class Answered(msgspec.Struct, frozen=True, array_like=True, tag=5):
     """The answer to a call."""
 
     call: int
-    body: bytes
+    body: bytes | Parcel
 
 
 class Raised(msgspec.Struct, frozen=True, array_like=True, tag=6):

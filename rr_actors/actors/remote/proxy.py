@@ -204,6 +204,11 @@ class DistantInbox:
 class _Proxy(pykka.ActorProxy[A]):
     """A proxy that equals another if both are of the same part of the same actor."""
 
+    # Pykka looks for these two names in each attribute of an actor. An attribute may be a proxy, and its actor may hold
+    # a proxy of the first one.
+    _pykka_traversable = False
+    pykka_traversable = False
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, pykka.ActorProxy):
             return False
@@ -251,10 +256,6 @@ class DistantProxy(_Proxy[A]):
             which must not wait, a name is taken as a method when it is called, as an attribute when it is awaited.
         known: the attributes, if they are known. If None, the proxy asks now; if empty, when a name is first used.
     """
-
-    # Pykka looks for these two names in each attribute of an actor, and an attribute may be this proxy.
-    _pykka_traversable = False
-    pykka_traversable = False
 
     def __init__(
         self,

@@ -9,6 +9,7 @@ a type, the provider decodes to it and encodes again. Then a dict equals the dat
 from __future__ import annotations
 
 import contextlib
+import datetime
 import pathlib
 import re
 import types
@@ -25,6 +26,7 @@ from rr_actors.base.errors import (
     NotSerializable,
     did_you_mean,
     name_of_class,
+    readable,
     shortened,
     shown,
     text_of,
@@ -90,11 +92,11 @@ class Codec:
     def __init__(self, type_: Any = None, what: str = "request") -> None:
         self.type = type_
         wanted = Any if type_ is None else _declared_type(type_)
-        self._shape = shape_of(wanted, what)
-        self._gaps = gaps_of(self._shape)
-        self._has_class = has_class(self._shape)
-        self._runs_code = runs_code(self._shape)
-        self._takes_any = any(isinstance(part, AnyType) for _, part in walk(self._shape, ""))
+        self.shape = shape_of(wanted, what)
+        self._gaps = gaps_of(self.shape)
+        self._has_class = has_class(self.shape)
+        self._runs_code = runs_code(self.shape)
+        self._takes_any = any(isinstance(part, AnyType) for _, part in walk(self.shape, ""))
         self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=_value_of).decode
         self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=_value_of).decode
 
@@ -129,15 +131,15 @@ class Codec:
         except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
             first = error
         try:  # perhaps the only reason is that the bytes name classes inside of declared types
-            fitted = write_tree(fit(read_tree(raw), self._shape, what))
+            fitted = write_tree(fit(read_tree(raw), self.shape, what))
         except Misfit as misfit:
             _refuse(misfit, server, what, first)
         except Exception:
-            _refuse(_misfit(first, raw, self._shape, what), server, what, first)
+            _refuse(_misfit(first, raw, self.shape, what), server, what, first)
         try:
             return self._read_marked(fitted)
         except Exception as error:
-            _refuse(_misfit(error, fitted, self._shape, what), server, what, error)
+            _refuse(_misfit(error, fitted, self.shape, what), server, what, error)
 
     def runs_code(self, raw: bytes) -> bool:
         """Return whether decoding these bytes may run a user's code: a __post_init__, a pydantic model, an rr.codec."""
@@ -161,11 +163,29 @@ class Codec:
         canonical = encode(self.decode(raw, server, what), f"{server}: {what}" if server else what)
         if canonical != raw and self.type is not None:
             try:
-                misfit = _unknown_field(plain(read_tree(raw)), self._shape, what)
+                misfit = _unknown_field(plain(read_tree(raw)), self.shape, what)
             except RecursionError as error:  # msgspec may go deeper than Python
                 misfit = Misfit(what, "a value of some hundred levels at most", f"one that is deeper: {error}")
             if misfit is not None:
                 _refuse(misfit, server, what, None)
+        return canonical
+
+    def today(self, raw: bytes) -> bytes:
+        """Return the canonical bytes that a stored request has by this type, which may be newer than the request.
+
+        A field that the type lacks is dropped, unless the type has another one that the request lacks: that may be the
+        same field under a new name.
+
+        Raises:
+            InvalidRequest: the request does not fit the type. `.path`, `.expected`
+            NotSerializable: the value has no canonical bytes.
+        """
+        canonical = encode(self.decode(raw))
+        if canonical != raw and self.type is not None:
+            old, new = shown_plain(raw), shown_plain(canonical)
+            misfit = _unknown_field(old, self.shape, "request")
+            if misfit is not None and isinstance(old, dict) and set(new) - set(cast("Any", old)):
+                _refuse(misfit, "", "request", None)
         return canonical
 
     def _fill(self, value: object) -> None:
@@ -184,12 +204,34 @@ class Codec:
                 ahead += cast("list[object]", value)
 
 
+_SHOWN = 400  # characters of a request or response
+
+
 def shown_plain(raw: bytes) -> Any:
     """Return these bytes as plain values, without classes; None if they are damaged."""
     try:
         return plain(read_tree(raw))
     except Exception:  # the bytes may come from anywhere
         return None
+
+
+def text_of_value(raw: bytes | None) -> str:
+    """Return a request's or response's bytes as the text that is shown; "" for None."""
+    if raw is None:
+        return ""
+    value: Any = shown_plain(raw)
+    if value is None and raw != b"\xc0":
+        return f"<{len(raw)} bytes>"
+    text = readable(json_of(value))
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def json_of(value: Any) -> str:
+    """Return a value as JSON; what JSON does not have is shown as in Python."""
+    try:
+        return msgspec.json.encode(value, enc_hook=repr).decode()
+    except Exception:  # a key is no text, a number is too long, or the nesting is too deep
+        return repr(value)
 
 
 # -- declared types that msgspec does not know, and unions of classes that it cannot tell apart -----------------------
@@ -338,8 +380,10 @@ def _each_part(value: object) -> Iterator[tuple[str, object]]:
 def _described(value: Any, error: Exception) -> str:
     if isinstance(error, NoForm):
         return str(error)
-    if isinstance(error, OverflowError):
+    if isinstance(error, OverflowError) and isinstance(value, int):
         return "an integer of more than 64 bits"
+    if isinstance(value, datetime.datetime):
+        return "a datetime whose year in UTC is not within 1 to 9999"
     if isinstance(error, UnicodeError):
         return "a string with a lone surrogate"
     if isinstance(value, dict):
@@ -350,7 +394,8 @@ def _described(value: Any, error: Exception) -> str:
         return f"the class {value.__qualname__}"
     if callable(value) and hasattr(value, "__qualname__"):
         return f"a {type(value).__name__} ({value.__qualname__})"
-    return f"an object of type {type(value).__module__}.{type(value).__qualname__}"
+    text = f"an object of type {type(value).__module__}.{type(value).__qualname__}"
+    return text if isinstance(error, TypeError) else f"{text}, whose own code raised {text_of(error)}"
 
 
 # -- bytes that do not fit the type: where and why -----------------------------------------------------------------

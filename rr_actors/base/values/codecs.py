@@ -97,12 +97,17 @@ codec_named: Callable[[str], TypeCodec | None] = _by_name.get
 """Return the codec for a name in bytes; None if this process has none."""
 
 
+def types_of_main() -> list[type]:
+    """Return the classes of `__main__` that have a codec."""
+    return [cls for cls in _by_type if cls.__module__ == "__main__"]
+
+
 def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T]) -> None:
     """Let values of a type travel in requests and responses, with and without annotations.
 
     The codec holds for this process. Call this at the top level of the module that defines the type, so that every
-    process that imports the module has the codec. A type of a script's `__main__` takes its codec along. A second codec
-    for a type replaces the first.
+    process that imports the module has the codec. Children get the codecs that types of a script's `__main__` have when
+    they start. A second codec for a type replaces the first.
 
     Args:
         type: the class. Its subclasses need codecs of their own.

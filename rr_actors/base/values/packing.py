@@ -18,12 +18,13 @@ import msgspec
 from msgspec import inspect
 from msgspec.msgpack import Ext
 
-from rr_actors.base.errors import NotSerializable
+from rr_actors.base.errors import NotSerializable, text_of
 from rr_actors.base.values.codecs import (
     CODEC,
     FLAT,
     NAMED,
     NESTED,
+    NoForm,
     TypeCodec,
     codec_of,
     is_pydantic_model,
@@ -98,7 +99,15 @@ def _header(size: int, short: int, long: int) -> bytes:
 
 
 def _pack_own(value: Any, codec: TypeCodec) -> Ext:
-    return Ext(CODEC, _encode(codec.name) + packed(codec.encode(value)))
+    done = "raised"
+    try:
+        data = codec.encode(value)
+        done = "returned what cannot be sent:"
+        return Ext(CODEC, _encode(codec.name) + packed(data))
+    except NoForm:
+        raise
+    except Exception as error:
+        raise NoForm(f"a {codec.name}, whose rr.codec {done} {text_of(error)}") from error
 
 
 def _pack_flat(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterator, Sequence
+from hashlib import sha256
 from inspect import getattr_static
 from typing import Any, get_origin
 
@@ -69,6 +70,16 @@ def walk(shape: Shape, path: str) -> Iterator[tuple[str, Shape]]:
         parts = [getattr(shape, name, None) for name in ("item_type", "key_type", "value_type")]
         parts += [*getattr(shape, "item_types", ()), *getattr(shape, "types", ())]
         ahead += [(path, part) for part in parts if part is not None]
+
+
+def digest_of(shapes: Sequence[Shape]) -> bytes:
+    """Return a digest of shapes, which is the same in each process; b"" if a default's repr raises."""
+    parts = [part for shape in shapes for _, part in walk(shape, "") if isinstance(part, inspect.EnumType)]
+    members = [(name, member.value) for part in parts for name, member in part.cls.__members__.items()]
+    try:
+        return sha256(repr((shapes, members)).encode("utf-8", "backslashreplace")).digest()
+    except Exception:
+        return b""
 
 
 def fields_of(shape: Shape) -> dict[str, Shape] | None:

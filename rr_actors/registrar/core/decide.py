@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rr_actors.base.errors import shown
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
+    callback_runs,
     holding,
     loading,
     notices,
+    priorities,
     reconciliation,
     recovery,
     releasing,
@@ -52,6 +55,12 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
             receive_from(decision, sender, item)
         else:
             raise TypeError(f"{catalog.name}: not a message for a registrar: {shown(item)}")
+    if catalog.touched:
+        for resource_id in list(catalog.touched):
+            unloading.balance(decision, resource_id)
+        priorities.settle(decision)
+    if catalog.rising:
+        priorities.rise(decision)
     return decision
 
 
@@ -60,6 +69,12 @@ def _describe(decision: Decision, sender: str, message: m.Describe) -> None:
     server = decision.catalog.servers.get(message.server)
     if server is not None:
         decision.cause(Reply(sender, m.Described(message.server, server.types)))
+
+
+def _unload_erred(decision: Decision, command: c.UnloadErred) -> None:
+    unloading.unload_erred(decision, command)
+    # Those that waited for a load which was not run again. A resource that stays hears them all the same.
+    status_delivery.start_deferred(decision, command.resource_id)
 
 
 def _set_rows(decision: Decision, command: c.SetRows) -> None:
@@ -79,6 +94,8 @@ _MESSAGES: dict[type[Any], Callable[[Decision, Any], None]] = {
     m.Fetch: reconciliation.fetch,
     m.Probe: loading.probe,
     m.Gone: unloading.gone,
+    m.Reprioritise: priorities.reprioritise,
+    m.Reprioritised: priorities.reprioritised,
 }
 
 _MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
@@ -91,6 +108,8 @@ _MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
 
 _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.BeginAgain: lambda decision, _: recovery.begin_again(decision),
+    c.BeginClosing: reconciliation.begin_closing,
+    c.EndClosing: reconciliation.end_closing,
     c.SetRows: _set_rows,
     c.RefuseLoad: lambda decision, it: decision.cause(refuse(decision, it.origin, it.query_id, it.failure)),
     c.Register: recovery.register,
@@ -99,19 +118,30 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.LoadErred: loading.load_erred,
     c.LoadOverdue: loading.load_overdue,
     c.UnloadDone: unloading.unload_done,
-    c.UnloadErred: unloading.unload_erred,
+    c.UnloadErred: _unload_erred,
     c.RecoverDone: recovery.recover_done,
     c.RecoverErred: recovery.recover_erred,
+    c.RecoverOverdue: recovery.recover_overdue,
+    c.PauseDone: recovery.pause_ended,
+    c.PauseErred: recovery.pause_ended,
+    c.ResumeDone: recovery.resume_ended,
+    c.ResumeErred: recovery.resume_ended,
+    c.BeginTrial: recovery.begin_trial,
+    c.TrialOver: recovery.trial_over,
+    c.RefusalOver: callback_runs.refusal_over,
     c.LingerOver: unloading.linger_over,
     c.SetStatus: status_changes.set_status,
     c.SetResponse: status_changes.set_response,
     c.Swap: status_changes.swap,
     c.ForceUnload: unloading.force_unload,
+    c.Revoke: status_changes.revoke,
+    c.GraceOver: unloading.grace_over,
     c.Ask: holding.ask,
     c.Got: holding.got,
     c.SendAgain: holding.send_again,
     c.GiveUp: holding.give_up,
     c.Release: holding.release,
+    c.SetPriority: priorities.set_priority,
     c.AddInFlight: lambda decision, _: releasing.add_all_in_flight(decision),
     c.ReleaseOverdue: holding.release_overdue,
     c.Heard: status_delivery.heard,
@@ -123,7 +153,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
 }
 
 
-def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: m.Failure) -> tuple[Decision, list[Item]]:
+def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure) -> tuple[Decision, list[Item]]:
     """Refuse items whose changes could not be written; return that decision, and the items to be decided again.
 
     The caller has undone their decision: nothing of them has happened. Callers that wait get `failure`. Later messages
@@ -144,7 +174,15 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: m.Failu
                 held = decision.catalog.held.get(item.query_id)
                 if held is not None and held.hold is Hold.OWED:  # its row stays; its caller has waited
                     decision.cause(UnloadResolved(item.query_id, item.failure))
-            case c.SetStatus() | c.SetResponse() | c.Swap() | c.ForceUnload() | c.Unregister():
+            case (
+                c.SetStatus()
+                | c.SetResponse()
+                | c.Swap()
+                | c.ForceUnload()
+                | c.Revoke()
+                | c.Unregister()
+                | c.SetPriority()
+            ):
                 decision.cause(Answer(item.ticket, failure))
             case _:
                 again.append((item, sender))

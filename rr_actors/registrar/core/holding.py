@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from rr_actors.base.errors import shortened
 from rr_actors.registrar.core import releasing
+from rr_actors.registrar.core.priorities import follow
 from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, request, withdraw
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
@@ -26,8 +27,11 @@ from rr_actors.registrar.model.rows import HELD, OK, OWED, PENDING, Held, Notice
 def ask(decision: Decision, command: Ask) -> None:
     """Ask a provider for a query. The provider's Peer row is on disk before the request is sent."""
     catalog = decision.catalog
-    attempt = 0
+    attempt, priority = 0, command.priority
     parent = command.parent
+    if True in catalog.shut and not parent:  # a resource may still load a part: it releases all of them at its end
+        decision.cause(LoadResolved(pending(command), catalog.shut[True]))
+        return
     if parent:
         resource = catalog.resources.get(parent)
         if resource is None:
@@ -36,13 +40,15 @@ def ask(decision: Decision, command: Ask) -> None:
             decision.cause(LoadResolved(held, failures.withdrawn(held, why)))
             return
         attempt = resource.attempt
+        if not command.own:
+            priority = catalog.inherited(parent)
         if (known := catalog.held.get(command.query_id)) is not None:
             if known.hold is HELD:
                 decision.cause(LoadResolved(known, None))
             elif known.hold is OWED:
                 decision.cause(LoadResolved(known, failures.withdrawn(known, "it is being released")))
             return
-    held = pending(command, attempt)
+    held = pending(command, attempt, priority)
     look_there(decision, command.registrar)
     decision.put_here(held)
     request(decision, held.registrar, load_of(decision, held))
@@ -57,12 +63,16 @@ def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
     asked = catalog.in_flight.get(id)
     if asked is None or asked.registrar not in catalog.up:
         return False
-    row = replace(asked, response=answer.response, resource_id=answer.resource_id, hold=HELD)
+    parent = asked.parent
+    if parent and not asked.own and catalog.inherited(parent) != asked.priority:
+        return False
+    place = (asked.id, asked.registrar, asked.server, asked.request, answer.response, answer.resource_id)
+    row = Held(*place, parent, asked.attempt, asked.seq, HELD, answer.state, asked.priority, asked.own)
     catalog.unfinished = [(catalog.in_flight, id, asked), ("held", id, ABSENT)]
     catalog.held[id] = row
     add(catalog.outbound, asked.registrar, id)
-    if asked.parent:
-        add(catalog.parts, asked.parent, id)
+    if parent:
+        add(catalog.parts, parent, id)
     unsaved.new[id] = row
     del catalog.in_flight[id]
     catalog.unfinished = None
@@ -80,10 +90,11 @@ def got(decision: Decision, command: Got) -> None:
         decision.cause(LoadResolved(replace(taken, resource_id=command.resource_id, response=command.response), None))
         return
     if held.registrar not in catalog.up:
-        decision.note(catalog.fresh, id, True)
+        decision.note(catalog.fresh, id, command.run)
         decision.cause(Connect(held.registrar))
     if held.hold is not HELD:  # else reconciling has made it HELD before
-        loaded(decision, held.registrar, Loaded(id, command.resource_id, command.response))
+        answer = Loaded(id, command.resource_id, command.response, state=command.state)
+        loaded(decision, held.registrar, answer)
     # The row is as it was before: loaded() has caused its own LoadResolved.
     if held.hold is HELD or (held.hold is PENDING and id in catalog.ending):
         decision.cause(LoadResolved(held, None))
@@ -111,15 +122,16 @@ def _unknown(query_id: str) -> Held:
     return Held(query_id, "", "", b"", None, "", "", 0, 0, PENDING, State.FATAL)
 
 
-def pending(ask: Ask, attempt: int = 0) -> Held:
+def pending(ask: Ask, attempt: int = 0, priority: int = 0) -> Held:
     """Return the row of a query that is asked for."""
     place = (ask.query_id, ask.registrar, ask.server, ask.request)
-    return Held(*place, None, "", ask.parent, attempt, ask.seq, PENDING, OK)
+    return Held(*place, None, "", ask.parent, attempt, ask.seq, PENDING, OK, priority, ask.own)
 
 
 def load_of(decision: Decision, held: Held) -> Load:
     """Return the Load that asks for a query; it is the same the first time and every time."""
-    return Load(held.id, held.server, held.request, decision.catalog.name, held.parent, held.attempt, held.seq)
+    place = (held.id, held.server, held.request, decision.catalog.name, held.parent)
+    return Load(*place, held.attempt, held.seq, held.priority, held.own)
 
 
 def loaded(decision: Decision, provider: str, message: Loaded) -> None:
@@ -130,13 +142,24 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
     """
     add_in_flight(decision, message.query_id)
     held = decision.catalog.held.get(message.query_id)
-    if held is None or (held.id in decision.catalog.ending and held.resource_id != message.resource_id):
+    another = held is not None and (held.hold is PENDING or held.resource_id != message.resource_id)
+    if held is None or (another and held.id in decision.catalog.ending):
         request(decision, provider, Unload(message.query_id, decision.catalog.name))
     elif held.hold is PENDING:
+        if held.resource_id not in ("", message.resource_id):
+            held = asked_anew(held)
         response = message.response if held.response is None else held.response  # an UPDATE has come before it
-        held = replace(held, hold=HELD, resource_id=message.resource_id, response=response)
+        state = message.state if held.response is None and held.state is OK else held.state  # a status may be newer
+        held = replace(held, hold=HELD, resource_id=message.resource_id, response=response, state=state)
         decision.put_later(held)
         decision.cause(LoadResolved(held, None))
+        if held.parent:
+            follow(decision, held)
+
+
+def asked_anew(held: Held) -> Held:
+    """Return the row of a query that is asked for without what statuses of an earlier resource have brought to it."""
+    return replace(held, resource_id="", response=None, state=OK)
 
 
 def load_refused(decision: Decision, message: LoadRefused) -> None:
@@ -277,13 +300,19 @@ def unload_refused(decision: Decision, message: UnloadRefused) -> None:
     held = catalog.held.get(message.query_id)
     if held is None or held.hold is not OWED:
         return
-    parent = catalog.resources.get(held.parent)
-    wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
-    if wanted and held.resource_id:
+    if may_be_held_again(catalog, held) and message.failure.kind != "Unavailable":  # else it is unloaded later
         decision.note(catalog.kept, held.id, True)
-        decision.put(replace(held, hold=HELD))
+        decision.put(again := replace(held, hold=HELD))
+        follow(decision, again)
     decision.cause(UnloadResolved(held.id, message.failure))
     released(decision, held.id)
+
+
+def may_be_held_again(catalog: Catalog, held: Held) -> bool:
+    """Return whether an owed query is held again if its unload fails."""
+    parent = catalog.resources.get(held.parent)
+    wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
+    return wanted and bool(held.resource_id)
 
 
 def lose(decision: Decision, held: Held, event: str, why: str) -> None:

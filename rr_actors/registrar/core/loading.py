@@ -16,18 +16,43 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from rr_actors.registrar.core.callback_runs import end_limit, limit_load, running, start_load
+from rr_actors.registrar.core.callback_runs import (
+    end_limit,
+    end_trial,
+    forget_request,
+    limit_load,
+    refused_for_s,
+    request_id,
+    run_id,
+    running,
+    start_load,
+)
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
+from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, request, withdraw
 from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.core.status_delivery import start_deferred
-from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
+from rr_actors.registrar.core.unloading import answers_to_owners, balance, retire, settle
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
-from rr_actors.registrar.model.rows import LOADED, LOADING, OK, PENDING, QUEUED, Query, Resource
+from rr_actors.registrar.model.rows import (
+    LOADED,
+    LOADING,
+    OK,
+    PAUSED,
+    PAUSING,
+    PENDING,
+    QUEUED,
+    RESTING,
+    STANDBY,
+    UNLOADING,
+    Query,
+    Resource,
+    State,
+)
 
 _NONE: dict[bytes, str] = {}
 
@@ -44,6 +69,9 @@ def load(decision: Decision, message: Load) -> None:
     if refused is not None:
         decision.cause(Reply(message.origin, LoadRefused(message.query_id, refused)))
         return
+    if catalog.shut:
+        decision.cause(refuse(decision, message.origin, message.query_id, catalog.shut[False]))
+        return
     if server not in catalog.servers or server in catalog.leaving:
         decision.cause(refuse(decision, message.origin, message.query_id, failures.unknown_server(catalog, server)))
         return
@@ -59,6 +87,11 @@ def load(decision: Decision, message: Load) -> None:
 
 def _load_first(decision: Decision, message: Load) -> None:
     catalog = decision.catalog
+    if catalog.refusing and (id := request_id(message.server, message.request)) in catalog.refusing:
+        rounds = catalog.callback_runs[id].deaths
+        failure = failures.still_refused(catalog, message.server, rounds, refused_for_s(rounds))
+        decision.cause(refuse(decision, message.origin, message.query_id, failure))
+        return
     queued = (message.server, message.request) in catalog.unloading
     phase = QUEUED if queued else LOADING
     resource_id = catalog.new_resource_id(message.query_id)
@@ -66,16 +99,21 @@ def _load_first(decision: Decision, message: Load) -> None:
     decision.put(resource)
     _begin_query(decision, message, resource_id)
     decision.note(catalog.waiting, message.query_id, resource_id)
-    if not queued:
+    if queued:
+        _look_for_ring(decision, message, resource)
+    else:
         start_load(decision, resource)
 
 
 def _join(decision: Decision, message: Load, resource: Resource) -> None:
     catalog = decision.catalog
     alone = resource.id not in catalog.holders
+    if alone or message.priority or resource.id in catalog.ranked:
+        touch(decision, resource.id)
     _begin_query(decision, message, resource.id)
-    if resource.phase is LOADED:
+    if resource.phase is LOADED or (resource.phase in (PAUSING, PAUSED) and message.priority <= STANDBY):
         if alone:
+            decision.forget(catalog.idle, resource.id)
             decision.cause(SetTimer("linger:" + resource.id, None, None))
         decision.cause(Reply(message.origin, loaded(catalog, message.query_id, resource)))
         return
@@ -97,6 +135,8 @@ def join(catalog: Catalog, message: Load) -> Query | None:
         return None
     if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
         return None
+    if catalog.shut or message.priority or resource.id in catalog.ranked:
+        return None
     id = message.query_id
     if id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
         return None
@@ -107,7 +147,7 @@ def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:
     """Return the answer to a Load whose resource is loaded."""
     server = catalog.servers.get(resource.server)
     types = 0 if server is None else server.types_checksum
-    return Loaded(query_id, resource.id, resource.response or b"", types)
+    return Loaded(query_id, resource.id, resource.response or b"", types, resource.state)
 
 
 def _load_again(decision: Decision, message: Load, query: Query) -> None:
@@ -116,11 +156,16 @@ def _load_again(decision: Decision, message: Load, query: Query) -> None:
     resource = catalog.resources[query.resource_id]
     if resource.id in catalog.recovering:
         park(decision, resource.id, message)
-    elif is_busy(catalog, resource):
+    elif is_busy(catalog, resource) or (query.priority > STANDBY and _is_to_run(resource)):
         decision.note(catalog.waiting, query.id, resource.id)
         _look_for_ring(decision, message, resource)
     else:
         decision.cause(Reply(query.origin, loaded(catalog, query.id, resource)))
+
+
+def _is_to_run(resource: Resource) -> bool:
+    """Return whether a resource is paused, or about to be, and is resumed for who needs it."""
+    return resource.phase in RESTING and resource.state is not State.FATAL
 
 
 def _look_for_ring(decision: Decision, message: Load, resource: Resource) -> None:
@@ -136,7 +181,16 @@ def _begin_query(decision: Decision, message: Load, resource_id: str) -> None:
 
 
 def _query_of(message: Load, resource_id: str) -> Query:
-    return Query(message.query_id, resource_id, message.origin, message.parent, message.attempt, message.seq)
+    return Query(
+        message.query_id,
+        resource_id,
+        message.origin,
+        message.parent,
+        message.attempt,
+        message.seq,
+        message.priority,
+        message.own,
+    )
 
 
 def load_done(decision: Decision, done: LoadDone) -> None:
@@ -147,8 +201,10 @@ def load_done(decision: Decision, done: LoadDone) -> None:
         return
     resource = replace(resource, phase=LOADED, response=done.response)
     decision.put(resource)
-    decision.cause(Happened("loaded", resource.id, resource.server, ""))
+    decision.cause(Happened("loaded", resource, ""))
     end_limit(decision, resource)
+    if catalog.callback_runs or catalog.trial:
+        _ended(decision, resource)
     holders = catalog.holders.get(resource.id)
     if holders:
         for query_id in holders:
@@ -156,6 +212,8 @@ def load_done(decision: Decision, done: LoadDone) -> None:
                 decision.cause(Reply(catalog.queries[query_id].origin, loaded(catalog, query_id, resource)))
         # The owner may have unloaded it while it was loading; its present holders came after that.
         decision.effects += answers_to_owners(decision, resource, None)
+        if resource.id in catalog.ranked:
+            balance(decision, resource.id)
     else:
         retire(decision, resource)
     start_deferred(decision, resource.id)
@@ -169,10 +227,16 @@ def load_erred(decision: Decision, erred: LoadErred) -> None:
     after: list[Effect] = [*refuse_all(decision, resource, erred.failure), *answers_to_owners(decision, resource, None)]
     drop_resource(decision, resource)
     end_limit(decision, resource)
-    decision.cause(Happened("load_failed", resource.id, resource.server, erred.failure.message))
+    _ended(decision, resource)
+    decision.cause(Happened("load_failed", resource, erred.failure.message))
     release_parts(decision, resource.id, after)
-    start_deferred(decision, resource.id)
     settle(decision, resource.server)
+
+
+def _ended(decision: Decision, resource: Resource) -> None:
+    """Note that the load callback has ended, and the process lives."""
+    end_trial(decision, run_id("load", resource.id))
+    forget_request(decision, resource)
 
 
 def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
@@ -184,10 +248,10 @@ def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
 
 # Probing finds rings of loads that wait for one another, by edge chasing (Chandy, Misra and Haas 1983).
 #
-# The last edge of a ring is always a load that joins one in flight, because a new resource waits for nothing yet. So a
-# probe starts at a load that joins. All other edges are known at their providers by then. Therefore a load may go by
-# another connection than the probe that follows it. A link may break and lose a probe. The loads that wait at that
-# provider are then sent again over the next link, and each starts another probe.
+# The last edge of a ring is always a load that joins one in flight or waits for an unload. Any other new resource waits
+# for nothing yet. So a probe starts at such a load. All other edges are known at their providers by then.
+# Therefore a load may go by another connection than the probe that follows it. A link may break and lose a probe. The
+# loads that wait at that provider are then sent again over the next link, and each starts another probe.
 
 _RING_LIMIT = 256
 
@@ -204,7 +268,8 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     """Pass a probe on from this resource to all that it waits for."""
     catalog = decision.catalog
     ring = [*message.ring, catalog.origin_of(resource)]
-    if not is_busy(catalog, resource) or len(ring) > _RING_LIMIT:
+    waits = is_busy(catalog, resource) or resource.phase is UNLOADING or resource.phase in RESTING
+    if not waits or len(ring) > _RING_LIMIT:
         return
     if resource.id == message.waiter:
         add_in_flight(decision, message.blocked)
@@ -212,6 +277,9 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
         if blocked is not None and blocked.hold is PENDING:
             withdraw(decision, blocked, failures.circular(ring, blocked))
         return
+    if resource.phase is QUEUED:
+        for id in list(catalog.unloading.get((resource.server, resource.request), ())):
+            chase(decision, catalog.resources[id], replace(message, ring=ring))
     for held_id in parts_of(decision, resource.id):
         held = catalog.held[held_id]
         if held.hold is PENDING:

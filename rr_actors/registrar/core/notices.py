@@ -1,35 +1,112 @@
-"""A provider's messages that answer no request at once: notices, answers to parked loads, refusals."""
+"""A provider's messages that answer no request at once: notices, answers to parked loads, refusals.
+
+The last part is a consumer's: when all receivers of a notice have dealt with it, its provider may forget it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import islice
 
 from msgspec.structs import replace
 
+from rr_actors.base.values.failure import Failure
+from rr_actors.registrar.core.callback_runs import forget_runs
+from rr_actors.registrar.core.holding import end_direct
+from rr_actors.registrar.core.priorities import touch
+from rr_actors.registrar.core.releasing import request
+from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.effects import Reply
-from rr_actors.registrar.model.messages import Failure, Load, LoadRefused, Noticed, NoticesHandled, Unload
-from rr_actors.registrar.model.rows import Notice, Query, Resource, is_own
+from rr_actors.registrar.model.effects import FellBehind, LoadResolved, Reply, SetTimer
+from rr_actors.registrar.model.messages import Load, LoadRefused, Noticed, NoticesHandled, Unload
+from rr_actors.registrar.model.rows import Hold, Notice, Query, Resource, State, is_own
+
+_HEARD_REMEMBERED = 20_000
+_SWEPT_EVERY = 1024
+
+Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 
 # Notices: statuses on their way to the holders of queries. A notice is a row until its holder has dealt with it.
+#
+# Of one query, a window of notices is on the way at a time (Catalog.window), oldest first. The others wait here until
+# the holder has dealt with half of these. So a slow holder has few of them in memory, and only its own wait. If more
+# wait than Catalog.backlog, the oldest are dropped, which newer ones have made out of date.
 
 
 def notify(decision: Decision, query: Query, said: Notice, *, repeated: bool = False) -> None:
-    """Add a notice for the query's holder with what `said` says of the resource, and send it."""
+    """Add a notice for the query's holder with what `said` says of the resource, and send it in its turn."""
+    catalog = decision.catalog
     notice = replace(said, id=f"{said.event}:{query.id}", query_id=query.id, origin=query.origin)
     decision.put(notice)
-    if repeated:  # the holder may have got this status before a crash
-        decision.note(decision.catalog.told, notice.id, True)
-    send_notice(decision, notice)
+    if repeated and notice.id not in catalog.told:  # the holder may have got this status before a crash
+        decision.note(catalog.told, notice.id, False)
+    before = len(catalog.notices_on[query.id]) - 1
+    if before >= catalog.backlog:
+        oldest = [catalog.notices[id] for id in islice(catalog.notices_on[query.id], 2 * catalog.window)]
+        drop_superseded(decision, [old for old in oldest if not catalog.told.get(old.id)])
+    if query.id in catalog.behind or query.origin not in catalog.consumers:
+        return
+    if before < catalog.window:
+        _send_notice(decision, notice)
+    else:
+        decision.note(catalog.behind, query.id, before)
+        decision.cause(FellBehind(query.origin, query.resource_id, query.id, before))
 
 
-def send_notice(decision: Decision, notice: Notice) -> None:
-    """Send a notice if its holder has a link; otherwise the notice waits for the holder's next link."""
+def drop_superseded(decision: Decision, oldest: list[Notice]) -> None:
+    """Drop the oldest notices that wait for one receiver, but no FATAL, no loss, and not the last response."""
+    dropped, response = 0, False
+    for notice in reversed(oldest):
+        if notice.state is State.FATAL or (notice.response is not None and not response):
+            response = response or notice.response is not None
+        else:
+            drop_notice(decision, notice)
+            dropped += 1
+    if dropped:
+        decision.cause(FellBehind(oldest[0].origin, oldest[0].resource_id, oldest[0].query_id, 0, dropped))
+
+
+def send_notices_to(decision: Decision, origin: str) -> None:
+    """Send the oldest notices for each query of a consumer over its new link; the others in their turn."""
     catalog = decision.catalog
-    if notice.origin in catalog.consumers:
-        repeated = notice.id in catalog.told
-        decision.note(catalog.told, notice.id, True)
-        decision.cause(Reply(notice.origin, Noticed(notice, repeated)))
+    sent: dict[str, int] = {}
+    for notice in [catalog.notices[id] for id in catalog.notices_to.get(origin, ())]:
+        count = sent.get(notice.query_id, 0)
+        if count < catalog.window:
+            sent[notice.query_id] = count + 1
+            decision.forget(catalog.behind, notice.query_id)
+            _send_notice(decision, notice)
+        else:
+            decision.note(catalog.behind, notice.query_id, count)
+            if catalog.told.get(notice.id):
+                decision.note(catalog.told, notice.id, False)
+
+
+def _send_notice(decision: Decision, notice: Notice) -> None:
+    catalog = decision.catalog
+    repeated = notice.id in catalog.told
+    if repeated and notice.response is not None and (resource := catalog.resources.get(notice.resource_id)) is not None:
+        notice = replace(notice, response=resource.response)  # its holder may have heard of a newer one
+    decision.note(catalog.told, notice.id, True)
+    decision.cause(Reply(notice.origin, Noticed(notice, repeated)))
+
+
+def _send_more(decision: Decision, query_id: str) -> None:
+    """Fill the window of a query that is behind, if half of it is free."""
+    catalog = decision.catalog
+    on_way = catalog.behind.get(query_id, catalog.window)
+    if on_way * 2 > catalog.window:
+        return
+    for notice in [catalog.notices[id] for id in catalog.notices_on[query_id]]:
+        if notice.origin not in catalog.consumers:
+            return  # its next link brings them
+        if not catalog.told.get(notice.id):
+            if on_way == catalog.window:
+                decision.note(catalog.behind, query_id, on_way)
+                return
+            _send_notice(decision, notice)
+            on_way += 1
+    decision.forget(catalog.behind, query_id)
 
 
 def own_notices(decision: Decision, resource_id: str) -> list[Notice]:
@@ -39,34 +116,59 @@ def own_notices(decision: Decision, resource_id: str) -> list[Notice]:
 
 
 def drop_resource(decision: Decision, resource: Resource) -> None:
-    """Remove a resource, and the notices about it that its server has not heard."""
+    """Remove a resource, and the notices about it that its server has not heard; acknowledge those of its parts."""
     for notice in own_notices(decision, resource.id):
         drop_notice(decision, notice)
-    deferred = decision.forget(decision.catalog.deferred, resource.id) or ()
-    of_parts = tuple(start for start in deferred if not is_own(start.notice))
-    if of_parts:
-        decision.note(decision.catalog.deferred, resource.id, of_parts)  # their notices have to be acknowledged
+    for start in decision.forget(decision.catalog.deferred, resource.id) or ():
+        if not is_own(start.notice):
+            dealt_with(decision, ("resource", resource.id, start.notice.event))
+    forget_runs(decision, resource.id)
+    end_revocation(decision, resource.id)
     decision.drop(resource)
 
 
+def end_revocation(decision: Decision, resource_id: str) -> None:
+    """Forget that a resource is revoked: it is gone, or cannot be unloaded."""
+    if (revocation := decision.catalog.revocations.get(resource_id)) is not None:
+        decision.drop(revocation)
+        decision.cause(SetTimer("revoke:" + resource_id, None, None))
+
+
 def notices_handled(decision: Decision, message: NoticesHandled) -> None:
-    """Drop the notices that their holder has dealt with."""
+    """Drop the notices that their holder has dealt with.
+
+    With the one that says that a query was taken away go those before it: the holder has dealt with them, or passed
+    them over while it was releasing the query.
+    """
     for id in message.ids:
         notice = decision.catalog.notices.get(id)
-        if notice is not None:
-            drop_notice(decision, notice)
+        if notice is None:
+            continue
+        drop_notice(decision, notice)
+        if notice.released and notice.query_id not in decision.catalog.queries:
+            drop_notices(decision, notice.origin, notice.query_id)
+        else:
+            _send_more(decision, notice.query_id)
 
 
 def drop_notice(decision: Decision, notice: Notice) -> None:
     """Drop a notice, which need not be sent (again)."""
+    catalog = decision.catalog
     decision.drop(notice)
-    decision.forget(decision.catalog.told, notice.id)
+    sent = decision.forget(catalog.told, notice.id)
+    if notice.query_id in catalog.behind:
+        if notice.query_id not in catalog.notices_on:
+            decision.forget(catalog.behind, notice.query_id)
+        elif sent:
+            decision.note(catalog.behind, notice.query_id, catalog.behind[notice.query_id] - 1)
 
 
 def drop_query(decision: Decision, query: Query) -> None:
     """Remove a query that its holder has released, and the notices about it that the holder has not heard."""
     decision.forget(decision.catalog.waiting, query.id)
     decision.forget(decision.catalog.unanswered, query.id)
+    if query.resource_id in decision.catalog.ranked:
+        touch(decision, query.resource_id)
     decision.drop(query)
     drop_notices(decision, query.origin, query.id)
 
@@ -78,9 +180,10 @@ def drop_notices(decision: Decision, origin: str, query_id: str) -> None:
 
 
 def send_notices(decision: Decision, query: Query) -> None:
-    """Send all notices about a query again."""
+    """Send the notices about a query again that are on their way."""
     for notice in _notices_of(decision, query.origin, query.id):
-        send_notice(decision, notice)
+        if decision.catalog.told.get(notice.id) and notice.origin in decision.catalog.consumers:
+            _send_notice(decision, notice)
 
 
 def _notices_of(decision: Decision, origin: str, query_id: str) -> list[Notice]:
@@ -146,3 +249,71 @@ def parked_on(catalog: Catalog, query_id: str) -> str | None:
         if any(isinstance(message, Load) and message.query_id == query_id for message in parked):
             return resource_id
     return None
+
+
+# Notices at the consumer.
+
+
+def dealt_with(decision: Decision, place: Place) -> None:
+    """Note that a receiver has dealt with an event; acknowledge the notices of which it was the last receiver."""
+    catalog = decision.catalog
+    waiting = catalog.heard.get(place, ())
+    remember_heard(decision, place)
+    for notice_id in waiting:
+        hearing = catalog.hearing.get(notice_id)
+        if hearing is None:
+            continue
+        if hearing.receivers > 1:
+            decision.note(catalog.hearing, notice_id, replace(hearing, receivers=hearing.receivers - 1))
+        else:
+            decision.forget(catalog.hearing, notice_id)
+            end_query(decision, hearing.ends, hearing.provider)
+            acknowledge(decision, hearing.provider, notice_id)
+
+
+def end_query(decision: Decision, held_id: str, provider: str) -> None:
+    """Remove a query that was taken away, when its holders know; on disk before the notice is acknowledged.
+
+    A provider that is gone for good may still have the query in its catalog: the release is owed. If this registrar has
+    found by itself that the query is lost (`provider` is ""), its provider may have a notice of that: an Unload has it
+    drop that.
+    """
+    catalog = decision.catalog
+    doubted = decision.forget(catalog.ending, held_id)
+    held = catalog.held.get(held_id)
+    if held is not None and held.hold is not Hold.OWED:
+        if held.hold is Hold.PENDING and held_id not in catalog.direct:
+            # Its thread's line broke, and the load waits for the link.
+            failure = failures.withdrawn(held, "taken away before the answer to its load came")
+            decision.cause(LoadResolved(held, failure))
+        end_direct(decision, held_id)
+        decision.forget(catalog.kept, held_id)
+        if doubted:
+            decision.put(replace(held, hold=Hold.OWED, resource_id=""))
+            request(decision, held.registrar, Unload(held_id, catalog.name))
+        else:
+            decision.drop(held)
+            if not provider and held.registrar in catalog.up:
+                request(decision, held.registrar, Unload(held_id, catalog.name))
+
+
+def remember_heard(decision: Decision, place: Place) -> None:
+    """Remember that no notice waits for this receiver of an event; forget the oldest ones beyond the limit."""
+    catalog, heard = decision.catalog, decision.catalog.heard
+    decision.note(heard, place, ())
+    if len(heard) % _SWEPT_EVERY == 0:
+        for old, pending in list(heard.items()):
+            kind, id, _ = old
+            if not pending and id not in (catalog.held if kind == "query" else catalog.resources):
+                decision.forget(heard, old)
+    if len(heard) > _HEARD_REMEMBERED:
+        for old in list(heard)[: _HEARD_REMEMBERED // 2]:
+            if not heard[old]:
+                decision.forget(heard, old)  # so old that its notice was acknowledged long ago
+
+
+def acknowledge(decision: Decision, provider: str, notice_id: str) -> None:
+    """Say to a notice's provider that its receivers have dealt with it; this registrar's own has no provider."""
+    if provider:
+        decision.note(decision.catalog.acked, provider, True)
+        request(decision, provider, NoticesHandled([notice_id]))

@@ -7,13 +7,14 @@ from operator import attrgetter
 
 from msgspec.structs import replace
 
-from rr_actors.registrar.core import digests
-from rr_actors.registrar.core.holding import end_release, load_of, loaded, lose
-from rr_actors.registrar.core.notices import drop_parked, send_notice
-from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, request
+from rr_actors.registrar.core.holding import asked_anew, end_release, load_of, loaded, lose
+from rr_actors.registrar.core.notices import drop_notice, drop_parked, send_notices_to
+from rr_actors.registrar.core.priorities import follow, tell, tell_unsent
+from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, released, request
+from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Decision
-from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
-from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
+from rr_actors.registrar.model.commands import BeginClosing, ConsumerLost, EndClosing, LinkLost, PeerGone, Reconcile
+from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request, UnloadResolved
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
 from rr_actors.registrar.model.rows import Held, Hold, State
 
@@ -30,27 +31,29 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     decision.note(catalog.up, command.registrar, command.link)
     theirs = {query.query_id for query in command.queries}
     for held in catalog.unsettled_at(command.registrar):
-        if held.hold is Hold.PENDING and (held.response is not None or held.state is not State.OK):
+        if held.hold is Hold.PENDING and held.resource_id:
             # An earlier link brought this. It may have lost the news that the query was taken away. The list is newer:
             # if it does not have the query, the query is loaded anew.
-            decision.put_here(replace(held, response=None, state=State.OK))
+            decision.put_here(asked_anew(held))
     for query in command.queries:
         _agree(decision, command.registrar, query)
-    if command.registrar in catalog.outbound:  # perhaps the list has brought the first row at this provider
-        look_there(decision, command.registrar)
+    decision.note(catalog.agreed, command.registrar, True)
+    if command.notices:  # if this link is lost before them, they come over the next, and then the provider forgets them
+        decision.note(catalog.acked, command.registrar, True)
+    look_there(decision, command.registrar)  # the list may have brought the first row there, or a thread's line does
     agreed, differing = digests.split(catalog, command.registrar, command.same)
     for held in agreed:
         decision.forget(catalog.kept, held.id)
     for held in differing:
-        if held.id not in theirs and held.id not in catalog.fresh:
+        if held.id not in theirs and catalog.fresh.get(held.id) != command.run:
             kept = held.id in catalog.kept  # the answer to the second try was lost
             why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
             lose(decision, held, command.event, why)
-            # a notice may follow; if this link is lost, it comes over the next
-            decision.note(catalog.acked, command.registrar, True)
     for id in list(catalog.fresh):
         if id not in catalog.held or catalog.held[id].registrar == command.registrar:
             decision.forget(catalog.fresh, id)
+    if catalog.unsent or catalog.rising:
+        tell_unsent(decision, command.registrar)
     _send_open(decision, command.registrar)
 
 
@@ -71,13 +74,21 @@ def _send_open(decision: Decision, provider: str) -> None:
 def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     """Take over what a provider's list says of one query."""
     held = decision.catalog.held.get(query.query_id)
+    if held is not None and held.hold is not Hold.PENDING and held.priority != query.priority:
+        tell(decision, held)
     if held is None:
         _take_back(decision, registrar, query)
     elif held.hold is Hold.PENDING and query.response is not None:
         decision.put_here(replace(held, state=State(query.state)))
         loaded(decision, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
-        now = replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
+        now = replace(
+            held,
+            request=query.request,
+            resource_id=query.resource_id,
+            response=query.response,
+            state=State(query.state),
+        )
         decision.forget(decision.catalog.kept, held.id)
         if now != held:  # a crash came after a status was acknowledged, and before the row was written
             decision.put_later(now)
@@ -86,19 +97,25 @@ def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
 def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     """Add a row for a query that only the provider knows: hold it again, or release it.
 
-    It may be from before a crash, its row not written yet; or the provider missed its release. It is released in three
+    It may be from before a crash, its row not written yet; or the provider missed its release. It is released in four
     cases. It has no response: then its load was never acknowledged. It is of an earlier attempt of its parent: the
     parent does not have it any more. It is of this incarnation: then we have released it, as otherwise we would have
-    its row.
+    its row. This registrar was closed since: that releases what a provider has that was away then, except for the parts
+    of a resource that could not be unloaded.
     """
     catalog = decision.catalog
+    peer = catalog.peers.get(registrar)
     parent = catalog.resources.get(query.parent)
     kept = not query.parent or (parent is not None and parent.attempt == query.attempt)
     wanted = kept and query.response is not None and query.seq <= catalog.since
+    wanted = wanted and (parent is not None or peer is None or query.seq > peer.released)
     hold, resource_id = (Hold.HELD, query.resource_id) if wanted else (Hold.OWED, "")  # as though withdrawn
     place = (registrar, query.server, query.request, query.response, resource_id)
-    numbers = (query.attempt, query.seq)
-    decision.put_later(Held(query.query_id, *place, query.parent, *numbers, hold, State(query.state)))
+    facts = (query.attempt, query.seq, hold, State(query.state), query.priority, query.own)
+    held = Held(query.query_id, *place, query.parent, *facts)
+    decision.put_later(held)
+    if held.parent:
+        follow(decision, held)
 
 
 def link_lost(decision: Decision, command: LinkLost) -> None:
@@ -120,30 +137,81 @@ def link_lost(decision: Decision, command: LinkLost) -> None:
 
 
 def peer_gone(decision: Decision, command: PeerGone) -> None:
-    """Fail the loads that wait for a provider that cannot be reached; if it is gone for good, lose what it had."""
-    catalog = decision.catalog
-    for id in list(catalog.outbound.get(command.registrar, ())):
+    """Fail the loads that wait for a provider that cannot be reached; if it is gone for good, lose what it had.
+
+    Unless it is known to have nothing, all of that is owed to it: its catalog may still have it, and it may be started
+    again under its name, in this run of the system or in a later one.
+    """
+    catalog, provider = decision.catalog, command.registrar
+    unsure = False
+    if command.final:
+        add_all_in_flight(decision, provider)
+    asked = catalog.agreed.get(provider, False)  # else no link was up since it was gone, so nothing was sent there
+    for id in list(catalog.outbound.get(provider, ())):
         held = catalog.held[id]
         if command.final:
             decision.forget(catalog.fresh, id)
+            decision.forget(catalog.unsent, id)
         if held.hold is Hold.PENDING and id in catalog.direct:
+            unsure = True
             continue  # its thread's line breaks, and then the link asks for it
         if held.hold is Hold.PENDING:
             decision.cause(LoadResolved(held, command.failure))
-            if command.final:
+            if command.empty or (command.final and not asked):
                 decision.drop_later(held)
             else:
-                decision.put(replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
+                # It may have had the request before it stopped.
+                decision.put(replace(held, hold=Hold.OWED, resource_id=""))
         elif not command.final:
             continue
-        elif held.hold is Hold.OWED:
-            end_release(decision, held)
-        else:
+        elif held.hold is Hold.HELD:
+            if not command.empty and id not in catalog.ending:
+                decision.note(catalog.doubted, id, True)
             lose(decision, held, command.event, command.failure.message)
-    if command.final:
-        decision.forget(catalog.acked, command.registrar)
-    if command.final and command.registrar not in catalog.outbound and command.registrar in catalog.peers:
-        decision.drop(catalog.peers[command.registrar])
+        elif command.empty:
+            end_release(decision, held)
+        else:  # it has not heard of the release, and may be back, perhaps in the next system
+            decision.put(held)  # the disk may not have it as owed yet
+            decision.cause(UnloadResolved(id, command.failure))
+            released(decision, id)
+    if not command.final:
+        return
+    if (decision.forget(catalog.acked, provider) or unsure) and not command.empty:
+        decision.forget(catalog.agreed, provider)  # a lost acknowledgement or load: a notice or query may be there
+    known = provider in catalog.agreed
+    if known:
+        decision.note(catalog.agreed, provider, False)
+    if (known or command.empty) and provider not in catalog.outbound and provider in catalog.peers:
+        decision.drop(catalog.peers[provider])
+
+
+def begin_closing(decision: Decision, command: BeginClosing) -> None:
+    """Load nothing from now on: who would release it?"""
+    decision.note(decision.catalog.shut, command.own, command.failure)
+
+
+def end_closing(decision: Decision, _command: EndClosing) -> None:
+    """Owe all releases that are left, and forget the providers that have nothing of this registrar.
+
+    A provider that was away since this registrar was opened may have queries that are unknown here; one that is away
+    now may not have got an acknowledgement. The Peer row stays, and says that all is released. A consumer with a link
+    has its notices, or finds at its next start that the query is gone. Others hear them when both are started again.
+    """
+    catalog = decision.catalog
+    add_all_in_flight(decision)  # a Load may be on its way, on its thread's line
+    for held in list(catalog.held.values()):
+        if held.parent not in catalog.resources:  # its release has failed; if it does so again, nobody wants it back
+            decision.put(replace(held, hold=Hold.OWED, resource_id=""))
+    for peer in list(catalog.peers.values()):
+        away = catalog.agreed.get(peer.id) is True and peer.id not in catalog.up
+        if peer.id not in catalog.agreed or (away and peer.id in catalog.acked):
+            decision.put(replace(peer, released=catalog.last_number()))
+        elif peer.id not in catalog.outbound:
+            decision.drop(peer)
+    for origin in {**catalog.consumers, catalog.name: ""}:
+        for notice in [catalog.notices[id] for id in catalog.notices_to.get(origin, ())]:
+            if notice.query_id not in catalog.queries:
+                drop_notice(decision, notice)
 
 
 # -- as a provider -------------------------------------------------------------------------------------------------
@@ -163,8 +231,9 @@ def fetch(decision: Decision, message: Fetch) -> None:
     size = 0
     for query in queries:
         resource = catalog.resources[query.resource_id]
-        response = None if resource.id in catalog.moving else resource.response or b""
-        place = (query.parent, query.attempt, query.seq, str(resource.state))
+        unanswered = resource.id in catalog.moving or query.id in catalog.waiting
+        response = None if unanswered else resource.response or b""
+        place = (query.parent, query.attempt, query.seq, str(resource.state), query.priority, query.own)
         row = FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
         more = len(row.request) + len(response or b"")
         if rows and (len(rows) == _CHUNK or size + more > _CHUNK_BYTES):
@@ -172,7 +241,8 @@ def fetch(decision: Decision, message: Fetch) -> None:
             rows, size = [], 0
         rows.append(row)
         size += more
-    decision.cause(Reply(message.origin, Fetched(rows, False, message.number, same)))
+    notices = message.resume and bool(catalog.notices_to.get(message.origin))
+    decision.cause(Reply(message.origin, Fetched(rows, False, message.number, same, notices)))
     if message.resume:
         drop_parked(decision, lambda parked: parked.origin == message.origin)  # a consumer that lives sends them again
         for id in list(catalog.unanswered):  # the consumer sends these Unloads again over the new link
@@ -180,8 +250,7 @@ def fetch(decision: Decision, message: Fetch) -> None:
             if query is None or query.origin == message.origin:
                 decision.forget(catalog.unanswered, id)
         decision.note(catalog.consumers, message.origin, True)
-        for notice_id in list(catalog.notices_to.get(message.origin, ())):
-            send_notice(decision, catalog.notices[notice_id])
+        send_notices_to(decision, message.origin)
 
 
 def consumer_lost(decision: Decision, command: ConsumerLost) -> None:

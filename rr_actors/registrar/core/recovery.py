@@ -11,24 +11,74 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import holding
-from rr_actors.registrar.core.callback_runs import start_load, start_queued, start_unload
-from rr_actors.registrar.core.loading import load
+from rr_actors.registrar.core.callback_runs import (
+    ATTEMPTS,
+    awaits_trial,
+    deaths_of,
+    end_trial,
+    give_up_request,
+    is_given_up,
+    is_its_turn,
+    limit_trial,
+    note_begun,
+    note_ended,
+    refuse_for_a_while,
+    run_id,
+    running,
+    start_load,
+    start_queued,
+)
+from rr_actors.registrar.core.loading import load, loaded
 from rr_actors.registrar.core.notices import refuse_all
+from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts
-from rr_actors.registrar.core.status_changes import spread, start_own
+from rr_actors.registrar.core.status_changes import is_busy, limit_grace, spread, start_own
 from rr_actors.registrar.core.status_delivery import start_deferred
-from rr_actors.registrar.core.unloading import begin_unload, condemned, retire, unheld, unload
+from rr_actors.registrar.core.unloading import (
+    answer_wholes,
+    answers_to_owners,
+    balance,
+    begin_unload,
+    condemned,
+    go_on,
+    refuse_waiting,
+    retire,
+    run_unload,
+    unheld,
+    unload,
+)
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
-from rr_actors.registrar.model.commands import RecoverDone, RecoverErred, Register
-from rr_actors.registrar.model.effects import StartRecover
+from rr_actors.registrar.model.commands import (
+    BeginTrial,
+    PauseDone,
+    PauseErred,
+    RecoverDone,
+    RecoverErred,
+    RecoverOverdue,
+    Register,
+    Reread,
+    ResumeDone,
+    ResumeErred,
+    TrialOver,
+)
+from rr_actors.registrar.model.effects import Died, Happened, Reply, SetTimer, StartRecover
 from rr_actors.registrar.model.messages import Load
-from rr_actors.registrar.model.rows import NOT_BEGUN, Phase, Resource, State
-
-ATTEMPTS = 3
-"""How often a load begins whose process dies each time. With the default restart intensity, one more death would end
-the supervisor: one request could take a whole tree down, and again at each start."""
+from rr_actors.registrar.model.rows import (
+    NOT_BEGUN,
+    PAUSED,
+    PAUSING,
+    RESUMING,
+    STANDBY,
+    CallbackRun,
+    Phase,
+    Resource,
+    ServerType,
+    State,
+    types_id,
+)
 
 
 def begin_again(decision: Decision) -> None:
@@ -37,16 +87,54 @@ def begin_again(decision: Decision) -> None:
     A load that was interrupted is prepared for its next attempt; after ATTEMPTS of them it is refused and cleaned up.
     """
     holding.begin_again(decision)
+    died, given_up = _count_deaths(decision)
     for id in list(decision.catalog.moving):
         resource = decision.catalog.resources[id]
         if resource.phase is not Phase.LOADING or resource.tries == NOT_BEGUN:  # no server was there to begin it
             continue
+        died.append(_run_of(decision.catalog, resource, "load"))
         if resource.attempt < ATTEMPTS:
             decision.put(replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
         else:
-            decision.effects += refuse_all(decision, resource, failures.interrupted(decision.catalog, resource))
+            wait_s = give_up_request(decision, resource)
+            failure = failures.interrupted(decision.catalog, resource, wait_s)
+            given_up.append(failure.message)
+            decision.effects += refuse_all(decision, resource, failure)
             # A part or all of it may be loaded. With the next number, the parts of the last attempt are released.
             decision.put(replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
+            note_begun(decision, "unload", id, begun=False)
+    for run in list(decision.catalog.callback_runs.values()):
+        if run.id.startswith("request:"):
+            refuse_for_a_while(decision, run.id)
+    for revocation in decision.catalog.revocations.values():
+        limit_grace(decision, revocation)
+    if died:
+        decision.cause(Died(tuple(died), tuple(given_up)))
+
+
+def _count_deaths(decision: Decision) -> tuple[list[str], list[str]]:
+    """Count the last process's death for each callback that ran in it; return what ran, and what runs no more."""
+    catalog = decision.catalog
+    unloads = [run_id("unload", id) for id in catalog.moving if catalog.resources[id].phase is Phase.UNLOADING]
+    first = [CallbackRun(id, begun=True) for id in unloads if id not in catalog.callback_runs]
+    died: list[str] = []
+    given_up: list[str] = []
+    for run in [*(run for run in catalog.callback_runs.values() if run.begun), *first]:
+        role, _, id = run.id.partition(":")
+        resource = catalog.resources.get(id)
+        if resource is None:
+            decision.drop(run)
+            continue
+        deaths = run.deaths + 1
+        decision.put(CallbackRun(run.id, deaths))
+        died.append(_run_of(catalog, resource, role))
+        if deaths == ATTEMPTS:
+            given_up.append(failures.not_run_again(catalog, resource, role, deaths))
+    return died, given_up
+
+
+def _run_of(catalog: Catalog, resource: Resource, role: str) -> str:
+    return f"the {role} callback of {catalog.origin_of(resource)} for resource {resource.id}"
 
 
 def register(decision: Decision, command: Register) -> None:
@@ -54,7 +142,16 @@ def register(decision: Decision, command: Register) -> None:
     catalog = decision.catalog
     server = command.server
     decision.note(catalog.servers, server.name, server)
+    for reread in command.reread:
+        _reread(decision, reread, command.event)
+    if command.digest:
+        _note_types(decision, command)
     for resource in _to_recover(catalog, server):
+        if catalog.resources.get(resource.id) is not resource:
+            continue  # the end of another resource of the same request has begun its load
+        if resource.id in catalog.unread:
+            _lose_unread(decision, resource, command.event)
+            continue
         match resource.phase:
             case Phase.LOADING if resource.tries == NOT_BEGUN:
                 _interrupted(decision, resource)
@@ -63,37 +160,85 @@ def register(decision: Decision, command: Register) -> None:
             case Phase.QUEUED:
                 start_queued(decision, resource)
             case Phase.UNLOADING:
-                start_unload(decision, resource)
+                run_unload(decision, resource)
             case Phase.LOADED:
-                _recover(decision, resource, server.has_recover, server.recovery, command.event)
+                _recover(decision, resource, server, command.event)
             case Phase.UNLOAD_FAILED:
                 pass
+            case _:
+                _recover(decision, resource, server, command.event)
+        if (left := catalog.resources.get(resource.id)) is not None and left.id not in catalog.recovering:
+            _rest_again(decision, left, command.event)
     start_own(decision, server.name)
+
+
+def _note_types(decision: Decision, command: Register) -> None:
+    """Keep the digest of the types that all stored values fit, so that the next incarnation need not read them."""
+    misfits = any(reread.misfit for reread in command.reread)
+    row = ServerType(types_id(command.server.name), b"" if misfits else command.digest)
+    known = decision.catalog.server_types.get(row.id)
+    if known is None and decision.catalog.by_server.get(command.server.name):  # else there is nothing to read
+        decision.put_later(row)
+    elif known is not None and known != row:
+        decision.put(row)
+
+
+def _reread(decision: Decision, reread: Reread, event: str) -> None:
+    """Give a stored resource the request and response that it has by today's types, or note that it does not fit."""
+    resource = decision.catalog.resources.get(reread.resource_id)
+    if resource is None:
+        return
+    if reread.misfit:
+        decision.note(decision.catalog.unread, resource.id, reread.misfit)
+        return
+    changed = reread.response != resource.response
+    resource = replace(resource, request=reread.request, response=reread.response)
+    decision.put(resource)
+    if changed and resource.phase is Phase.LOADED and resource.state is not State.FATAL:
+        text, source = "brought up to date from an earlier version", decision.catalog.origin_of(resource)
+        spread(decision, resource, event + ":upgrade", State.UPDATE, text, source, reread.response)
+
+
+def _lose_unread(decision: Decision, resource: Resource, event: str) -> None:
+    why = failures.unread(decision.catalog, resource)
+    if resource.phase is Phase.LOADED and resource.id in decision.catalog.holders:
+        if resource.state is not State.FATAL:
+            spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
+        return
+    if resource.phase in (Phase.QUEUED, Phase.LOADING):
+        decision.effects += refuse_all(decision, resource, failures.load_failed(decision.catalog, resource, why))
+    if resource.phase is Phase.QUEUED:
+        unheld(decision, resource)
+    elif resource.phase is not Phase.UNLOAD_FAILED:
+        begin_unload(decision, resource)
 
 
 def _interrupted(decision: Decision, resource: Resource) -> None:
     """Run an interrupted load again if somebody holds its resource; otherwise clean up what it left."""
-    if resource.id in decision.catalog.holders:
+    if resource.id not in decision.catalog.holders:
+        unheld(decision, resource)
+    elif resource.attempt < ATTEMPTS or is_its_turn(decision, run_id("load", resource.id)):
         resource = replace(resource, tries=0)
         decision.put(resource)
         start_load(decision, resource)
-    else:
-        unheld(decision, resource)
 
 
 def _to_recover(catalog: Catalog, server: Server) -> list[Resource]:
     """Return the server's resources that need a decision."""
     ids = catalog.by_server.get(server.name, ())
-    if server.recovery == "keep" and not server.has_recover:  # held resources, which are most, need no decision then
+    if (
+        server.recovery == "keep" and not server.pauses and not catalog.resting and not server.has_recover
+    ):  # held resources, which are most, need no decision then
         moving, holders = catalog.moving, catalog.holders
         if len(holders) == len(catalog.resources):  # every resource is held
-            ids = [id for id in moving if id in ids]
+            ids = [id for id in {**moving, **catalog.unread} if id in ids]
         else:
-            ids = [id for id in ids if id in moving or id not in holders]
+            ids = [id for id in ids if id in moving or id in catalog.unread or id not in holders]
     return [catalog.resources[id] for id in ids]
 
 
-def _recover(decision: Decision, resource: Resource, has_recover: bool, policy: str, event: str) -> None:
+def _recover(decision: Decision, resource: Resource, server: Server, event: str) -> None:
+    has_recover, policy = server.has_recover, server.recovery
     if resource.id not in decision.catalog.holders:
         if has_recover or policy != "keep":  # it may be lost, so it is not kept warm
             begin_unload(decision, resource)
@@ -101,21 +246,181 @@ def _recover(decision: Decision, resource: Resource, has_recover: bool, policy: 
             retire(decision, resource)
     elif resource.state is State.FATAL:
         return  # parts of an interrupted reload stay with it until its holders release it
-    elif has_recover:
+    elif is_given_up(decision.catalog, "recover", resource.id):
+        why = failures.not_run_again(
+            decision.catalog, resource, "recover", deaths_of(decision.catalog, "recover", resource.id)
+        )
+        spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
+    elif has_recover or policy == "reload":
         decision.note(decision.catalog.recovering, resource.id, ())
-        decision.cause(StartRecover(resource, reload=False))
-    elif policy == "reload":
-        again = replace(resource, attempt=resource.attempt + 1)
-        decision.put(again)
-        decision.note(decision.catalog.recovering, resource.id, ())
-        release_parts(decision, resource.id, (StartRecover(again, reload=True),), keep_attempt=again.attempt)
+        if not awaits_trial(decision, "recover", resource.id):
+            _run_recover(decision, resource, server)
     elif policy == "lost":
         why = "lost: its manager was restarted"
         spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
 
 
+def _run_recover(decision: Decision, resource: Resource, server: Server) -> None:
+    """Run the recover callback; without one, load the resource again, when the parts of its last load are released."""
+    note_begun(decision, "recover", resource.id)
+    if server.has_recover:
+        decision.cause(StartRecover(resource, reload=False))
+    else:
+        resource = replace(resource, attempt=resource.attempt + 1, phase=Phase.LOADED)
+        decision.put(resource)
+        again = StartRecover(resource, reload=True)
+        release_parts(decision, resource.id, (again,), keep_attempt=resource.attempt)
+    if server.recover_timeout_s is not None:
+        failure = failures.recover_overdue(decision.catalog, resource, server.recover_timeout_s)
+        overdue = RecoverOverdue(resource.id, resource.attempt, failure)
+        decision.cause(SetTimer("recover:" + resource.id, server.recover_timeout_s, overdue))
+
+
+# -- pauses ------------------------------------------------------------------------------------------------------------
+
+
+def _rest_again(decision: Decision, resource: Resource, event: str) -> None:
+    """Go on with a pause or resumption that a crash has interrupted, and with the time of an idle resource."""
+    catalog = decision.catalog
+    if resource.phase in (PAUSING, RESUMING):
+        role = "pause" if resource.phase is PAUSING else "resume"
+        deaths = deaths_of(catalog, role, resource.id)
+        if deaths < ATTEMPTS:
+            go_on(decision, resource)
+            return
+        why = failures.not_run_again(catalog, resource, role, deaths)
+        if role == "pause":
+            _runs(decision, resource)
+        else:
+            _not_resumed(decision, resource, event, Failure("LoadFailed", why, {}))
+    elif catalog.priority_of(resource.id) <= STANDBY or resource.phase is PAUSED:
+        balance(decision, resource.id)
+
+
+def pause_ended(decision: Decision, ended: PauseDone | PauseErred) -> None:
+    """Note that the resource is paused; it is resumed if it is needed by now. If the callback raised, it runs on.
+
+    An idle one that nobody holds is unloaded then; one on standby is not paused again before it was needed once.
+    """
+    resource = running(decision.catalog, ended.resource_id, PAUSING, ended.attempt)
+    if resource is None:
+        return
+    note_ended(decision, "pause", resource.id)
+    if isinstance(ended, PauseErred):
+        decision.cause(Happened("pause_failed", resource, ended.failure.message))
+        _runs(decision, resource)
+        return
+    touch(decision, resource.id)
+    resource = replace(resource, phase=PAUSED)
+    decision.put(resource)
+    decision.cause(Happened("paused", resource, ""))
+    if resource.id not in decision.catalog.holders:
+        retire(decision, resource)
+    else:
+        _answer_owners(decision, resource)
+
+
+def _runs(decision: Decision, resource: Resource) -> None:
+    """Let a resource run on that could not be paused."""
+    catalog = decision.catalog
+    resource = replace(resource, phase=Phase.LOADED)
+    decision.put(resource)
+    decision.note(catalog.idle, resource.id, True)  # no timer is set before it was needed
+    _answer_loads(decision, resource)
+    if resource.id not in catalog.holders:
+        begin_unload(decision, resource)
+
+
+def resume_ended(decision: Decision, ended: ResumeDone | ResumeErred) -> None:
+    """Answer all that wait for a resource that runs again; one that could not be resumed is lost."""
+    catalog = decision.catalog
+    resource = running(catalog, ended.resource_id, RESUMING, ended.attempt)
+    if resource is None:
+        return
+    note_ended(decision, "resume", resource.id)
+    if isinstance(ended, ResumeErred):
+        _not_resumed(decision, resource, ended.event, ended.failure)
+        return
+    touch(decision, resource.id)
+    resource = replace(resource, phase=Phase.LOADED)
+    decision.put(resource)
+    decision.cause(Happened("resumed", resource, ""))
+    if ended.response is not None and ended.response != resource.response:
+        source = catalog.origin_of(resource)
+        spread(decision, resource, ended.event, State.UPDATE, "resumed with a new response", source, ended.response)
+        resource = catalog.resources[resource.id]
+    _answer_loads(decision, resource)
+    if resource.id not in catalog.holders:
+        retire(decision, resource)
+
+
+def _answer_loads(decision: Decision, resource: Resource) -> None:
+    catalog = decision.catalog
+    for query in catalog.queries_of(resource.id):
+        if decision.forget(catalog.waiting, query.id) is not None:
+            decision.cause(Reply(query.origin, loaded(catalog, query.id, resource)))
+    answer_wholes(decision, resource)
+    _answer_owners(decision, resource)
+
+
+def _answer_owners(decision: Decision, resource: Resource) -> None:
+    """Answer an owner who has unloaded the resource: who holds it came after that, unless it is revoked."""
+    catalog = decision.catalog
+    if resource.id in catalog.holders and resource.id not in catalog.revocations:
+        decision.effects += answers_to_owners(decision, resource, None)
+
+
+def _not_resumed(decision: Decision, resource: Resource, event: str, failure: Failure) -> None:
+    """Refuse the loads that wait for a resource, and send its other holders a FATAL status."""
+    catalog = decision.catalog
+    resource = replace(resource, phase=Phase.LOADED)
+    decision.put(resource)
+    refuse_waiting(decision, resource, failure)
+    _answer_loads(decision, resource)
+    spread(decision, resource, event, State.FATAL, failure.message, catalog.origin_of(resource))
+
+
+# -- callbacks that run alone ------------------------------------------------------------------------------------------
+
+
+def begin_trial(decision: Decision, command: BeginTrial) -> None:
+    """Run a callback whose turn has come, if it still has to run."""
+    catalog = decision.catalog
+    if command.run_id not in catalog.trial:
+        return
+    limit_trial(decision, command.run_id)
+    role, _, id = command.run_id.partition(":")
+    resource = catalog.resources.get(id)
+    server = None if resource is None else catalog.servers.get(resource.server)
+    if resource is None or server is None:
+        end_trial(decision, command.run_id)
+        return
+    match role:
+        case "load" if resource.phase is Phase.LOADING and resource.tries == NOT_BEGUN and id in catalog.holders:
+            _interrupted(decision, resource)
+        case "unload" if resource.phase is Phase.UNLOADING:
+            run_unload(decision, resource)
+        case "recover" if id in catalog.recovering:
+            _run_recover(decision, resource, server)
+        case "pause" | "resume" if resource.phase in (PAUSING, RESUMING):
+            go_on(decision, resource)
+        case "status" if catalog.deferred.get(id) and not is_busy(catalog, resource):
+            start_deferred(decision, id)
+        case _:
+            end_trial(decision, command.run_id)
+
+
+def trial_over(decision: Decision, command: TrialOver) -> None:
+    """Go on with the next callback, although this one has not ended."""
+    end_trial(decision, command.run_id)
+
+
+# -- ends --------------------------------------------------------------------------------------------------------------
+
+
 def recover_done(decision: Decision, done: RecoverDone) -> None:
     """Keep a resource that lives; send its holders an UPDATE if its response has changed."""
+    note_ended(decision, "recover", done.resource_id)
     resource = _asked_after(decision, done.resource_id, done.attempt)
     if resource is None:
         return
@@ -127,11 +432,24 @@ def recover_done(decision: Decision, done: RecoverDone) -> None:
 
 def recover_erred(decision: Decision, erred: RecoverErred) -> None:
     """Send the holders of a lost resource a FATAL status."""
+    note_ended(decision, "recover", erred.resource_id)
     resource = _asked_after(decision, erred.resource_id, erred.attempt)
     if resource is None:
         return
     source = decision.catalog.origin_of(resource)
     spread(decision, resource, erred.event, State.FATAL, erred.failure.message, source)
+    _go_on(decision, resource.id)
+
+
+def recover_overdue(decision: Decision, overdue: RecoverOverdue) -> None:
+    """Send the holders of a resource whose recover callback takes too long a FATAL status. The callback goes on."""
+    resource = _asked_after(decision, overdue.resource_id, overdue.attempt)
+    if resource is None:
+        return
+    end_trial(decision, run_id("recover", resource.id))
+    event = f"overdue:{resource.id}:{decision.catalog.epoch}"
+    source = decision.catalog.origin_of(resource)
+    spread(decision, resource, event, State.FATAL, overdue.failure.message, source)
     _go_on(decision, resource.id)
 
 
@@ -148,6 +466,9 @@ def _go_on(decision: Decision, resource_id: str) -> None:
     catalog = decision.catalog
     parked = decision.forget(catalog.recovering, resource_id)
     resource = catalog.resources[resource_id]
+    server = catalog.servers.get(resource.server)
+    if server is not None and server.recover_timeout_s is not None:
+        decision.cause(SetTimer("recover:" + resource_id, None, None))
     if condemned(decision, resource):
         begin_unload(decision, resource)
     for message in parked:
@@ -156,6 +477,8 @@ def _go_on(decision: Decision, resource_id: str) -> None:
         else:
             unload(decision, message)
     left = catalog.resources.get(resource_id)
-    if left is not None and left.phase is Phase.LOADED and resource_id not in catalog.holders:
+    if left is not None and left.phase in (Phase.LOADED, PAUSED) and resource_id not in catalog.holders:
         retire(decision, left)
+    elif left is not None:
+        _rest_again(decision, left, f"rest:{resource_id}:{catalog.epoch}")
     start_deferred(decision, resource_id)

@@ -12,18 +12,31 @@ response that it may replace. Until then the status is deferred.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import islice
 
 from msgspec.structs import replace
 
-from rr_actors.registrar.core.notices import drop_notice, notify, own_notices
-from rr_actors.registrar.core.releasing import request
-from rr_actors.registrar.core.unloading import begin_unload
+from rr_actors.registrar.core.callback_runs import awaits_trial, is_given_up, note_begun
+from rr_actors.registrar.core.notices import drop_notice, drop_superseded, notify, own_notices
+from rr_actors.registrar.core.releasing import owe, request
+from rr_actors.registrar.core.unloading import begin_unload, stay_lost
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.commands import SetResponse, SetStatus, Swap
-from rr_actors.registrar.model.effects import Answer, Happened, StartStatus
+from rr_actors.registrar.model.commands import GraceOver, Revoke, SetResponse, SetStatus, Swap
+from rr_actors.registrar.model.effects import Answer, Happened, SetTimer, StartStatus
 from rr_actors.registrar.model.messages import Unload
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, State
+from rr_actors.registrar.model.rows import (
+    LOADED,
+    RESTING,
+    REVOKED,
+    Held,
+    Hold,
+    Notice,
+    Phase,
+    Resource,
+    Revocation,
+    State,
+)
 
 # -- to the holders ------------------------------------------------------------------------------------------------
 
@@ -49,7 +62,9 @@ def _note(decision: Decision, resource: Resource, said: Notice) -> Resource:
     response = resource.response if said.response is None else said.response
     resource = replace(resource, state=lasting, message=said.message, response=response)
     decision.put(resource)
-    decision.cause(Happened("status", resource.id, resource.server, f"{said.state} {said.message}".rstrip()))
+    decision.cause(Happened("status", resource, f"{said.state} {said.message}".rstrip(), said))
+    if lasting is State.FATAL and resource.phase in RESTING:
+        return stay_lost(decision, resource, said.message)
     return resource
 
 
@@ -60,22 +75,125 @@ def _tell_holders(decision: Decision, resource: Resource, said: Notice, *, repea
 
 
 def _end_if_unwanted(decision: Decision, resource: Resource) -> None:
-    loaded = resource.phase is Phase.LOADED and resource.id not in decision.catalog.recovering
+    loaded = resource.phase in (Phase.LOADED, Phase.PAUSED) and resource.id not in decision.catalog.recovering
     if resource.state is State.FATAL and loaded and resource.id not in decision.catalog.holders:
         begin_unload(decision, resource)  # it lingered; no new request will join it
+
+
+# -- revocations -------------------------------------------------------------------------------------------------------
+#
+# A holder hears that a resource is revoked as a FATAL status. When it has heard that, it lets the resource go. A
+# resource that depends on it is revoked itself, unless its status callback has put another in its place, or has handled
+# the status. So the highest are unloaded first, and each part after the last of its wholes. Each step is one decision:
+# the notice is acknowledged in the same commit that owes the release, or has the row of the next revocation.
+
+
+def revoke(decision: Decision, command: Revoke) -> None:
+    """Revoke a resource; answer the owner when it is gone."""
+    catalog = decision.catalog
+    resource = catalog.find(command.target)
+    if resource is None:
+        decision.cause(Answer(command.ticket, failures.unknown_target(catalog, command.target)))
+    elif resource.id in catalog.revocations:
+        decision.cause(Answer(command.ticket, failures.not_revoked(resource, "is revoked already")))
+    elif not _is_revocable(catalog, resource):
+        phase = "recovering" if resource.id in catalog.recovering else resource.phase
+        decision.cause(Answer(command.ticket, failures.not_revoked(resource, f"is {phase}")))
+    else:
+        decision.note(catalog.owners, resource.id, (*catalog.owners.get(resource.id, ()), command.ticket))
+        _revoke(decision, resource, Revocation(resource.id, command.event, command.why, command.grace_ms))
+
+
+def _is_revocable(catalog: Catalog, resource: Resource) -> bool:
+    loaded = resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED, *RESTING)
+    return loaded and resource.id not in catalog.recovering
+
+
+def _revoke(decision: Decision, resource: Resource, revocation: Revocation, source: str = "") -> None:
+    decision.put(revocation)
+    limit_grace(decision, revocation)
+    decision.cause(Happened("revoked", resource, revocation.why))
+    source = source or decision.catalog.origin_of(resource)
+    place = (revocation.event, "", "", resource.id, revocation.event, State.FATAL, revocation.why, source)
+    said = Notice(*place, reason=REVOKED, grace_ms=revocation.grace_ms)
+    resource = _note(decision, resource, said)
+    _tell_holders(decision, resource, said)
+    if resource.phase is Phase.UNLOAD_FAILED and resource.id not in decision.catalog.holders:
+        begin_unload(decision, resource)
+
+
+def limit_grace(decision: Decision, revocation: Revocation) -> None:
+    """Set the timer for the forced unload of a revoked resource."""
+    over = GraceOver(revocation.id, revocation.event)
+    decision.cause(SetTimer("revoke:" + revocation.id, revocation.grace_ms / 1000, over))
+
+
+def pass_revocation_on(decision: Decision, resource: Resource, notice: Notice, *, handled: bool) -> None:
+    """Have a resource give up a revoked part: only the part, if that is `handled`; else the resource is revoked, too.
+
+    If it does not hold the part any more, there is nothing to do: it has put another in its place.
+    """
+    catalog = decision.catalog
+    parts = [catalog.held[id] for id in catalog.parts_of(resource.id)]
+    revoked = [held for held in parts if held.resource_id == notice.resource_id and held.hold is not Hold.OWED]
+    if not revoked or resource.id in catalog.revocations:
+        return
+    if handled:
+        for held in revoked:
+            let_go(decision, held)
+    elif _is_revocable(catalog, resource):
+        event = f"{notice.event.partition(':')[0]}:{resource.id}"
+        _revoke(decision, resource, Revocation(resource.id, event, notice.message, notice.grace_ms), notice.source)
+
+
+def let_go(decision: Decision, held: Held) -> None:
+    """Release a query whose holder has heard that the resource is revoked. It is not held again."""
+    owe(decision, held, "its resource is revoked")
+    decision.put(replace(held, hold=Hold.OWED, resource_id=""))
+    request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
 # -- to the server of the resource ---------------------------------------------------------------------------------
 
 
 def start_status(decision: Decision, start: StartStatus) -> None:
-    """Run the status callback of the resource; defer it while the load or recover callback runs."""
-    resource = decision.catalog.resources[start.resource.id]
-    if is_busy(decision.catalog, resource):
-        deferred = decision.catalog.deferred
+    """Run the status callback of the resource; defer it while the load or recover callback runs, or until its turn."""
+    catalog = decision.catalog
+    resource = catalog.resources[start.resource.id]
+    if is_busy(catalog, resource) or awaits_trial(decision, "status", resource.id):
+        deferred = catalog.deferred
         decision.note(deferred, resource.id, (*deferred.get(resource.id, ()), start))
-    else:
-        decision.cause(replace(start, resource=resource))
+        return
+    if is_heard_by(catalog, resource):
+        if resource.id not in catalog.statuses:
+            note_begun(decision, "status", resource.id)
+        decision.note(catalog.statuses, resource.id, catalog.statuses.get(resource.id, 0) + 1)
+    decision.cause(replace(start, resource=resource))
+
+
+def start_in_turn(decision: Decision, start: StartStatus) -> None:
+    """Run the status callback for a status of its own resource; if a window of runs has been caused, when these end."""
+    catalog, id = decision.catalog, start.resource.id
+    late = catalog.late.get(id)
+    if late is None and catalog.statuses.get(id, 0) + len(catalog.deferred.get(id, ())) < catalog.window:
+        start_status(decision, start)
+        return
+    if late is None:
+        late = {}
+        decision.note(catalog.late, id, late)
+    decision.note(late, start.notice.id, start)
+    if len(late) > catalog.backlog:
+        oldest = list(islice(late, catalog.window))
+        drop_superseded(decision, [catalog.notices[old] for old in oldest])
+        for old in oldest:
+            if old not in catalog.notices:
+                decision.forget(late, old)
+
+
+def is_heard_by(catalog: Catalog, resource: Resource) -> bool:
+    """Return whether a status callback runs for statuses of the resource and of its parts."""
+    server = catalog.servers.get(resource.server)
+    return server is not None and server.has_status and not is_given_up(catalog, "status", resource.id)
 
 
 def is_busy(catalog: Catalog, resource: Resource) -> bool:
@@ -94,8 +212,12 @@ def start_own(decision: Decision, server: str) -> None:
         resource = catalog.resources[resource_id]
         if resource.server == server:
             for notice in own_notices(decision, resource_id):
-                if decision.forget(catalog.told, notice.id):
-                    start_status(decision, StartStatus(resource, notice, repeated=True))
+                if decision.forget(catalog.told, notice.id) is None:
+                    continue
+                if is_given_up(catalog, "status", resource_id):
+                    own_done(decision, notice, handled=False)
+                else:
+                    start_in_turn(decision, StartStatus(resource, notice, repeated=True))
 
 
 def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
@@ -144,7 +266,7 @@ def swap(decision: Decision, command: Swap) -> None:
     catalog = decision.catalog
     resource = catalog.resources.get(command.resource_id)
     part, spare = (_part(catalog, command.resource_id, id) for id in (command.part, command.spare))
-    if resource is None or resource.phase is not Phase.LOADED or part is None or spare is None:
+    if resource is None or resource.phase not in (LOADED, *RESTING) or part is None or spare is None:
         _release(decision, command.resource_id, (command.spare,))
         failure = failures.not_swapped(catalog, command.resource_id, command.part)
         decision.cause(Answer(command.ticket, failure))
@@ -177,9 +299,8 @@ def _say(
     event, message = command.event, command.message
     said = Notice(f"{event}:", "", "", resource.id, event, state, message, source, False, response)
     resource = _note(decision, resource, said)
-    server = decision.catalog.servers.get(resource.server)
-    if server is None or not server.has_status or command.callback_of == resource.id:
+    if command.callback_of == resource.id or not is_heard_by(decision.catalog, resource):
         _tell_holders(decision, resource, said)
     else:
         decision.put(said)
-        start_status(decision, StartStatus(resource, said, repeated=False))
+        start_in_turn(decision, StartStatus(resource, said, repeated=False))

@@ -8,22 +8,28 @@ a crash comes before that, the provider sends it again, marked as repeated.
 
 from __future__ import annotations
 
+from itertools import islice
+
 from msgspec.structs import replace
 
-from rr_actors.registrar.core.holding import end_direct, end_release
+from rr_actors.registrar.core.callback_runs import is_given_up, note_ended
+from rr_actors.registrar.core.holding import asked_anew, end_release, may_be_held_again
+from rr_actors.registrar.core.notices import acknowledge, dealt_with, end_query, remember_heard
 from rr_actors.registrar.core.releasing import add_in_flight, request
-from rr_actors.registrar.core.status_changes import is_busy, own_done, spread, start_status
-from rr_actors.registrar.model import failures
+from rr_actors.registrar.core.status_changes import (
+    is_busy,
+    is_heard_by,
+    let_go,
+    own_done,
+    pass_revocation_on,
+    spread,
+    start_status,
+)
 from rr_actors.registrar.model.catalog import Catalog, Decision, Hearing
 from rr_actors.registrar.model.commands import Heard, StatusDone
-from rr_actors.registrar.model.effects import Hear, LoadResolved, StartStatus
-from rr_actors.registrar.model.messages import Noticed, NoticesHandled, Unload
-from rr_actors.registrar.model.rows import Held, Hold, Notice, State, is_own
-
-_REMEMBERED = 20_000
-_SWEPT_EVERY = 1024
-
-Place = tuple[str, str, str]  # "query" or "resource", its id, the event
+from rr_actors.registrar.model.effects import Hear, StartStatus
+from rr_actors.registrar.model.messages import Noticed, Unload
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Resource, State, is_own, is_revocation
 
 
 def noticed(decision: Decision, provider: str, message: Noticed) -> None:
@@ -31,37 +37,42 @@ def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     catalog, notice = decision.catalog, message.notice
     add_in_flight(decision, notice.query_id)
     held = catalog.held.get(notice.query_id)
+    doubted = not provider and decision.forget(catalog.doubted, notice.query_id) is not None
     if held is None:
-        _acknowledge(decision, provider, notice.id)
-    elif held.resource_id and held.resource_id != notice.resource_id:
+        acknowledge(decision, provider, notice.id)
+    elif held.hold is not Hold.PENDING and held.resource_id not in ("", notice.resource_id):
         # It is about an earlier resource of the query, and was held back until on_start returned.
-        _acknowledge(decision, provider, notice.id)
+        acknowledge(decision, provider, notice.id)
     elif held.hold is Hold.OWED:
-        if notice.released:
+        if notice.released and not doubted:
             if held.resource_id:
                 end_release(decision, held)
             else:  # withdrawn: its Load may have been sent again since, so only the provider's answer can end it
                 request(decision, held.registrar, Unload(held.id, catalog.name))
-            _acknowledge(decision, provider, notice.id)
+            acknowledge(decision, provider, notice.id)
+        elif not may_be_held_again(catalog, held):
+            if is_revocation(notice):  # its unload has failed, and is to be tried again
+                request(decision, held.registrar, Unload(held.id, catalog.name))
+            acknowledge(decision, provider, notice.id)
         # else the provider drops the notice with the query, or sends it again if the unload fails
     elif held.hold is Hold.PENDING and notice.released and held.id not in catalog.direct:
         # its Load was sent again since, and gets an answer of its own; this notice is about the time before
-        decision.put_here(replace(held, state=State.OK, response=None))
-        _acknowledge(decision, provider, notice.id)
+        decision.put_here(asked_anew(held))
+        acknowledge(decision, provider, notice.id)
     elif notice.id in catalog.hearing:
         pass  # a second sending; the notice is acknowledged when its receivers have dealt with it
     elif held.id in catalog.ending:
-        _acknowledge(decision, provider, notice.id)  # its holders know that they have lost it
+        if not notice.released:  # else the provider drops it when the row is gone from the disk: see end_query()
+            acknowledge(decision, provider, notice.id)
     else:
-        _hear(decision, held, notice, provider, message.repeated)
+        _hear(decision, held, notice, provider, message.repeated, doubted=doubted)
 
 
-def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
+def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeated: bool, *, doubted: bool) -> None:
     catalog = decision.catalog
+    if held.hold is Hold.PENDING and held.resource_id not in ("", notice.resource_id):
+        held = asked_anew(held)
     receivers = 0
-    heard_all = held.hold is Hold.HELD and held.id not in catalog.kept
-    if repeated and notice.response is not None and heard_all:
-        notice = replace(notice, response=held.response)  # reconciling has brought the newest
     place = ("query", held.id, notice.event)
     listened = False
     if place not in catalog.heard:
@@ -69,9 +80,10 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
         listened = is_listened(catalog, held)
         response = held.response if notice.response is None else notice.response
         put = decision.put_here if held.hold is Hold.PENDING else decision.put_later
-        put(replace(held, state=notice.state, response=response))
+        lasting = State.FATAL if held.state is State.FATAL else notice.state
+        put(replace(held, state=lasting, response=response, resource_id=notice.resource_id))
         if notice.released:
-            decision.note(catalog.ending, held.id, True)
+            decision.note(catalog.ending, held.id, doubted)
         decision.note(catalog.heard, place, (notice.id,))
         decision.cause(Hear(held, notice, repeated))
     resource = catalog.resources.get(held.parent)
@@ -81,8 +93,8 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
     if receivers:
         decision.note(catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
     else:
-        _end(decision, ends)
-        _acknowledge(decision, provider, notice.id)
+        end_query(decision, ends, provider)
+        acknowledge(decision, provider, notice.id)
 
 
 def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool:
@@ -94,17 +106,25 @@ def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool
         if waiting and notice.id not in waiting:
             decision.note(catalog.heard, place, (*waiting, notice.id))
         return bool(waiting)
-    server = catalog.servers.get(resource.server)
-    if server is None or not (server.has_status or listened or is_busy(catalog, resource)):
-        _remember(decision, place)
-        spread(decision, resource, notice.event, notice.state, notice.message, notice.source, repeated=start.repeated)
+    known = resource.server in catalog.servers
+    if not known or not (is_heard_by(catalog, resource) or listened or is_busy(catalog, resource)):
+        remember_heard(decision, place)
+        _pass_on(decision, resource, notice, handled=False, repeated=start.repeated)
         return False
     decision.note(catalog.heard, place, (notice.id,))
     if listened:
         decision.note(catalog.next_to_hear, notice.id, start)
     else:
-        start_status(decision, start)
+        _start(decision, start)
     return True
+
+
+def _start(decision: Decision, start: StartStatus) -> None:
+    """Have the resource hear a status now; without its callback, if that has ended the process too often."""
+    if is_given_up(decision.catalog, "status", start.resource.id):
+        _heard_it(decision, start.resource.id, start.notice, handled=False)
+    else:
+        start_status(decision, start)
 
 
 def is_listened(catalog: Catalog, held: Held) -> bool:
@@ -119,10 +139,15 @@ def heard(decision: Decision, command: Heard) -> None:
     for notice_id in catalog.heard.get(place, ()):
         start = decision.forget(catalog.next_to_hear, notice_id)
         if start is not None and not command.handled and start.resource.id in catalog.resources:
-            start_status(decision, start)
+            _start(decision, start)
         elif start is not None:
-            _dealt_with(decision, ("resource", start.resource.id, command.event))
-    _dealt_with(decision, place)
+            if command.handled and (resource := catalog.resources.get(start.resource.id)) is not None:
+                _pass_on(decision, resource, start.notice, handled=True, repeated=False)
+            dealt_with(decision, ("resource", start.resource.id, command.event))
+    held = catalog.held.get(command.query_id)
+    if command.revoked and held is not None and held.hold is not Hold.OWED and not held.parent:
+        let_go(decision, held)
+    dealt_with(decision, place)
 
 
 def start_deferred(decision: Decision, resource_id: str) -> None:
@@ -130,74 +155,59 @@ def start_deferred(decision: Decision, resource_id: str) -> None:
     catalog = decision.catalog
     for start in decision.forget(catalog.deferred, resource_id) or ():
         resource = catalog.resources.get(resource_id)
-        server = None if resource is None else catalog.servers.get(resource.server)
-        if resource is None or server is None:
-            status_done(decision, StatusDone(resource_id, start.notice, handled=False))
+        if resource is None or resource.server not in catalog.servers:
+            _heard_it(decision, resource_id, start.notice, handled=False)
         else:
-            start_status(decision, start)
+            _start(decision, start)
+    _start_late(decision, resource_id)
 
 
 def status_done(decision: Decision, done: StatusDone) -> None:
+    """Note that the status callback has run for a status, or that the server has none."""
+    statuses, id = decision.catalog.statuses, done.resource_id
+    if (left := statuses.get(id, 0)) > 1:
+        decision.note(statuses, id, left - 1)
+    elif decision.forget(statuses, id):
+        note_ended(decision, "status", id)
+        resource = decision.catalog.resources.get(id)
+        if decision.catalog.deferred and resource is not None and not is_busy(decision.catalog, resource):
+            start_deferred(decision, id)  # it awaited its trial, and has not died this time
+    _heard_it(decision, id, done.notice, handled=done.handled)
+    if decision.catalog.late:
+        _start_late(decision, id)
+
+
+def _start_late(decision: Decision, resource_id: str) -> None:
+    """Run the status callback for the resource's own statuses that wait for runs to end, if half a window has ended."""
+    catalog = decision.catalog
+    late, resource = catalog.late.get(resource_id), catalog.resources.get(resource_id)
+    free = catalog.window - catalog.statuses.get(resource_id, 0) - len(catalog.deferred.get(resource_id, ()))
+    if late is None or resource is None or free * 2 < catalog.window:
+        return
+    for notice_id in list(islice(late, free)):
+        start = decision.forget(late, notice_id)
+        _start(decision, replace(start, resource=resource))
+    if not late:
+        decision.forget(catalog.late, resource_id)
+
+
+def _heard_it(decision: Decision, resource_id: str, notice: Notice, *, handled: bool) -> None:
     """Note that the resource has heard a status; send it to the holders, unless it was handled."""
     catalog = decision.catalog
-    notice = done.notice
     if is_own(notice):
-        own_done(decision, notice, handled=done.handled)
+        own_done(decision, notice, handled=handled)
         return
-    resource = catalog.resources.get(done.resource_id)
-    if resource is not None and not done.handled:
+    resource = catalog.resources.get(resource_id)
+    if resource is not None:
         hearing = catalog.hearing.get(notice.id)
         repeated = hearing is not None and hearing.repeated
+        _pass_on(decision, resource, notice, handled=handled, repeated=repeated)
+    dealt_with(decision, ("resource", resource_id, notice.event))
+
+
+def _pass_on(decision: Decision, resource: Resource, notice: Notice, *, handled: bool, repeated: bool) -> None:
+    """Send a part's status to the holders of the resource, unless it was handled. A revocation has its own way."""
+    if is_revocation(notice):
+        pass_revocation_on(decision, resource, notice, handled=handled)
+    elif not handled:
         spread(decision, resource, notice.event, notice.state, notice.message, notice.source, repeated=repeated)
-    _dealt_with(decision, ("resource", done.resource_id, notice.event))
-
-
-def _dealt_with(decision: Decision, place: Place) -> None:
-    catalog = decision.catalog
-    waiting = catalog.heard.get(place, ())
-    _remember(decision, place)
-    for notice_id in waiting:
-        hearing = catalog.hearing.get(notice_id)
-        if hearing is None:
-            continue
-        if hearing.receivers > 1:
-            decision.note(catalog.hearing, notice_id, replace(hearing, receivers=hearing.receivers - 1))
-        else:
-            decision.forget(catalog.hearing, notice_id)
-            _end(decision, hearing.ends)
-            _acknowledge(decision, hearing.provider, notice_id)
-
-
-def _end(decision: Decision, held_id: str) -> None:
-    """Remove a query that was taken away, when its holders know; on disk before the notice is acknowledged."""
-    catalog = decision.catalog
-    decision.forget(catalog.ending, held_id)
-    held = catalog.held.get(held_id)
-    if held is not None and held.hold is not Hold.OWED:
-        if held.hold is Hold.PENDING and held_id not in catalog.direct:
-            # Its thread's line broke, and the load waits for the link.
-            failure = failures.withdrawn(held, "taken away before the answer to its load came")
-            decision.cause(LoadResolved(held, failure))
-        end_direct(decision, held_id)
-        decision.forget(catalog.kept, held_id)
-        decision.drop(held)
-
-
-def _remember(decision: Decision, place: Place) -> None:
-    catalog, heard = decision.catalog, decision.catalog.heard
-    decision.note(heard, place, ())
-    if len(heard) % _SWEPT_EVERY == 0:
-        for old, pending in list(heard.items()):
-            kind, id, _ = old
-            if not pending and id not in (catalog.held if kind == "query" else catalog.resources):
-                decision.forget(heard, old)
-    if len(heard) > _REMEMBERED:
-        for old in list(heard)[: _REMEMBERED // 2]:
-            if not heard[old]:
-                decision.forget(heard, old)  # so old that its notice was acknowledged long ago
-
-
-def _acknowledge(decision: Decision, provider: str, notice_id: str) -> None:
-    if provider:
-        decision.note(decision.catalog.acked, provider, True)
-        request(decision, provider, NoticesHandled([notice_id]))

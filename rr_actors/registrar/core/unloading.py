@@ -4,29 +4,47 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from rr_actors.registrar.core.callback_runs import running, start_queued, start_unload
+from rr_actors.base.values.failure import Failure
+from rr_actors.registrar.core.callback_runs import (
+    awaits_trial,
+    deaths_of,
+    is_given_up,
+    note_begun,
+    note_ended,
+    running,
+    start_queued,
+    start_unload,
+)
 from rr_actors.registrar.core.notices import (
     drop_notice,
     drop_notices,
     drop_parked,
     drop_query,
     drop_resource,
+    end_revocation,
     notify,
     park,
+    refuse,
     refuse_all,
     remember,
     send_notices,
 )
+from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Decision
-from rr_actors.registrar.model.commands import ForceUnload, LingerOver, UnloadDone, UnloadErred, Unregister
-from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer
-from rr_actors.registrar.model.messages import Failure, Gone, Unload, Unloaded, UnloadRefused
+from rr_actors.registrar.model.commands import ForceUnload, GraceOver, LingerOver, UnloadDone, UnloadErred, Unregister
+from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer, StartPause
+from rr_actors.registrar.model.messages import Gone, Reprioritised, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import (
     LOADED,
     NOT_BEGUN,
+    PAUSED,
+    PAUSING,
     QUEUED,
+    RESUMING,
+    REVOKED,
+    STANDBY,
     UNLOAD_FAILED,
     UNLOADING,
     Notice,
@@ -61,10 +79,13 @@ def _release(decision: Decision, query: Query) -> None:
     last = len(catalog.holders[resource.id]) == 1
     remember(decision, query.id, failures.LET_GO)
     again = last and resource.phase is UNLOADING
-    if again or (last and resource.phase in (LOADED, UNLOAD_FAILED) and not _lingers(decision, resource)):
+    if again or (last and resource.phase in (LOADED, UNLOAD_FAILED, PAUSED) and not _lingers(decision, resource)):
         decision.note(catalog.unanswered, query.id, True)  # answered when the resource is gone, and the query with it
         if not again:
-            start_unload(decision, resource)
+            run_unload(decision, resource)
+        if resource.server not in catalog.servers:  # the release stays owed
+            decision.forget(catalog.unanswered, query.id)
+            decision.cause(Reply(query.origin, UnloadRefused(query.id, failures.serverless(catalog, resource))))
         return
     drop_query(decision, query)
     decision.cause(Reply(query.origin, Unloaded(query.id)))
@@ -74,11 +95,12 @@ def _release(decision: Decision, query: Query) -> None:
 
 def unheld(decision: Decision, resource: Resource) -> None:
     """Decide about a resource that nobody holds any more: drop, keep warm or unload it, by its phase."""
+    resource = stay_paused(decision, resource)
     if resource.phase is QUEUED:
         decision.effects += answers_to_owners(decision, resource, None)
         drop_resource(decision, resource)
         settle(decision, resource.server)
-    elif resource.phase in (LOADED, UNLOAD_FAILED):
+    elif resource.phase in (LOADED, UNLOAD_FAILED, PAUSED):
         retire(decision, resource)
     elif resource.tries == NOT_BEGUN and resource.server in decision.catalog.servers:
         # The load does not run again; the unload callback cleans up after the interrupted run.
@@ -87,8 +109,11 @@ def unheld(decision: Decision, resource: Resource) -> None:
 
 def _lingers(decision: Decision, resource: Resource) -> bool:
     server = decision.catalog.servers.get(resource.server)
-    warm = resource.phase is LOADED and resource.state is not State.FATAL
-    return server is not None and server.linger_s > 0 and warm and not condemned(decision, resource)
+    if server is None or resource.state is State.FATAL or condemned(decision, resource):
+        return False
+    if resource.phase is LOADED:
+        return server.linger_s > 0 or (server.pauses and not is_given_up(decision.catalog, "pause", resource.id))
+    return resource.phase is PAUSED
 
 
 def condemned(decision: Decision, resource: Resource) -> bool:
@@ -99,37 +124,161 @@ def condemned(decision: Decision, resource: Resource) -> bool:
 def retire(decision: Decision, resource: Resource) -> None:
     """Keep an unheld resource warm if its server says so; otherwise unload it."""
     if _lingers(decision, resource):
-        linger_s = decision.catalog.servers[resource.server].linger_s
-        decision.cause(SetTimer("linger:" + resource.id, linger_s, LingerOver(resource.id)))
+        touch(decision, resource.id)
+        decision.forget(decision.catalog.idle, resource.id)
+        _wait(decision, resource)
     else:
         begin_unload(decision, resource)
 
 
 def linger_over(decision: Decision, over: LingerOver) -> None:
-    """Unload a resource that nobody has loaded again while it was kept warm."""
-    resource = decision.catalog.resources.get(over.resource_id)
-    if resource is not None and resource.phase is LOADED and resource.id not in decision.catalog.holders:
+    """Pause or unload a resource that has idled for long enough."""
+    catalog = decision.catalog
+    resource = catalog.resources.get(over.resource_id)
+    if resource is None or resource.phase not in (LOADED, PAUSED) or catalog.priority_of(resource.id) > STANDBY:
+        return
+    server = catalog.servers.get(resource.server)
+    if resource.phase is LOADED and server is not None and server.pauses and _may_pause(decision, resource):
+        decision.put(replace(resource, phase=PAUSING))
+        go_on(decision, catalog.resources[resource.id])
+    elif resource.id not in catalog.holders:
         begin_unload(decision, resource)
+
+
+# Pausing. A resource idles if all who hold it have it on standby, or nobody does.
+
+
+def _may_pause(decision: Decision, resource: Resource) -> bool:
+    return resource.state is not State.FATAL and not is_given_up(decision.catalog, "pause", resource.id)
+
+
+def _wait(decision: Decision, resource: Resource) -> None:
+    """Set the timer that pauses or unloads an idle resource, unless it runs."""
+    catalog = decision.catalog
+    server = catalog.servers[resource.server]
+    wait_s = server.paused_s if resource.phase is PAUSED else server.linger_s
+    if resource.id not in catalog.idle and wait_s is not None:
+        decision.note(catalog.idle, resource.id, True)
+        decision.cause(SetTimer("linger:" + resource.id, wait_s, LingerOver(resource.id)))
+
+
+def balance(decision: Decision, resource_id: str) -> None:
+    """Have an idle resource of a server that pauses wait for its pause, and resume a paused one that is needed."""
+    catalog = decision.catalog
+    resource = catalog.resources.get(resource_id)
+    server = None if resource is None else catalog.servers.get(resource.server)
+    if (
+        resource is None
+        or server is None
+        or resource.phase not in (LOADED, PAUSED)
+        or resource.id in catalog.recovering
+    ):
+        return
+    paused = resource.phase is PAUSED
+    if server.pauses and catalog.priority_of(resource.id) <= STANDBY:
+        if _may_pause(decision, resource) and not (paused and resource.id in catalog.holders):
+            _wait(decision, resource)
+        elif paused:
+            _stop_waiting(decision, resource)
+    elif paused:
+        _stop_waiting(decision, resource)
+        if resource.state is State.FATAL:  # nobody is given it any more, so it does not run again
+            return
+        decision.put(replace(resource, phase=RESUMING))
+        go_on(decision, catalog.resources[resource.id])
+    elif server.pauses:
+        _stop_waiting(decision, resource)
+
+
+def _stop_waiting(decision: Decision, resource: Resource) -> None:
+    if decision.forget(decision.catalog.idle, resource.id):
+        decision.cause(SetTimer("linger:" + resource.id, None, None))
+
+
+def stay_paused(decision: Decision, resource: Resource) -> Resource:
+    """End a resumption that waits for the resource's parts, as its callback has not begun; return the resource."""
+    catalog = decision.catalog
+    if resource.id not in catalog.rising:
+        return resource
+    decision.forget(catalog.rising, resource.id)
+    note_ended(decision, "resume", resource.id)
+    touch(decision, resource.id)
+    resource = replace(resource, phase=PAUSED)
+    decision.put(resource)
+    return resource
+
+
+def stay_lost(decision: Decision, resource: Resource, why: str) -> Resource:
+    """Let nothing wait for the resumption of a FATAL resource, as it is not resumed; return the resource."""
+    refuse_waiting(decision, resource, failures.load_failed(decision.catalog, resource, why))
+    answer_wholes(decision, resource)
+    return stay_paused(decision, resource)
+
+
+def answer_wholes(decision: Decision, resource: Resource) -> None:
+    """Say to each whole that may wait for this part that it runs, or that it will not."""
+    for query in decision.catalog.queries_of(resource.id):
+        if query.parent:
+            decision.cause(Reply(query.origin, Reprioritised(query.id, query.priority)))
+
+
+def refuse_waiting(decision: Decision, resource: Resource, failure: Failure) -> None:
+    """Refuse the loads that wait for a resource that is being paused or resumed; its other queries stay."""
+    for query in decision.catalog.queries_of(resource.id):
+        if query.id in decision.catalog.waiting:
+            decision.cause(refuse(decision, query.origin, query.id, failure))
+            drop_query(decision, query)
+
+
+def go_on(decision: Decision, resource: Resource) -> None:
+    """Run the pause callback; or the resume callback, when all parts have been resumed."""
+    catalog = decision.catalog
+    decision.forget(catalog.idle, resource.id)
+    touch(decision, resource.id)
+    role = "pause" if resource.phase is PAUSING else "resume"
+    if awaits_trial(decision, role, resource.id):
+        return
+    note_begun(decision, role, resource.id)
+    if resource.phase is PAUSING:
+        decision.cause(StartPause(resource))
+    else:
+        decision.note(catalog.rising, resource.id, None)
 
 
 def begin_unload(decision: Decision, resource: Resource) -> None:
     """Cancel the linger timer, and run the unload callback."""
     decision.cause(SetTimer("linger:" + resource.id, None, None))
-    start_unload(decision, resource)
+    run_unload(decision, resource)
+
+
+def run_unload(decision: Decision, resource: Resource) -> None:
+    """Run the unload callback, unless it has ended the process too often, or is not to run before its turn."""
+    if resource.id in decision.catalog.unread:  # the callback cannot run without its request and response
+        _remove(decision, resource)
+    elif is_given_up(decision.catalog, "unload", resource.id):
+        deaths = deaths_of(decision.catalog, "unload", resource.id)
+        _keep(decision, resource, failures.unload_given_up(decision.catalog, resource, deaths))
+    elif awaits_trial(decision, "unload", resource.id):
+        decision.put(replace(resource, phase=UNLOADING))
+    else:
+        start_unload(decision, resource)
 
 
 def unload_done(decision: Decision, done: UnloadDone) -> None:
     """Remove the resource, release its parts, answer all that wait, and start a queued load of the same request."""
     resource = running(decision.catalog, done.resource_id, UNLOADING, done.tries)
-    if resource is None:
-        return
+    if resource is not None:
+        _remove(decision, resource)
+
+
+def _remove(decision: Decision, resource: Resource) -> None:
     after: list[Effect] = []
     for query in decision.catalog.queries_of(resource.id):
         drop_query(decision, query)
         after.append(Reply(query.origin, Unloaded(query.id)))
     after += answers_to_owners(decision, resource, None)
     drop_resource(decision, resource)
-    decision.cause(Happened("unloaded", resource.id, resource.server, ""))
+    decision.cause(Happened("unloaded", resource, ""))
     release_parts(decision, resource.id, after)
     _next_in_queue(decision, resource)
     settle(decision, resource.server)
@@ -138,17 +287,24 @@ def unload_done(decision: Decision, done: UnloadDone) -> None:
 def unload_erred(decision: Decision, erred: UnloadErred) -> None:
     """Keep the resource as unload_failed, as it may still be running, and refuse the Unloads that wait."""
     resource = running(decision.catalog, erred.resource_id, UNLOADING, erred.tries)
-    if resource is None:
-        return
-    decision.put(replace(resource, phase=UNLOAD_FAILED, message=erred.failure.message))
-    decision.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
+    if resource is not None:
+        note_ended(decision, "unload", resource.id)
+        _keep(decision, resource, erred.failure)
+
+
+def _keep(decision: Decision, resource: Resource, failure: Failure) -> None:
+    touch(decision, resource.id)  # it may have lost its holders, or its parts their priority
+    end_revocation(decision, resource.id)
+    decision.put(replace(resource, phase=UNLOAD_FAILED, message=failure.message))
+    decision.cause(Happened("unload_failed", resource, failure.message))
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try
-            decision.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
+            remember(decision, query.id, failure)  # its holder does not let it go any more
+            decision.cause(Reply(query.origin, UnloadRefused(query.id, failure)))
         send_notices(decision, query)  # the holder passed them over while it was releasing the query
-    decision.effects += answers_to_owners(decision, resource, erred.failure)
+    decision.effects += answers_to_owners(decision, resource, failure)
     _next_in_queue(decision, resource)
-    settle(decision, resource.server, erred.failure)
+    settle(decision, resource.server, failure)
 
 
 def _next_in_queue(decision: Decision, gone: Resource) -> None:
@@ -190,12 +346,19 @@ def force_unload(decision: Decision, command: ForceUnload) -> None:
         return
     waiting = decision.catalog.owners.get(resource.id, ())
     decision.note(decision.catalog.owners, resource.id, (*waiting, command.ticket))
-    _evict(decision, resource, command.event, command.why)
+    if command.clears and is_given_up(decision.catalog, "unload", resource.id):
+        _take_away(decision, resource, command.event, command.why)
+        _remove(decision, resource)
+    else:
+        _evict(decision, resource, command.event, command.why)
 
 
 def unregister(decision: Decision, command: Unregister) -> None:
     """Take no more loads for a server, and release all its queries; answer the owner when its resources are gone."""
     catalog = decision.catalog
+    if command.name not in catalog.servers and command.name in catalog.by_server:
+        _clear(decision, command)
+        return
     if command.name not in catalog.servers or command.name in catalog.leaving:
         decision.cause(Answer(command.ticket, failures.unknown_server(catalog, command.name)))
         return
@@ -205,25 +368,57 @@ def unregister(decision: Decision, command: Unregister) -> None:
     settle(decision, command.name)
 
 
-def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None:
+def _clear(decision: Decision, command: Unregister) -> None:
+    """Remove all resources of a server that is not registered, without its callbacks."""
+    why = f"server {command.name!r} is not registered any more"
+    for resource_id in list(decision.catalog.by_server[command.name]):
+        resource = decision.catalog.resources[resource_id]
+        if resource.phase in (QUEUED, Phase.LOADING):
+            decision.effects += refuse_all(decision, resource, failures.load_failed(decision.catalog, resource, why))
+        else:
+            _take_away(decision, resource, command.event, why)
+        _remove(decision, resource)
+    decision.cause(Answer(command.ticket, None))
+
+
+def grace_over(decision: Decision, command: GraceOver) -> None:
+    """Take a revoked resource from those that still hold it, and unload it."""
+    catalog = decision.catalog
+    resource, revocation = catalog.resources.get(command.resource_id), catalog.revocations.get(command.resource_id)
+    if resource is None or revocation is None or revocation.event != command.event:
+        return
+    if resource.phase is not UNLOADING:
+        decision.note(catalog.owners, resource.id, catalog.owners.get(resource.id, ()))  # condemned
+        _evict(decision, resource, command.event + ":over", revocation.why, REVOKED)
+
+
+def _evict(decision: Decision, resource: Resource, event: str, why: str, reason: str = "") -> None:
     match resource.phase:
         case Phase.QUEUED | Phase.LOADING:
             decision.effects += refuse_all(decision, resource, failures.load_failed(decision.catalog, resource, why))
             unheld(decision, resource)  # a running load goes on; the resource is unloaded when it returns
-        case Phase.LOADED | Phase.UNLOAD_FAILED:
-            source = decision.catalog.origin_of(resource)
-            said = Notice(event, "", "", resource.id, event, State.FATAL, why, source, released=True)
-            failure = failures.load_failed(decision.catalog, resource, why)
-            for query in decision.catalog.queries_of(resource.id):
-                decision.drop(query)
-                remember(decision, query.id, failure)
-                notify(decision, query, said)
-            if resource.id not in decision.catalog.recovering:  # else the end of its recovery unloads it
-                begin_unload(decision, resource)
         case Phase.UNLOADING:
             for query in decision.catalog.queries_of(resource.id):
                 drop_query(decision, query)
                 decision.cause(Reply(query.origin, Unloaded(query.id)))
+        case _:
+            refuse_waiting(decision, resource, failures.load_failed(decision.catalog, resource, why))
+            _take_away(decision, resource, event, why, reason)
+            resource = stay_paused(decision, resource)
+            if resource.phase not in (PAUSING, RESUMING) and resource.id not in decision.catalog.recovering:
+                begin_unload(decision, resource)  # else the end of the callback that runs unloads it
+
+
+def _take_away(decision: Decision, resource: Resource, event: str, why: str, reason: str = "") -> None:
+    source = decision.catalog.origin_of(resource)
+    said = Notice(event, "", "", resource.id, event, State.FATAL, why, source, released=True, reason=reason)
+    failure = failures.load_failed(decision.catalog, resource, why)
+    for query in decision.catalog.queries_of(resource.id):
+        if decision.catalog.refused.get(query.id) is failures.LET_GO:  # its holder passes over what was said before
+            drop_notices(decision, query.origin, query.id)
+        decision.drop(query)
+        remember(decision, query.id, failure)
+        notify(decision, query, said)
 
 
 def gone(decision: Decision, message: Gone) -> None:

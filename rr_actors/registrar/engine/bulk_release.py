@@ -5,10 +5,11 @@ from __future__ import annotations
 import functools
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Any
 
 from rr_actors.base.errors import RrError
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.rows import Hold
+from rr_actors.runtime.thread_rules import on_loop
 
 AT_A_TIME = 4096
 """Releases in progress at each provider: as many as callbacks may wait for its workers. More would wait there, half
@@ -16,8 +17,9 @@ done on both sides. Rows that exist for a moment only would be written, and all 
 """
 
 
+@on_loop
 class Releases:
-    """Releases queries in their order at each provider; one that is down or slow delays no other. On the loop.
+    """Releases queries in their order at each provider; one that is down or slow delays no other.
 
     Args:
         registrar: the actor that holds them.
@@ -27,7 +29,7 @@ class Releases:
     """
 
     def __init__(
-        self, registrar: Any, query_ids: Iterable[str], ended: Callable[[str, RrError | None], object]
+        self, registrar: RegistrarActor, query_ids: Iterable[str], ended: Callable[[str, RrError | None], object]
     ) -> None:
         self._registrar = registrar
         self._ended = ended

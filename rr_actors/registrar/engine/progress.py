@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import contextlib
 import math
+import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Protocol, cast
 
 import msgspec
 
-from rr_actors.base.errors import Unavailable, UsageError, exact_number, exact_text, is_a, shown
+from rr_actors.base.errors import Unavailable, UsageError, exact_number, exact_text, is_a, readable, shown
+from rr_actors.base.values.canonical import text_of_value
+from rr_actors.hosting.process_node import ProcessNode
 from rr_actors.registrar.core.notices import parked_on
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.messages import Load, Progressed, readable
+from rr_actors.registrar.model.messages import Load, Message, Progressed
 from rr_actors.registrar.model.rows import Phase
+from rr_actors.runtime.thread_rules import any_thread, on_loop
 
 INTERVAL_S = 0.1
 """The time between two reports of one load, at least."""
@@ -84,22 +88,51 @@ class _Reports:
         self.turn: deque[None] = deque((None,))
 
 
-class ProgressReports:
-    """The reports of all loads of one registrar. On the loop, except report(), newest(), has_unsent() and forget()."""
+class Hints(Protocol):
+    """The links of a registrar's consumers, as they are used for messages that may be lost."""
 
-    def __init__(self, registrar: Any) -> None:
+    def hint(self, origin: str, message: Message) -> None:
+        """Send a message when flushed; drop it if the consumer is behind with its reading."""
+        ...
+
+    def flush(self) -> None:
+        """Flush every link that has unsent messages."""
+        ...
+
+
+class Reporting(Protocol):
+    """A registrar, as its reports see it."""
+
+    name: str
+    closed: bool
+    node: ProcessNode
+    lock: threading.RLock
+
+    @property
+    def consumers(self) -> Hints: ...
+
+    def whole(self) -> Catalog: ...
+
+
+@on_loop
+class ProgressReports:
+    """The reports of all loads of one registrar."""
+
+    def __init__(self, registrar: Reporting) -> None:
         self._registrar = registrar
         self._loads: dict[str, _Reports] = {}
 
+    @any_thread
     def report(self, resource_id: str, fraction: float, text: str) -> None:
-        """Keep a report, and have it sent soon. From any thread; does not wait."""
+        """Keep a report, and have it sent soon; does not wait."""
         reports = self._loads.get(resource_id) or self._loads.setdefault(resource_id, _Reports())
         reports.newest = (fraction, text)
         reports.unsent.append(reports.newest)
         self._want_turn(resource_id, reports)
 
+    @any_thread
     def newest(self, resource_id: str) -> tuple[float, str] | None:
-        """Return the last report of a load that runs; None if it has made none. From any thread."""
+        """Return the last report of a load that runs; None if it has made none."""
         reports = self._loads.get(resource_id)
         return None if reports is None else reports.newest
 
@@ -114,15 +147,18 @@ class ProgressReports:
         if reports is not None and reports.unsent and not self._registrar.closed:
             self._send(resource_id, reports)
 
+    @any_thread
     def has_unsent(self, resource_id: str) -> bool:
-        """Return whether a report has to be sent before the load's answer. From any thread."""
+        """Return whether a report has to be sent before the load's answer."""
         reports = self._loads.get(resource_id)
         return reports is not None and bool(reports.unsent)
 
+    @any_thread
     def forget(self, resource_id: str) -> None:
-        """Drop the reports of a callback that has returned, as none is unsent. From any thread."""
+        """Drop the reports of a callback that has returned, as none is unsent."""
         self._loads.pop(resource_id, None)
 
+    @any_thread
     def _want_turn(self, resource_id: str, reports: _Reports) -> None:
         try:
             reports.turn.pop()
@@ -175,8 +211,9 @@ class ProgressReports:
             registrar.consumers.hint(origin, Progressed(query_ids, resource_id, resource.server, fraction, text))
         registrar.consumers.flush()
         if registrar.node.watched:
-            where = {"registrar": registrar.name, "server": f"{registrar.name}/{resource.server}"}
-            registrar.node.emit("progress", **where, resource_id=resource_id, fraction=fraction, text=text)
+            where = {"registrar": registrar.name, "server": catalog.origin_of(resource), "resource_id": resource_id}
+            request = text_of_value(resource.request)
+            registrar.node.emit("progress", **where, request=request, fraction=fraction, text=text)
         return True
 
 
@@ -212,8 +249,9 @@ class ProgressListeners:
         self._by_query.pop(query_id, None)
         self._heard.pop(query_id, None)
 
+    @on_loop
     def hear(self, provider: str, message: Progressed) -> None:
-        """Call the listeners for a report that has arrived. On the loop."""
+        """Call the listeners for a report that has arrived."""
         if not self._by_query:
             return
         progress = Progress(message.fraction, message.text, f"{provider}/{message.server}", message.resource_id)

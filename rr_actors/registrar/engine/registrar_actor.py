@@ -1,86 +1,55 @@
-"""RegistrarActor: has one catalog, and all other parts of one registrar. Its Monitor decides messages and commands.
+"""RegistrarActor: has one catalog, and all other parts of one registrar. Its monitor decides messages and commands.
 
-It lives on the process's loop, with its servers and clients. Nothing here blocks except a commit. Two of its parts are
-in this file: the servers that are registered here (Servers), and the types of providers' servers (ServerTypes).
+It lives on the process's loop, with its servers and clients. Nothing here blocks except a commit.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
-from typing import Any, Protocol
 
-from rr_actors.base.config import RegistrarConfig
-from rr_actors.base.errors import (
-    CatalogError,
-    MailboxFull,
-    NameTaken,
-    NotSerializable,
-    RegistrarDown,
-    RrError,
-    UsageError,
-)
-from rr_actors.base.names import ServerId, new_id
+from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, RrError, UsageError
+from rr_actors.base.names import new_id
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
-from rr_actors.registrar.core import digests
-from rr_actors.registrar.engine.monitor import LoadWaiter, Monitor, RegistrarState, UnloadWaiter, answered_by_line
-from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
-from rr_actors.registrar.engine.server import ServerActor
+from rr_actors.base.values.failure import Failure, error_of, failure_of
+from rr_actors.hosting.streams import Publishers
+from rr_actors.registrar.engine.effect_runner import EffectRunner
+from rr_actors.registrar.engine.monitor import Opening, RegistrarBase, RegistrarMonitor
+from rr_actors.registrar.engine.progress import ProgressReports
+from rr_actors.registrar.engine.registrar_state import LoadWaiter, UnloadWaiter, answered_by_line
+from rr_actors.registrar.engine.server import Servers
 from rr_actors.registrar.links.consumer_links import Consumers
-from rr_actors.registrar.links.provider_link import THREADS, Client
+from rr_actors.registrar.links.local_line import LocalLine
+from rr_actors.registrar.links.provider_link import THREADS, ProviderLink, ProviderLinks, ServerTypes
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.messages import Described, Failure, Load, Loaded, LoadRefused, error_of, failure_of
-from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice, Put, ServerType
-from rr_actors.runtime import interpreter
+from rr_actors.registrar.model.messages import Loaded, LoadRefused
+from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.runtime.event_loop import FORKED
-from rr_actors.storage.store import Store
-from rr_actors.wire.name_service import Status
-from rr_actors.wire.transport import Attach, Hello, Welcome
+from rr_actors.runtime.thread_rules import on_loop
+from rr_actors.wire.name_service import Presence
+from rr_actors.wire.transport import Attach, Exchange, Hello, Welcome
 
 _RETRY_S = 0.25
 
-logger = logging.getLogger("rr_actors.registrar")
+logger = Log("rr_actors.registrar")
 
 
-class Audience(Protocol):
-    """The listeners to the queries that this registrar holds."""
+class RegistrarActor(RegistrarBase):
+    """One registrar of this process."""
 
-    holder: Any  # the Registrar that users call
-
-    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
-        """Run the callbacks that listen to a query, for a status of it.
-
-        Then call `heard` on the loop, with whether one of them has dealt with the status.
-        """
-        ...
-
-    def forget(self, query_id: str) -> None:
-        """Drop the listeners of a query that is not held any more."""
-        ...
-
-
-class RegistrarActor(RegistrarState):
-    """One registrar of this process. `node` has what all of them share: dispatcher, transports, directory."""
-
-    def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
-        self.node = node
-        self.workers = node.dispatcher.workers
-        super().__init__(name, config, store, node.dispatcher.loop, self.workers)
-        self._commits.watched = node.watched
-        self.serving = False
-        self.servers = Servers(self)
-        self.clients: dict[str, Client] = {}
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
         self.callers: set[UnloadWaiter] = set()  # the callbacks of commands whose end somebody waits for
-        self.audience: Audience | None = None
-        self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
         self.progress = ProgressReports(self)
-        self.listeners = ProgressListeners()
+        self.publishers = Publishers(self.node.config.segments_limit_bytes)
         self.consumers = Consumers(self)
-        self.types = ServerTypes(self)
-        self.monitor = Monitor(self)
+        self.servers = Servers(self, self.consumers)
+        self.clients = ProviderLinks(self)
+        self.types = ServerTypes(self, self.clients)
+        runner = EffectRunner(self, self.consumers, self.servers, self.clients)
+        self.monitor = RegistrarMonitor(self, runner, self.servers)
 
     # -- start and stop ------------------------------------------------------------------------------------------
 
@@ -93,6 +62,7 @@ class RegistrarActor(RegistrarState):
         if self.catalog.in_flight and not self.closed:
             self.commit(((c.AddInFlight(), None),))
 
+    @on_loop
     def begin(self) -> None:
         """Go on with the work that the catalog says was in progress, and look for the providers of its queries."""
         self.lock_in_use(in_use=True)
@@ -102,11 +72,13 @@ class RegistrarActor(RegistrarState):
         for provider in providers:
             self.client(provider).want()
 
+    @on_loop
     def serve(self) -> None:
         """Let in consumers from now on, and decide the statuses that waited."""
         self.serving = True
         self.monitor.hear_held_back()
 
+    @on_loop
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let in the link of a consumer, or the direct line of a thread of a consumer that has a link already.
 
@@ -130,13 +102,14 @@ class RegistrarActor(RegistrarState):
             self._why_down = f"closed, as {self.node.stopping}"
         return super().down()
 
+    @on_loop
     def close(self, *, erase: bool = False) -> None:
-        """Write unsaved changes, and close the links and the catalog; no query is released. On the loop.
+        """Write unsaved changes, and close the links and the catalog; no query is released.
 
         Each step is tried, also after one that failed.
 
         Args:
-            erase: remove the catalog, unless a provider that is down has to be told that queries are released.
+            erase: remove the catalog, unless a provider has to be told that queries are released.
 
         Raises:
             Exception, ExceptionGroup: the errors of the steps that failed.
@@ -147,6 +120,7 @@ class RegistrarActor(RegistrarState):
         steps = Steps()
         for part in (self.monitor, self.consumers, *self.clients.values()):
             steps.take(f"closing its {type(part).__name__}", part.close)
+        steps.take("closing its streams", self.publishers.close_all)
         down = self.down()
         loads, self.loads = self.loads, {}
         for load_waiter in loads.values():
@@ -154,13 +128,21 @@ class RegistrarActor(RegistrarState):
         unloads, self.unloads = self.unloads, {}
         for waiter in (*unloads.values(), *self.callers):
             steps.take("telling who unloads, or has given a command", waiter, down)
-        with self.lock:
-            catalog = self.whole()
-            told = catalog.outbound.keys() <= catalog.up.keys()
-        steps.take("closing its catalog", lambda: self._commits.close(erase=erase and told))
+        steps.take("closing its catalog", self._close_catalog, erase)
         self.lock_in_use(in_use=False)
         steps.end(f"registrar {self.name!r}: not closed altogether")
 
+    def _close_catalog(self, erase: bool) -> None:
+        """Close the catalog, also after a defect because of which its rows cannot be looked at."""
+        owes = True
+        try:
+            with self.lock:
+                catalog = self.whole()
+                owes = bool(catalog.outbound or catalog.peers)
+        finally:
+            self.commits.close(erase=erase and not owes)
+
+    @on_loop
     def fail(self, error: Exception) -> None:
         """Close the registrar after a defect. Its supervisor starts it again from its catalog."""
         logger.critical("registrar %s: failed", self.name, exc_info=error)
@@ -169,31 +151,28 @@ class RegistrarActor(RegistrarState):
         if self.on_failure is not None:
             self.on_failure(error)
         else:  # no supervisor starts it; it may be opened again
-            self.node.close_registrar(self.name, Status.DORMANT)
+            self.node.close_registrar(self.name, Presence.DORMANT)
 
-    # -- messages and commands -----------------------------------------------------------------------------------
+    # -- what its parts ask of each other ------------------------------------------------------------------------
 
-    def post(self, command: c.Command, *, more: bool = False) -> None:
-        """Have the Monitor decide a command. On the loop. `more`: others follow, to be decided together with it."""
-        if not self.closed:
-            self.monitor.put(command, more=more or self.node.dispatcher.more)
+    def expel(self, origin: str) -> None:
+        self.consumers.expel(origin)
 
-    def join_here(self, load: Load, hello: Hello) -> Loaded | None:
-        """Decide a Load of a thread of this process, with the Hello of its line, by the fast path.
+    def described(self, server: str, types: bytes) -> None:
+        self.types.described(server, types)
 
-        Return None if the Load has to be sent.
-        """
-        if self.closed or interpreter.possible() or not self.consumers.listens_to(hello):
-            return None
-        return self.join(load)
+    def line(self, hello: Hello) -> Exchange:
+        return LocalLine(self.node, self, hello)
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
-        """Return the refusal that replaces an answer that is too long for a frame. On the loop."""
         resource = self.catalog.resources.get(loaded.resource_id)
         server = None if resource is None else self.servers.get(resource.server)
         failure = failure_of(error) if server is None else server.load_failure(error)
         return LoadRefused(loaded.query_id, failure)
 
+    # -- loads and unloads ---------------------------------------------------------------------------------------
+
+    @on_loop
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load; `waiter` hears how the load ended."""
         if self.closed:
@@ -207,6 +186,7 @@ class RegistrarActor(RegistrarState):
         self.loads[ask.query_id] = waiter
         self.post(ask)
 
+    @on_loop
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
         """Release a query of this registrar; `waiter` hears how the release ended."""
         if self.closed:
@@ -223,6 +203,7 @@ class RegistrarActor(RegistrarState):
 
     # -- loads and unloads that a thread leaves to the loop: its line broke, or it gave up ------------------------
 
+    @on_loop
     def go_on_loading(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
         """Go on with a load that a thread has begun, by Got, SendAgain or GiveUp; `waiter` hears how it ends."""
         if self.closed:
@@ -248,6 +229,7 @@ class RegistrarActor(RegistrarState):
 
         return ended
 
+    @on_loop
     def go_on_unloading(self, query_id: str, waiter: UnloadWaiter, refusal: Failure | None = None) -> None:
         """Go on with an unload that a thread has begun by its own line; `waiter` hears how it ends.
 
@@ -289,33 +271,22 @@ class RegistrarActor(RegistrarState):
 
     # -- clients, rows -------------------------------------------------------------------------------------------
 
-    def client(self, provider: str) -> Client:
+    def client(self, provider: str) -> ProviderLink:
         """Return the client of a provider; make it if there is none."""
-        client = self.clients.get(provider)
-        if client is None:
-            client = self.clients[provider] = Client(self, provider)
-        return client
-
-    def held_at(self, provider: str) -> list[Held] | None:
-        """Return the rows held at a provider; None while messages wait that could change them."""
-        with self.lock:
-            return None if self.waiting else digests.held_at(self.whole(), provider)
-
-    def commit_rows(self, changes: list[Change]) -> None:
-        """Write rows that need no decision, such as stored servers, as Monitor.run() does. On the loop."""
-        self.monitor.run(c.SetRows(changes))
+        return self.clients[provider]
 
     def commit_counts(self) -> dict[str, int]:
         """Return the number of commits, the number of timed commits, and the microseconds that these took."""
-        log = self._commits
+        log = self.commits
         return {"commits": log.count, "timed_commits": log.timed, "commit_us": int(log.timed_s * 1e6)}
 
     def save(self) -> None:
         """Write the unsaved changes, as CommitLog.save() does."""
-        self._commits.save()
+        self.commits.save()
 
+    @on_loop
     def reload_catalog(self) -> None:
-        """Read the catalog from the disk again, and reconcile with all providers and consumers. On the loop.
+        """Read the catalog from the disk again, and reconcile with all providers and consumers.
 
         Raises:
             UsageError: a load or unload is in flight.
@@ -325,8 +296,9 @@ class RegistrarActor(RegistrarState):
             if self.busy():
                 raise UsageError(f"{self.name}: load_catalog() while a load or unload is in flight; wait for it")
             old = self.whole()
-            catalog = Catalog(self.name, self._commits.content(), self.epoch)
+            catalog = self.stored_catalog()
             catalog.servers.update(old.servers)
+            catalog.unread.update((id, why) for id, why in old.unread.items() if id in catalog.resources)
             catalog.listened, catalog.in_flight = old.listened, old.in_flight
             catalog.since = max(catalog.since, old.since, *(row.seq for row in old.held.values()))
             self.catalog = catalog
@@ -336,9 +308,15 @@ class RegistrarActor(RegistrarState):
             self.begin()
             self.servers.register_again()
 
+    @on_loop
     def force(self, target: str, waiter: UnloadWaiter) -> None:
-        """Unload a resource that others may hold; `waiter` hears how it ended. On the loop."""
-        self.post(c.ForceUnload(target, new_id(), waiter))
+        """Unload a resource that others may hold; `waiter` hears how it ended."""
+        self.post(c.ForceUnload(target, new_id(), waiter, clears=True))
+
+    @on_loop
+    def revoke(self, target: str, why: str, grace_ms: int, waiter: UnloadWaiter) -> None:
+        """Have all holders let a resource go; `waiter` hears how that ended."""
+        self.post(c.Revoke(target, new_id(), why, grace_ms, waiter))
 
     def newest_first(self) -> list[str]:
         """Return the queries that this registrar holds, newest first."""
@@ -346,10 +324,15 @@ class RegistrarActor(RegistrarState):
             catalog = self.whole()
             return catalog.newest_first(id for id, row in catalog.held.items() if row.hold is not Hold.OWED)
 
-    def forget_peers(self) -> None:
-        """Remove all Peer rows: nothing is held anywhere, so the next start has no provider to look for."""
-        with self.lock:
-            self.commit_rows([Drop("peers", name) for name in self.whole().peers])
+    def begin_closing(self, why: str, *, own: bool = False) -> None:
+        """Load nothing for others any more; `own`: nor for this registrar. Callers get `why` in their error."""
+        text = f"registrar {self.name!r}: loads nothing any more, as {why}"
+        failure = Failure("RegistrarDown", text, {"registrar": self.name, "status": "stopped"})
+        self.monitor.run(c.BeginClosing(failure, own))
+
+    def end_closing(self) -> None:
+        """Have the catalog keep only what is still to be released; raise CatalogError if that cannot be written."""
+        self.monitor.run(c.EndClosing())
 
     def busy(self) -> bool:
         """Return whether a load or unload is in flight on either side."""
@@ -357,79 +340,3 @@ class RegistrarActor(RegistrarState):
             catalog = self.whole()
         waits = self.waiting or self.loads or self.unloads or catalog.in_flight
         return bool(waits or catalog.closings or catalog.recovering or catalog.moving or catalog.unsettled)
-
-
-class Servers:
-    """The servers of one registrar, by name; get() returns None if there is none. On the loop."""
-
-    def __init__(self, registrar: Any) -> None:
-        self._registrar = registrar
-        self._by_name: dict[str, ServerActor] = {}
-        self.get: Callable[[str], ServerActor | None] = self._by_name.get
-
-    def names(self) -> list[str]:
-        """Return the names of all servers, in the order in which they were registered."""
-        return list(self._by_name)
-
-    def register(self, server: ServerActor) -> None:
-        """Add a server, and go on with its resources; raise NameTaken if there is a server of that name."""
-        registrar, name = self._registrar, server.spec.name
-        old = self._by_name.get(name)
-        if old is not None and not old.restored:
-            text = f"server {server.origin}: registered already; unregister it first, or take another name"
-            raise NameTaken(text, name=name)
-        self._by_name[name] = server
-        registrar.consumers.tell_all(Described(name, server.facts.types))
-        if old is None:
-            registrar.post(c.Register(server.facts, new_id()))
-        else:
-            registrar.catalog.servers[name] = server.facts
-
-    def register_again(self) -> None:
-        """Register all servers again, in a catalog that was read anew."""
-        for server in self._by_name.values():
-            self._registrar.post(c.Register(server.facts, new_id()))
-
-    def unregister(self, name: str, done: Callable[[RrError | None], None]) -> None:
-        """Remove a server when all its resources are released; `done` hears how that ended."""
-        registrar = self._registrar
-
-        def ended(error: RrError | None) -> None:
-            if name not in registrar.catalog.servers:
-                self._by_name.pop(name, None)
-            done(error)
-
-        registrar.post(c.Unregister(name, new_id(), ended))
-
-
-class ServerTypes:
-    """The types of the servers of one registrar's providers; its catalog keeps them. On the loop."""
-
-    def __init__(self, registrar: Any) -> None:
-        self._registrar = registrar
-        self._wanting: dict[str, list[Callable[[], None]]] = {}
-
-    def tell(self, server: ServerId, told: Callable[[], None]) -> None:
-        """Call `told` when the types of a provider's server are known."""
-        if str(server) in self._registrar.catalog.server_types:
-            told()
-            return
-        self._wanting.setdefault(str(server), []).append(told)
-        self._registrar.client(server.registrar).describe(server.server, at_once=True)
-
-    def described(self, server: str, blob: bytes) -> None:
-        """Keep the types that a provider has sent, and call the callers that wait for them."""
-        registrar = self._registrar
-        if registrar.closed:
-            return
-        known = registrar.catalog.server_types.get(server)
-        if known is None or known.blob != blob:
-            row = ServerType(server, blob)  # written now: after a respawn, on_start reads queries before a link is up
-            try:
-                registrar.commit_rows([Put(row)])
-            except CatalogError as error:  # a full disk, for instance: the callers wait, within their time limits
-                logger.warning("%s: the types of %s are written later: %s", registrar.name, server, error)
-                registrar.node.dispatcher.loop.call_later(_RETRY_S, self.described, server, blob)
-                return
-        for told in self._wanting.pop(server, ()):
-            told()

@@ -7,12 +7,13 @@ hand do not; they pass ``parent=rr.current()``.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
-import logging
 import typing
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
 from contextvars import ContextVar
 from typing import Any, NoReturn, cast
 
@@ -21,29 +22,84 @@ import msgspec
 from rr_actors.base.checks import check_takes, examined, is_number
 from rr_actors.base.errors import (
     CircularDependency,
+    InvalidResponse,
     InvalidSpec,
     LoadFailed,
     MailboxFull,
+    NameTaken,
     NotSerializable,
+    OverCapacity,
     RrError,
     Unavailable,
     UsageError,
+    is_a,
+    readable,
     shortened,
     shown,
     text_of,
 )
 from rr_actors.base.names import check_name, new_id
-from rr_actors.base.values.canonical import Codec
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.values.canonical import Codec, encode, shown_plain
+from rr_actors.base.values.failure import Failure, failure_of
+from rr_actors.base.values.type_shapes import digest_of
+from rr_actors.hosting.streams import Publisher
 from rr_actors.registrar.core.callback_runs import running
+from rr_actors.registrar.core.decide import Item
+from rr_actors.registrar.engine.fields import by_fields, field_names, fields_type
+from rr_actors.registrar.engine.monitor import RegistrarBase
 from rr_actors.registrar.engine.progress import checked
 from rr_actors.registrar.engine.status import status_of
+from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
-from rr_actors.registrar.model.messages import Failure, Load, failure_of, readable
-from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, Notice, Phase, Resource
+from rr_actors.registrar.model.messages import Described, Load
+from rr_actors.registrar.model.rows import (
+    LOADED,
+    LOADING,
+    PAUSED,
+    PAUSING,
+    RESUMING,
+    UNLOADING,
+    Notice,
+    Phase,
+    Resource,
+)
 from rr_actors.runtime.callback_errors import Raised, described, log_raised, traceback_of
+from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.user_loop import Done, closing, is_coroutine
 from rr_actors.runtime.workers import is_async
+
+
+class Role(msgspec.Struct, frozen=True, eq=False):
+    """One kind of callback of a server; ROLES has all of them.
+
+    Attributes:
+        name: its field in ServerSpec.
+        arguments: what the callback is called with.
+        phase: the phase of the resource until the callback returns; None: nothing waits for it.
+        reports: whether it may report progress.
+        patient: whether it waits for a free thread however many do so; else it is refused then.
+        in_order: whether the callbacks of one resource run one after another.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    phase: Phase | None = None
+    reports: bool = False
+    patient: bool = False
+    in_order: bool = False
+
+
+LOAD = Role("load", ("request",), LOADING, reports=True)
+UNLOAD = Role("unload", ("request", "response"), UNLOADING, patient=True)
+STATUS = Role("status", ("request", "status"), in_order=True)
+RECOVER = Role("recover", ("request", "response"), LOADED, reports=True, patient=True)
+UPGRADE = Role("upgrade", ("request", "response"))
+USAGE = Role("usage", ("request", "response"), patient=True)
+PAUSE = Role("pause", ("request", "response"), PAUSING, patient=True)
+RESUME = Role("resume", ("request", "response"), RESUMING, patient=True)
+ROLES = {role.name: role for role in (LOAD, UNLOAD, STATUS, RECOVER, UPGRADE, USAGE, PAUSE, RESUME)}
 
 
 class Current(msgspec.Struct, frozen=True):
@@ -58,16 +114,14 @@ class Current(msgspec.Struct, frozen=True):
             load was withdrawn or given up after a crash. Nothing, a part or all of the resource may have been loaded.
     """
 
-    # `_registrar` is the actor of the serving registrar. `_phase` is the resource's phase until the callback returns:
-    # LOADING, UNLOADING, or LOADED while it is being recovered. It is None in a status callback, for which nothing
-    # waits.
+    # `_registrar` is the actor of the serving registrar.
 
     resource_id: str
     attempt: int
     origin: str
     server: str
-    _registrar: Any
-    _phase: Phase | None
+    _registrar: RegistrarBase
+    _role: Role
     interrupted: bool = False
 
     def progress(self, fraction: float, text: str = "") -> None:
@@ -84,10 +138,29 @@ class Current(msgspec.Struct, frozen=True):
             UsageError: `fraction` or `text` is something else, or this is an unload or status callback.
         """
         number, words = checked(fraction, text)
-        if self._phase is not LOADING and self._phase is not LOADED:
-            name, role = f"{self._registrar.name}/{self.server}", _ROLES[self._phase]
-            raise UsageError(f"{name}: progress() in its {role} callback: only load and recover callbacks report it")
+        if not self._role.reports:
+            what = f"{self._registrar.name}/{self.server}: progress() in its {self._role.name} callback"
+            allowed = " and ".join(role.name for role in ROLES.values() if role.reports)
+            raise UsageError(f"{what}: only {allowed} callbacks report it")
         self._registrar.progress.report(self.resource_id, number, words)
+
+    def open_stream(self, name: str = "stream") -> Publisher:
+        """Open a stream of the resource, in its load or recover callback: its holders read it with Query.stream().
+
+        It is closed when the unload callback has returned. After a crash of the manager, open it again in the callback
+        that runs then: those who read it go on.
+
+        Raises:
+            InvalidName: `name` is none.
+            NameTaken: the resource has a stream of this name. `.name`
+            UsageError: no load or recover callback of the resource runs here.
+            Unavailable: there can be no socket or no thread for it.
+        """
+        if not self._role.reports or _current.get() is not self:
+            place = "outside" if self._role.reports else "in"
+            what = f"{self._registrar.name}/{self.server}: open_stream() {place} its {self._role.name} callback"
+            raise UsageError(f"{what}: only load and recover callbacks open streams, while they run")
+        return self._registrar.publishers.open(self.resource_id, name)
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
@@ -101,7 +174,8 @@ def current() -> Current:
     """
     context = _current.get()
     if context is None:
-        raise UsageError("rr.current(): expected to be called in a load, unload, status or recover callback")
+        expected = "expected to be called in a load, unload, status or recover callback, or in one for usage"
+        raise UsageError(f"rr.current(): {expected}")
     return context
 
 
@@ -109,13 +183,13 @@ current_or_none: Callable[[], Current | None] = _current.get
 """Return the context of the callback that this code runs in; None outside of callbacks."""
 
 
-def serving(current: Current) -> Any:
+def serving(current: Current) -> RegistrarBase:
     """Return the actor of the registrar that runs the callback."""
     return current._registrar  # pyright: ignore[reportPrivateUsage]  # same file
 
 
-def _phase_of(current: Current) -> Phase | None:
-    return current._phase  # pyright: ignore[reportPrivateUsage]  # same file
+def _role_of(current: Current) -> Role:
+    return current._role  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def begin(current: Current) -> None:
@@ -127,18 +201,22 @@ def begin(current: Current) -> None:
 
 def _record(event: str, current: Current, detail: str = "") -> None:
     registrar = serving(current)
-    role = _ROLES[_phase_of(current)]
     server = f"{registrar.name}/{current.server}"
-    registrar.node.recorder.callback(event, server, role, current.resource_id, detail)
+    registrar.recorder.callback(event, server, _role_of(current).name, current.resource_id, detail)
 
 
-def status_callback_of(registrar: Any) -> str:
+def status_callback_of(registrar: RegistrarBase) -> str:
     """Return the id of the resource whose status callback this code runs in, if the registrar serves it; else ""."""
     me = _current.get()
-    return me.resource_id if me is not None and _phase_of(me) is None and serving(me) is registrar else ""
+    return me.resource_id if me is not None and _role_of(me) is STATUS and serving(me) is registrar else ""
 
 
-_ROLES = {LOADING: "load", UNLOADING: "unload", LOADED: "recover", None: "status"}
+def check_not_measuring(registrar: RegistrarBase) -> None:
+    """Raise UsageError in a usage callback of the registrar: it would ask for its own end."""
+    me = _current.get()
+    if me is not None and _role_of(me) is USAGE and serving(me) is registrar:
+        text = f"{registrar.name}/{me.server}: usage() in its usage callback: it would wait for itself"
+        raise UsageError(text, registrar=registrar.name, resource_id=me.resource_id)
 
 
 def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str) -> None:
@@ -154,7 +232,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
         UsageError: the call would wait for itself. `.registrar`, `.server`, `.resource_id`
     """
     me = _current.get()
-    if me is None or (phase := _phase_of(me)) is None or serving(me).closed:
+    if me is None or (phase := _role_of(me).phase) is None or serving(me).closed:
         return
     with serving(me).lock:
         catalog = serving(me).whole()
@@ -162,25 +240,23 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
         if not is_running or (phase is LOADED and me.resource_id not in catalog.recovering) or not waits_for(me):
             return
     name = serving(me).name
-    whose = f"the callback that {_ROLES[phase]}s resource {me.resource_id} of {name}/{me.server}"
+    whose = f"the callback that {_role_of(me).name}s resource {me.resource_id} of {name}/{me.server}"
     text = f"{what} waits for {whose}, and is called in it: it would wait for itself; {instead}"
     raise UsageError(text, registrar=name, server=f"{name}/{me.server}", resource_id=me.resource_id)
 
 
 # -- the server --------------------------------------------------------------------------------------------------------
 
-logger = logging.getLogger("rr_actors.server")
+logger = Log("rr_actors.server")
 
 Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
+_MOST_NUMBERS = 50
+_TOO_GREAT = 2**63  # as a console's answer has room for
+RECOVER_S = 30.0
+"""How long a recover callback may take, if its server says nothing else."""
+
 _ROW_BYTES = 1024  # room for the names and ids that are sent with a request, a response, or types
-ARGUMENTS = {
-    "load": ("request",),
-    "unload": ("request", "response"),
-    "status": ("request", "status"),
-    "recover": ("request", "response"),
-}
-"""The arguments of each callback."""
 
 
 class ServerSpec(msgspec.Struct, frozen=True):
@@ -196,6 +272,30 @@ class ServerSpec(msgspec.Struct, frozen=True):
     linger_s: float = 0.0
     load_timeout_s: float | None = None
     recovery: str | None = None  # None: "keep", as nothing was said
+    recover_timeout_s: float | None = RECOVER_S
+    upgrade: Callback | None = None
+    usage: Callback | None = None
+    idle: str = "unload"
+    paused_s: float | None = None
+    pause: Callback | None = None
+    resume: Callback | None = None
+
+
+class Usages(dict[str, dict[str, float]]):
+    """What resources use: by resource id, the numbers that the usage callback of its server has returned.
+
+    Attributes:
+        failures: by resource id, why a usage is not known: its callback raised, has not returned in time, or returned
+            something else than a dict of finite numbers.
+    """
+
+    def __init__(self, usages: Mapping[str, dict[str, float]], failures: dict[str, str]) -> None:
+        super().__init__(usages)
+        self.failures = failures
+
+
+Measured = dict[str, float] | str | None
+"""The usage of a resource, or why it is not known; None if the resource is not loaded any more."""
 
 
 class ServerActor:
@@ -209,12 +309,14 @@ class ServerActor:
         NotSerializable: the types are too long to be sent to consumers.
     """
 
-    def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
+    def __init__(self, registrar: RegistrarBase, spec: ServerSpec, types: bytes) -> None:
         self.spec = spec
         self.restored = False  # whether it came from the catalog; then a second registration replaces it
         has = spec.status is not None, spec.recover is not None
         limits = spec.linger_s, spec.load_timeout_s, spec.recovery or "keep"
-        self.facts = Server(spec.name, *limits, *has, types, zlib.crc32(types))  # what decisions need to know
+        checksum = zlib.crc32(types)
+        idle = spec.idle == "pause", spec.paused_s
+        self.facts = Server(spec.name, *limits, *has, types, checksum, spec.recover_timeout_s, *idle)  # for decisions
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
         if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):
@@ -222,32 +324,82 @@ class ServerActor:
             raise NotSerializable(f"{text}: have a module that others can import, or raise the limit", path="types")
         self.request = Codec(spec.request_type, f"{self.origin}: request")
         self.response = Codec(spec.response_type, f"{self.origin}: response")
-        load, one, both = spec.load, self._request_of, self._request_and_response_of
+        self.digest = digest_of((self.request.shape, self.response.shape))
+        one, both = self._request_of, self._request_and_response_of
         encoded = self.response.encode
-        self._load = self._described(load, "load", one, encoded)
-        self._unload = self._described(_or(spec.unload, _nothing), "unload", both, _nothing)
-        self._recover = self._described(_or(spec.recover, load), "recover", both, encoded)
-        self._status = self._described(_or(spec.status, _nothing), "status", one, _nothing)
+        self._runs = {
+            LOAD: self._described(LOAD, one, encoded),
+            UNLOAD: self._described(UNLOAD, both, _nothing),
+            RECOVER: self._described(RECOVER, both, encoded),
+            STATUS: self._described(STATUS, one, _nothing),
+            USAGE: self._described(USAGE, both, self._numbers),
+            PAUSE: self._described(PAUSE, both, _nothing),
+            RESUME: self._described(RESUME, both, self._new_response),
+        }
+        self._measuring: dict[str, Future[Measured]] = {}
 
     def _described(
-        self,
-        callback: Callback,
-        role: str,
-        arguments: Callable[[Resource], tuple[Any, ...]],
-        result: Callable[[Any], Any],
+        self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
     ) -> Callback:
-        what = f"{self.origin}: {role}"
+        what = f"{self.origin}: {role.name}"
+        callback = getattr(self.spec, role.name) or _nothing
         try:
-            wrapped = _wrap(callback, arguments, result)
+            taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
+            wrapped = _wrap(taking, arguments, result)
         except Exception as error:
             expected = "a callable whose attributes can be read"
             text = f"{what}: expected {expected}, got {shown(callback)}: {text_of(error)}"
-            raise InvalidSpec(text, field=role, expected=expected, got=callback) from None
+            raise InvalidSpec(text, field=role.name, expected=expected, got=callback) from None
         return described(wrapped, what, self._describe)
 
     def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
         """Return the failure and the trace that describe a callback's error. In the thread that ran the callback."""
         return self.load_failure(error), failure_of(error, self.origin).trace
+
+    # -- what an earlier version stored --------------------------------------------------------------------------
+
+    def reread(self, resources: Iterable[Resource], digest: bytes) -> tuple[c.Reread, ...]:
+        """Read stored requests and responses by today's types; return what differs. Not on the loop: users' code runs.
+
+        What does not fit goes through the upgrade callback, if there is one. With an unchanged digest of the types only
+        users' code, such as a __post_init__, may read a value in another way than before.
+        """
+        if digest and digest == self.digest:
+            resources = (it for it in resources if self._runs_code(it))
+        return tuple(found for resource in resources if (found := self._reread(resource)) is not None)
+
+    def _runs_code(self, resource: Resource) -> bool:
+        response = resource.response
+        return self.request.runs_code(resource.request) or (response is not None and self.response.runs_code(response))
+
+    def _reread(self, resource: Resource) -> c.Reread | None:
+        place, response = resource.id, resource.response
+        try:
+            request = self.request.today(resource.request)
+            if response is not None:
+                self.response.decode(response, "", "response")
+        except RrError as error:
+            misfit = f"{error.message}, stored by an earlier version"
+        else:
+            return None if request == resource.request else c.Reread(place, request, response)
+        if self.spec.upgrade is not None:
+            try:
+                return self._upgraded(resource, self.spec.upgrade)
+            except Exception as error:
+                text = readable(text_of(error))
+                logger.exception("%s: the upgrade callback raised for resource %s", self.origin, place)
+                misfit += f", and the upgrade callback raised {text}"
+        logger.error("%s: resource %s is lost: %s", self.origin, place, misfit)
+        return c.Reread(place, resource.request, response, misfit)
+
+    def _upgraded(self, resource: Resource, upgrade: Callback) -> c.Reread:
+        old = None if resource.response is None else shown_plain(resource.response)
+        request, response = upgrade(shown_plain(resource.request), old)
+        new = self.request.canonical(encode(request), self.origin)
+        answer = None if resource.response is None else self.response.encode(response, self.origin)
+        if (error := self.too_long(msgspec.structs.replace(resource, request=new), answer)) is not None:
+            raise error
+        return c.Reread(resource.id, new, answer)
 
     # -- load ----------------------------------------------------------------------------------------------------
 
@@ -262,11 +414,12 @@ class ServerActor:
             return c.RefuseLoad(load.origin, load.query_id, failure_of(error))
         return load if canonical == load.request else msgspec.structs.replace(load, request=canonical)
 
+    @on_loop
     def start_load(self, resource: Resource) -> None:
         """Run the load callback."""
         done = functools.partial(self._load_ended, resource)
         at_once = functools.partial(self._loaded, resource)
-        self._submit(self._load, resource, resource.attempt, done, at_once=at_once)
+        self._submit(LOAD, resource, resource.attempt, done, at_once=at_once)
 
     def _loaded(self, resource: Resource, response: bytes) -> bool:
         """Decide LoadDone in the thread that ran the callback; return False if the loop has to."""
@@ -274,15 +427,23 @@ class ServerActor:
         if self.too_long(resource, response) is not None or progress.has_unsent(resource.id):
             return False
         progress.forget(resource.id)
+        self._let_in(resource.id)
         return self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
         self.registrar.progress.end(resource.id)
         error = error or self.too_long(resource, response)
         if error is None:
+            self._let_in(resource.id)
             self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
         else:
+            self.registrar.publishers.close(resource.id)
             self.registrar.post(c.LoadErred(resource.id, resource.attempt, self.load_failure(error)))
+
+    def _let_in(self, resource_id: str) -> None:
+        """Let readers in to the streams that a callback has opened."""
+        if self.registrar.publishers.streams:  # most registrars have none
+            self.registrar.publishers.let_in(resource_id)
 
     def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
         """Return the error for a response that, with its request, is too long for a frame; None if it is not."""
@@ -299,7 +460,7 @@ class ServerActor:
             return error.details[0]
         error = _alone(error)
         described = failure_of(error, self.origin)
-        if isinstance(error, CircularDependency):
+        if isinstance(error, (CircularDependency, OverCapacity)):
             return described
         if isinstance(error, LoadFailed):
             text, lines = described.message, error.traceback
@@ -310,20 +471,24 @@ class ServerActor:
 
     # -- unload --------------------------------------------------------------------------------------------------
 
+    @on_loop
     def start_unload(self, resource: Resource) -> None:
         """Run the unload callback; without one, the resource counts as unloaded at once."""
         if self.spec.unload is None:
+            self.registrar.publishers.close(resource.id)
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
 
         def at_once(_result: None) -> bool:
+            self.registrar.publishers.close(resource.id)
             return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
 
         done = functools.partial(self._unload_ended, resource)
-        self._submit(self._unload, resource, resource.tries, done, patient=True, at_once=at_once)
+        self._submit(UNLOAD, resource, resource.tries, done, at_once=at_once)
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:
+            self.registrar.publishers.close(resource.id)
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
         trace = error.details[1] if type(error) is Raised else failure_of(error, self.origin).trace
@@ -335,24 +500,62 @@ class ServerActor:
 
     # -- recover -------------------------------------------------------------------------------------------------
 
+    @on_loop
     def start_recover(self, resource: Resource, reload: bool) -> None:
         """Ask the recover callback whether the resource lives, or load the resource again."""
-        run = self._load if reload or self.spec.recover is None else self._recover
-        self._submit(run, resource, resource.attempt, functools.partial(self._recover_ended, resource), patient=True)
+        run = self._runs[LOAD if reload or self.spec.recover is None else RECOVER]
+        self._submit(RECOVER, resource, resource.attempt, functools.partial(self._recover_ended, resource), run=run)
 
     def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
         self.registrar.progress.end(resource.id)
         error = error or self.too_long(resource, response)
         if error is None:
+            self._let_in(resource.id)
             self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
             return
+        self.registrar.publishers.close(resource.id)
         text = readable(f"lost: {self.origin}: {_text_of(error)}")
         logger.warning("%s (resource %s)", text, resource.id)
         failure = Failure("LoadFailed", text, {"server": self.origin})
         self.registrar.post(c.RecoverErred(resource.id, resource.attempt, failure, new_id()))
 
+    # -- pause and resume ----------------------------------------------------------------------------------------
+
+    @on_loop
+    def start_pause(self, resource: Resource) -> None:
+        """Run the pause callback."""
+        self._submit(PAUSE, resource, resource.attempt, functools.partial(self._pause_ended, resource))
+
+    def _pause_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
+        if error is None:
+            self.registrar.post(c.PauseDone(resource.id, resource.attempt))
+            return
+        text = readable(f"{self.origin}: pause: {_text_of(error)}")
+        log_raised(logger, error, "%s; resource %s runs on", text, resource.id)
+        failure = Failure("LoadFailed", text, {"server": self.origin})
+        self.registrar.post(c.PauseErred(resource.id, resource.attempt, failure))
+
+    @on_loop
+    def start_resume(self, resource: Resource) -> None:
+        """Run the resume callback; without one, as the server does not pause any more, the resource runs."""
+        self._submit(RESUME, resource, resource.attempt, functools.partial(self._resume_ended, resource))
+
+    def _new_response(self, answer: Any, where: str = "") -> bytes | None:
+        return None if answer is None else self.response.encode(answer, where or self.origin)
+
+    def _resume_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
+        error = error or self.too_long(resource, response)
+        if error is None:
+            self.registrar.post(c.ResumeDone(resource.id, resource.attempt, response, new_id()))
+            return
+        text = readable(f"lost: {self.origin}: resume: {_text_of(error)}")
+        logger.warning("%s (resource %s)", text, resource.id)
+        failure = Failure("LoadFailed", text, {"server": self.origin})
+        self.registrar.post(c.ResumeErred(resource.id, resource.attempt, failure, new_id()))
+
     # -- status --------------------------------------------------------------------------------------------------
 
+    @on_loop
     def start_status(self, resource: Resource, notice: Notice, *, repeated: bool) -> None:
         """Run the status callback for a status of the resource, or of one of its parts."""
         status = status_of(notice, repeated=repeated)
@@ -363,33 +566,69 @@ class ServerActor:
                 log_raised(logger, error, "%s: the status callback raised; the status goes on", self.origin)
             self.registrar.post(c.StatusDone(resource.id, notice, status.is_handled))
 
-        self._submit(self._status, resource, resource.attempt, done, status, in_order=True)
+        self._submit(STATUS, resource, resource.attempt, done, status)
+
+    # -- usage ---------------------------------------------------------------------------------------------------
+
+    @on_loop
+    def measure(self, resource: Resource) -> Future[Measured]:
+        """Have the usage callback run; the future gets its numbers, or why there are none; None if it is unloaded.
+
+        While a callback runs, no other one begins for the same resource: one that hangs takes one thread.
+        """
+        known = self._measuring.get(resource.id)
+        if known is not None:
+            return known
+        future = self._measuring[resource.id] = Future()
+
+        def done(numbers: dict[str, float] | None, error: BaseException | None) -> None:
+            del self._measuring[resource.id]
+            left = self.registrar.catalog.resources.get(resource.id)
+            if left is None or left.phase not in (LOADED, PAUSED):
+                future.set_result(None)
+            else:
+                future.set_result(numbers if error is None else f"{self.origin}: usage: {readable(_text_of(error))}")
+
+        self._submit(USAGE, resource, resource.attempt, done)
+        return future
+
+    def _numbers(self, answer: object) -> dict[str, float]:
+        expected = f"a dict of at most {_MOST_NUMBERS} finite numbers by name"
+        numbers = cast("dict[Any, Any] | None", answer if is_a(answer, dict) else None)
+        if numbers is None or len(numbers) > _MOST_NUMBERS:
+            got = cast("object", answer)
+            text = f"expected {expected}, got {shown(got)} ({type(got).__name__})"
+            raise InvalidResponse(text, server=self.origin, path="", expected=expected)
+        for name, number in numbers.items():
+            if type(name) is not str or not is_number(number) or abs(number) >= _TOO_GREAT:
+                text = f"expected {expected}, got {shown(number)} ({type(number).__name__}) as {shown(name)}"
+                raise InvalidResponse(text, server=self.origin, path=shown(name), expected=expected)
+        return {name: number + 0 for name, number in numbers.items()}  # of the plain types: they travel
 
     # -- how callbacks run ---------------------------------------------------------------------------------------
 
     def _submit(
         self,
-        run: Callback,
+        role: Role,
         resource: Resource,
         attempt: int,
         done: Done,
         *more: Any,
-        in_order: bool = False,
-        patient: bool = False,
+        run: Callback | None = None,
         at_once: Callable[[Any], bool] | None = None,
     ) -> None:
         holder = self.registrar.catalog.holder_of(resource.id)
-        phase = None if in_order else resource.phase
-        interrupted = phase is UNLOADING and resource.response is None
-        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase, interrupted)
+        interrupted = role is UNLOAD and resource.response is None
+        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, role, interrupted)
+        run = self._runs[role] if run is None else run
         workers = self.registrar.workers
         if self.registrar.node.watched.recording:
             done, at_once = _recorded(current, done, at_once)
         try:
-            if in_order:
-                workers.serial(("status", resource.id), run, current, resource, *more, done=done)
+            if role.in_order:
+                workers.serial((role.name, resource.id), run, current, resource, *more, done=done)
             else:
-                workers.submit(run, current, resource, *more, done=done, patient=patient, at_once=at_once)
+                workers.submit(run, current, resource, *more, done=done, patient=role.patient, at_once=at_once)
         except (MailboxFull, Unavailable) as error:
             done(None, error)
 
@@ -429,12 +668,16 @@ def _wrap(
     if is_async(callback):
 
         async def run_async(current: Current, resource: Resource, *more: Any) -> Any:
+            if _is_over(current):
+                return None
             begin(current)
             return result(await callback(*arguments(resource), *more))
 
         return run_async
 
     def run(current: Current, resource: Resource, *more: Any) -> Any:
+        if _is_over(current):
+            return None
         begin(current)
         answer = callback(*arguments(resource), *more)
         if is_coroutine(answer):  # the callback is a wrapper or a lambda around an async function
@@ -444,12 +687,20 @@ def _wrap(
     return run
 
 
+def _is_over(current: Current) -> bool:
+    """Return whether a callback must not begin any more: its registrar is closed, or its resource is being unloaded.
+
+    Of a closed registrar nothing is decided, so its callback's result does not matter.
+    """
+    registrar = serving(current)
+    if registrar.closed or _role_of(current) is not STATUS:
+        return registrar.closed
+    resource = registrar.catalog.resources.get(current.resource_id)
+    return resource is None or resource.phase is UNLOADING
+
+
 async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
     return result(await answer)
-
-
-def _or(callback: Callback | None, other: Callback) -> Callback:
-    return other if callback is None else callback
 
 
 def _text_of(error: BaseException) -> str:
@@ -468,6 +719,117 @@ def _nothing(*_: Any) -> None:
     return None
 
 
+class Servers:
+    """The servers of one registrar, by name; get() returns None if there is none."""
+
+    def __init__(self, registrar: RegistrarBase, consumers: Consumers) -> None:
+        self._registrar = registrar
+        self._consumers = consumers
+        self._by_name: dict[str, ServerActor] = {}
+        self.get: Callable[[str], ServerActor | None] = self._by_name.get
+
+    def names(self) -> list[str]:
+        """Return the names of all servers, in the order in which they were registered."""
+        return list(self._by_name)
+
+    @on_loop
+    def register(self, server: ServerActor, reread: tuple[c.Reread, ...] = ()) -> None:
+        """Add a server, and go on with its resources; raise NameTaken if there is a server of that name."""
+        registrar, name = self._registrar, server.spec.name
+        old = self._by_name.get(name)
+        if old is not None and not old.restored:
+            text = f"server {server.origin}: registered already; unregister it first, or take another name"
+            raise NameTaken(text, name=name)
+        self._by_name[name] = server
+        self._consumers.tell_all(Described(name, server.facts.types))
+        if old is None:
+            registrar.post(c.Register(server.facts, new_id(), reread, server.digest))
+        else:
+            registrar.catalog.servers[name] = server.facts
+
+    @on_loop
+    def register_again(self) -> None:
+        """Register all servers again, in a catalog that was read anew."""
+        for server in self._by_name.values():
+            self._registrar.post(c.Register(server.facts, new_id()))
+
+    @on_loop
+    def unregister(self, name: str, done: Callable[[RrError | None], None]) -> None:
+        """Remove a server when all its resources are released; `done` hears how that ended."""
+        registrar = self._registrar
+
+        def ended(error: RrError | None) -> None:
+            if name not in registrar.catalog.servers:
+                self._by_name.pop(name, None)
+            done(error)
+
+        registrar.post(c.Unregister(name, new_id(), ended))
+
+    # -- requests that consumers have sent ----------------------------------------------------------------------------
+
+    @on_loop
+    def read_first(self, load: Load, sender: str) -> bool:
+        """Have a worker read the request first if that runs user code, and return whether it does."""
+        registrar, server = self._registrar, self.get(load.server)
+        if server is None or not server.request.runs_code(load.request):
+            return False
+        with registrar.lock:
+            if self._is_read(load):
+                return False
+        link_of = self._consumers.link_of
+        link = link_of(sender)
+
+        def done(read: Load | c.RefuseLoad, error: BaseException | None) -> None:
+            if registrar.closed or link_of(sender) is not link:  # the consumer sends it again over the next link
+                return
+            if self.get(load.server) is not server:  # unregistered meanwhile, and perhaps registered anew
+                registrar.monitor.receive(load, sender)
+                return
+            if error is not None:
+                read = c.RefuseLoad(sender, load.query_id, failure_of(error))
+            registrar.monitor.put(read, sender if type(read) is Load else None)
+            registrar.progress.greet(sender, load.query_id)
+
+        try:
+            registrar.workers.submit(server.readable, load, done=done)
+        except MailboxFull as error:
+            done(load, error)
+        except Unavailable:  # this process is stopping
+            pass
+        return True
+
+    @with_lock
+    def read(self, load: Load, sender: str | None) -> Item:
+        """Return the Load in canonical form, or its refusal; a worker has read it already if that runs user code."""
+        server = self.get(load.server)
+        if server is None or self._is_read(load) or server.request.runs_code(load.request):
+            return load, sender
+        read = server.readable(load)
+        return read, sender if type(read) is Load else None
+
+    @with_lock
+    def _is_read(self, load: Load) -> bool:
+        """Return whether the Load can be decided without reading its request."""
+        catalog = self._registrar.whole()
+        known = catalog.queries.get(load.query_id)
+        if known is not None:
+            return known.resource_id not in catalog.recovering  # such a resource may have to be loaded anew
+        return load.query_id in catalog.refused or catalog.joinable(load.server, load.request) is not None
+
+
+def checked_callback(callback: Callback, role: Role, request_type: Any, who: str) -> Callback:
+    """Return a function that takes the arguments of the role: the callback itself, unless it takes fields.
+
+    Raises:
+        InvalidSpec: the callback takes others.
+    """
+    names = field_names(request_type)
+    if names is not None:
+        return by_fields(callback, role.name, role.arguments, names, who)
+    check_takes(callback, role.arguments, who, role.name)
+    return callback
+
+
 def checked_spec(spec: ServerSpec) -> ServerSpec:
     """Check what a server is registered with; read its types from the annotations of `load` if none are given.
 
@@ -475,40 +837,74 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
         InvalidName, InvalidSpec: a field is wrong; the error says which.
     """
     name = check_name(spec.name, "server name")
-    with examined(f"server {name!r}"):
-        for field in ("load", "unload", "status", "recover"):
+    who = f"server {name!r}"
+    with examined(who):
+        request, response = _annotated(spec.load, who) if callable(spec.load) else (None, None)
+        request = request if spec.request_type is None else spec.request_type
+        for field, role in ROLES.items():
             callback = getattr(spec, field)
             if callable(callback):
-                check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
+                checked_callback(callback, role, request, who)
             elif field == "load" or callback is not None:
                 _invalid(name, field, "a callable", callback)
+        if spec.upgrade is not None and is_async(spec.upgrade):
+            _invalid(name, "upgrade", "a function that is not async", spec.upgrade)
         if spec.recovery is not None and spec.recovery not in RECOVERY:
             _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), spec.recovery)
         if not is_number(spec.linger_s) or spec.linger_s < 0:
             _invalid(name, "linger_s", "seconds, 0 or more", spec.linger_s)
-        limit_s = spec.load_timeout_s
-        if limit_s is not None and not (is_number(limit_s) and limit_s > 0):
-            _invalid(name, "load_timeout_s", "seconds greater than 0, or None", limit_s)
-        request, response = _annotated(spec.load)
+        _check_idle(name, spec)
+        for field in ("load_timeout_s", "recover_timeout_s"):
+            limit_s = getattr(spec, field)
+            if limit_s is not None and not (is_number(limit_s) and limit_s > 0):
+                _invalid(name, field, "seconds greater than 0, or None", limit_s)
         return msgspec.structs.replace(
             spec,
             name=name,
-            request_type=request if spec.request_type is None else spec.request_type,
+            request_type=request,
             response_type=response if spec.response_type is None else spec.response_type,
             linger_s=float(spec.linger_s),
         )
 
 
-def _annotated(load: Callback) -> tuple[Any, Any]:
-    """Return the request and response type in the annotations of a load callback, or None for each one not found."""
-    try:
-        hints = _hints(load)
+def _check_idle(name: str, spec: ServerSpec) -> None:
+    if spec.idle not in ("unload", "pause"):
+        _invalid(name, "idle", "'unload' or 'pause'", spec.idle)
+    if spec.paused_s is None:
+        return
+    if not is_number(spec.paused_s) or spec.paused_s < 0:
+        _invalid(name, "paused_s", "seconds, 0 or more, or None", spec.paused_s)
+    if spec.idle != "pause":
+        _invalid(name, "paused_s", "None, as idle is not 'pause'", spec.paused_s)
+
+
+def checked_pauses(spec: ServerSpec) -> ServerSpec:
+    """Check that a server has the callbacks that its idle policy needs, and no others; all are known now.
+
+    Raises:
+        InvalidSpec: pause or resume is missing, or never called.
+    """
+    for field in ("pause", "resume"):
+        callback = getattr(spec, field)
+        if spec.idle == "pause" and callback is None:
+            _invalid(spec.name, field, "a callable, as idle is 'pause'", callback)
+        if spec.idle != "pause" and callback is not None:
+            _invalid(spec.name, field, "idle='pause', without which it is never called", callback)
+    return spec
+
+
+def _annotated(load: Callback, who: str) -> tuple[Any, Any]:
+    """Return the request and response type of a load callback: its annotations, or a type made of its parameters.
+
+    None for each one not found.
+    """
+    hints: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    with contextlib.suppress(Exception):  # names that cannot be resolved, builtins without a signature: any plain value
         parameters = list(inspect.signature(load).parameters.values())
-    except Exception:  # names that cannot be resolved, builtins without a signature: any plain value then
-        return None, None
-    request = hints.get(parameters[0].name) if parameters else None
-    response = hints.get("return")
-    return _plain(request), _plain(response)
+        hints = _hints(load)
+    request = fields_type(load, hints, who) or (hints.get(parameters[0].name) if parameters else None)
+    return _plain(request), _plain(hints.get("return"))
 
 
 def log_unread_types(spec: ServerSpec, server: str) -> None:

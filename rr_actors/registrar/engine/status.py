@@ -5,8 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-from rr_actors.base.errors import UsageError, exact_text, is_a, shown, text_of
-from rr_actors.registrar.model.messages import readable
+from rr_actors.base.errors import UsageError, exact_text, is_a, readable, shown, text_of
 from rr_actors.registrar.model.rows import Notice, State
 
 
@@ -37,9 +36,24 @@ class Status:
         query_id: the receiver's query on that resource; "" if the resource is the receiver's own.
         source: the server where the status began, "registrar/server".
         repeated: whether the status may have been heard before; a crash made that uncertain.
+        reason: "revoked" if the resource's owner takes it away; "" else.
+        deadline_s: of a revoked resource, how many seconds after the status was sent it is unloaded by force: 0.0, if
+            that is done. None for any other status.
     """
 
-    __slots__ = ("_event", "_handled", "_spares", "message", "query_id", "repeated", "resource_id", "source", "state")
+    __slots__ = (
+        "_event",
+        "_handled",
+        "_spares",
+        "deadline_s",
+        "message",
+        "query_id",
+        "reason",
+        "repeated",
+        "resource_id",
+        "source",
+        "state",
+    )
 
     def __init__(
         self,
@@ -57,6 +71,8 @@ class Status:
         self.query_id = query_id
         self.source = source
         self.repeated = repeated
+        self.reason = ""
+        self.deadline_s: float | None = None
         self._handled = False
         self._event = ""  # the same for all receivers of the status, and after a crash
         self._spares = itertools.count()
@@ -91,7 +107,7 @@ class Status:
         return (self.state, self.message, self.resource_id, self.query_id, self.source)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_remake, (*self._key(), self.repeated))
+        return (_remake, (*self._key(), self.repeated, self.reason, self.deadline_s))
 
 
 def status_of(notice: Notice, *, repeated: bool = False) -> Status:
@@ -99,6 +115,8 @@ def status_of(notice: Notice, *, repeated: bool = False) -> Status:
     place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
     status = Status(notice.state, notice.message, **place, repeated=repeated)
     status._event = notice.event  # pyright: ignore[reportPrivateUsage]  # same file
+    if notice.reason:
+        status.reason, status.deadline_s = notice.reason, notice.grace_ms / 1000
     return status
 
 
@@ -119,5 +137,9 @@ def message_text(message: object) -> str:
         raise UsageError(f"message: expected text, got {shown(message)}, whose str() raised {text_of(error)}") from None
 
 
-def _remake(state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool) -> Status:
-    return Status(state, message, resource_id=resource_id, query_id=query_id, source=source, repeated=repeated)
+def _remake(
+    state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool, *revoked: Any
+) -> Status:
+    status = Status(state, message, resource_id=resource_id, query_id=query_id, source=source, repeated=repeated)
+    status.reason, status.deadline_s = revoked
+    return status

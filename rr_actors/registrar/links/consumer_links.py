@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
-from rr_actors.registrar.links.local_line import LocalLine
+from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.engine.monitor import RegistrarBase
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
@@ -26,27 +26,32 @@ from rr_actors.registrar.model.messages import (
     Noticed,
     NoticesHandled,
     Probe,
+    Reprioritise,
     Unload,
     Unloaded,
     UnloadRefused,
     retired,
 )
+from rr_actors.runtime import interpreter
+from rr_actors.runtime.thread_rules import any_thread, on_loop
 from rr_actors.wire.transport import Hello, Link
 
-logger = logging.getLogger("rr_actors.registrar")
+logger = Log("rr_actors.registrar")
 
-_OF_ITSELF = frozenset({Load, Unload, Fetch, Gone})  # messages in which a consumer names itself
+_OF_ITSELF = frozenset({Load, Unload, Fetch, Gone, Reprioritise})  # messages in which a consumer names itself
 _A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # the other messages that a consumer may send
 
 
+@on_loop
 class Consumers:
-    """One link for each consumer of a registrar's actor, and any number of direct lines. On the loop."""
+    """One link for each consumer of a registrar's actor, and any number of direct lines."""
 
-    def __init__(self, provider: Any) -> None:
+    def __init__(self, provider: RegistrarBase) -> None:
         self._provider = provider
         self._links: dict[str, Link] = {}
         self.routes = Routes()  # for each answer, the line or link by which it goes
         self._dirty: dict[int, Any] = {}
+        self._side: dict[type[Any], Callable[[str, Any], None]] = {}  # messages of consumers that are not decided
 
     def attach(self, link: Link) -> _Inlet:
         """Take the link of a consumer; it replaces an older one."""
@@ -71,8 +76,9 @@ class Consumers:
         if link is not None:
             self._send(link, message)
 
+    @any_thread
     def by_line(self, answer: Message) -> Callable[[], None] | None:
-        """Return a function that sends an answer by the line that alone waits, or None. From any thread."""
+        """Return a function that sends an answer by the line that alone waits, or None."""
         line = self.routes.line_of(answer)
         send = None if line is None else line.answering(answer)
         if line is not None and send is not None:
@@ -99,8 +105,9 @@ class Consumers:
         if self._try(link.send, link, message):
             self._dirty[id(link)] = link
 
+    @any_thread
     def _record(self, event: str, origin: str, message: Message, at: float | None = None) -> None:
-        self._provider.node.recorder.message(event, self._provider.name, origin, message, at)
+        self._provider.recorder.message(event, self._provider.name, origin, message, at)
 
     def _try(self, send: Callable[[Message], None], link: Any, message: Message) -> bool:
         # The time before send(): the receiver may read and record the message before send() returns.
@@ -161,10 +168,15 @@ class Consumers:
     def received(self, link: Link, message: Any) -> None:
         """Pass on a message of a link. If a newer link is open, ignore it: the consumer sends it again over that."""
         origin = link.hello.origin
-        _check(message, origin)
+        side = self._side.get(message.__class__)
+        if side is None:
+            _check(message, origin)
         if self._links.get(origin) is link:
             if self._provider.node.watched.level[0] > 1:
                 self._record("received", origin, message)
+            if side is not None:
+                side(origin, message)
+                return
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
             self._provider.monitor.receive(message, origin, more=link.more)
@@ -192,13 +204,14 @@ class Consumers:
         self.routes.link_lost(origin)
         self._provider.post(c.ConsumerLost(origin))
 
+    @any_thread
     def listens_to(self, hello: Hello) -> bool:
         """Return whether direct lines of this incarnation of a consumer may ask: as long as that has a link."""
         link = self._links.get(hello.origin)
         return not self._provider.closed and link is not None and link.hello.epoch == hello.epoch  # else it may be dead
 
-    def received_directly(self, line: Any, message: Any) -> None:
-        """Decide a message of a direct line; the answer goes by that line."""
+    def received_directly(self, line: Any, message: Any, *, more: bool = False) -> None:
+        """Decide a message of a direct line; the answer goes by that line. With `more`, behind waiting commands."""
         if not self.listens_to(line.hello):
             line.close()
             return
@@ -210,10 +223,23 @@ class Consumers:
             self._try(line.send_now, line, joined)
             return
         if isinstance(message, (Load, Unload)):
-            self.routes.asked_by_line(line, message)
+            self.routes.asked_by_line(line, message, self._provider.catalog.refused)
             line.open_outlet()
-        # A thread of this process may have posted a command before: with `more`, this message is decided after that.
-        self._provider.monitor.receive(message, origin, more=isinstance(line, LocalLine))
+        self._provider.monitor.receive(message, origin, more=more)
+
+    def received_here(self, line: Any, message: Any) -> None:
+        """Decide a message of a thread of this process, behind a command that the thread may have posted before."""
+        self.received_directly(line, message, more=True)
+
+    @any_thread
+    def join_here(self, load: Load, hello: Hello) -> Loaded | None:
+        """Decide a Load of a thread of this process, with the Hello of its line, by the fast path.
+
+        Return None if the Load has to be sent.
+        """
+        if self._provider.closed or interpreter.possible() or not self.listens_to(hello):
+            return None
+        return self._provider.join(load)
 
     def lost_directly(self, line: Any, _reason: Exception | None) -> None:
         """Note that a direct line is down: the consumer's link carries the answers that it waits for."""
@@ -258,8 +284,9 @@ class _Ways(msgspec.Struct):
     links: dict[str, str] = {}
 
 
+@on_loop
 class Routes:
-    """The ways of all answers of one provider. On the loop, except line_of() and answered().
+    """The ways of all answers of one provider.
 
     Loads and unloads are apart: an answer to a Load, late or sent twice, does not answer an Unload of the same query.
     """
@@ -275,9 +302,14 @@ class Routes:
         """Note a question that came by a consumer's link."""
         self._ways[type(question)].links[question.query_id] = consumer
 
-    def asked_by_line(self, line: Any, question: Load | Unload) -> None:
-        """Note a question that came by a direct line."""
+    def asked_by_line(self, line: Any, question: Load | Unload, released: Container[str] = ()) -> None:
+        """Note a question that came by a direct line; an Unload of a query in `released` is answered by the link, too.
+
+        Such an Unload came by the link before, and was refused since. So its thread may have left the line.
+        """
         self._ways[type(question)].lines[question.query_id] = line
+        if type(question) is Unload and question.query_id in released:
+            self.asked_by_link(question.origin, question)
 
     def way_of(self, message: Any) -> tuple[Any, bool]:
         """Return the line of an answer (or None), and whether it goes by the link; forget the question."""
@@ -289,17 +321,20 @@ class Routes:
         # An UnloadRefused must come before the notices that follow it by the link.
         return line, asked or line is None or type(message) is UnloadRefused
 
+    @any_thread
     def line_of(self, message: Any) -> Any:
-        """Return the line of an answer that goes by nothing else; None if there is none. From any thread."""
+        """Return the line of an answer that goes by nothing else; None if there is none."""
         ways = self._ways.get(message.__class__)
         if ways is None or type(message) is UnloadRefused or message.query_id in ways.links:
             return None
         return ways.lines.get(message.query_id)
 
+    @any_thread
     def answered(self, answer: Any) -> None:
-        """Forget the question of an answer that goes by the line of line_of(). From any thread."""
+        """Forget the question of an answer that goes by the line of line_of()."""
         self._forget_line(self._ways[type(answer)], answer.query_id)
 
+    @any_thread
     def _forget_line(self, ways: _Ways, query_id: str) -> Any:
         if ways is self._unloads:
             self._loads.links.pop(query_id, None)  # a withdrawn Load gets no answer

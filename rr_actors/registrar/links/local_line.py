@@ -5,11 +5,21 @@ from __future__ import annotations
 import functools
 import queue
 from collections.abc import Callable
-from typing import Any
+from typing import Protocol
 
+from rr_actors.hosting.process_node import ProcessNode
+from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model.messages import Load, Message
 from rr_actors.runtime.time_limits import left_until
 from rr_actors.wire.transport import Hello
+
+
+class Provider(Protocol):
+    """A registrar of this process, as a line sees it."""
+
+    epoch: int
+    closed: bool
+    consumers: Consumers
 
 
 class LocalLine:
@@ -18,24 +28,24 @@ class LocalLine:
     The calling thread itself joins a resource that is loaded and held. The loop decides all other messages.
     """
 
-    def __init__(self, node: Any, registrar: Any, hello: Hello) -> None:
+    def __init__(self, node: ProcessNode, registrar: Provider, hello: Hello) -> None:
         self._node = node
         self._registrar = registrar
         self.hello = hello
         self._unanswered = [None]  # only the thread that takes the entry out may answer
         self._answers: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
-        self.epoch: int = registrar.epoch
+        self.epoch = registrar.epoch
 
     def exchange(self, message: Message, deadline: float) -> Message:
         """Send a message and return its answer; raise TimeoutError, or ConnectionResetError once it is closed."""
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
-        if type(message) is Load and (joined := self._registrar.join_here(message, self.hello)) is not None:
+        if type(message) is Load and (joined := consumers.join_here(message, self.hello)) is not None:
             return joined
         if not self._unanswered and self._answers.empty():
             self._unanswered.append(None)
-        self._node.dispatcher.hand_over(consumers.received_directly, self, message)
+        self._node.dispatcher.hand_over(consumers.received_here, self, message)
         left_s = left_until(deadline)
         try:
             answer = self._answers.get(timeout=left_s)

@@ -1,4 +1,4 @@
-"""Client: a registrar's link to one provider. It finds the provider, connects, reconciles, and reconnects after a loss.
+"""ProviderLink: a registrar's link to one provider. It finds the provider, connects, reconciles, and reconnects.
 
 While anything is asked, held or owed at the provider, it keeps trying: a provider that is being respawned is back
 within milliseconds. It has no queue: open messages can be made from the rows, and reconciling sends them again.
@@ -11,16 +11,18 @@ again.
 from __future__ import annotations
 
 import asyncio
-import logging
+import functools
 import zlib
 from collections.abc import Callable
 from typing import Any
 
-from rr_actors.base.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
-from rr_actors.base.names import new_id
-from rr_actors.registrar.core import digests
-from rr_actors.registrar.links.local_line import LocalLine
+from rr_actors.base.errors import CatalogError, RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.base.names import ServerId, new_id
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.values.failure import failure_of
+from rr_actors.registrar.engine.monitor import RegistrarBase
 from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
@@ -32,15 +34,17 @@ from rr_actors.registrar.model.messages import (
     LoadRefused,
     Noticed,
     Progressed,
+    Reprioritised,
     Unloaded,
     UnloadRefused,
-    failure_of,
 )
-from rr_actors.wire.name_service import Entry, Status
+from rr_actors.registrar.model.rows import Put, ServerType
+from rr_actors.runtime.thread_rules import any_thread, on_loop
+from rr_actors.wire.name_service import NameEntry, Presence
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Exchange, Hello, Link
 
-logger = logging.getLogger("rr_actors.client")
+logger = Log("rr_actors.client")
 
 THREADS = "direct"
 """Hello.kind of the connections of threads."""
@@ -49,17 +53,24 @@ _FIRST_RETRY_S = 0.002
 _LAST_RETRY_S = 0.1
 _STARTING_RETRY_S = 0.01  # the longest wait after a provider is up; to look into the directory takes 2 µs
 _STOPPED_RETRY_S = 0.25
+_WRITE_AGAIN_S = 0.25
 
-_ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused})
-_A_PROVIDERS = _ANSWERS | {Fetched, Described, Noticed, Progressed}
+_ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused, Reprioritised})
+_A_PROVIDERS = _ANSWERS | {Fetched, Noticed}  # and the side messages (ProviderLink)
 
 Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
 
 
-class Client:
-    """The link of one registrar to one provider. On the loop, except where noted."""
+@on_loop
+class ProviderLink:
+    """The link of one registrar to one provider.
 
-    def __init__(self, registrar: Any, provider: str) -> None:
+    Attributes:
+        link: the present one; `opened` is the number of the Fetch that opened the last one.
+        undescribed: the servers whose types have been asked for, or have to be, and have not come yet.
+    """
+
+    def __init__(self, registrar: RegistrarBase, provider: str) -> None:
         self._registrar = registrar
         self._node = registrar.node
         self.provider = provider
@@ -74,10 +85,15 @@ class Client:
         self._known: digests.Known | None = None  # the rows held there, and their digests, when last looked at
         self._number = registrar.epoch << 32  # the number of the last Fetch
         self._linked = False  # whether there was ever a link
+        self._gone = False  # whether the registrar knows that the provider is gone for good
         self._described: set[str] = set()
-        self._undescribed: set[str] = set()
+        self.undescribed: set[str] = set()
         self.checksums: dict[str, int] = {}  # by server, those of the types that are known (Loaded.types)
         self._connections: ThreadConnections[Exchange] = ThreadConnections(self._dial_for_thread)
+        self._side: dict[type[Any], Callable[[Any], None]] = {  # messages of the provider that are not decided
+            Described: self._take_types,
+            Progressed: functools.partial(self._registrar.listeners.hear, provider),
+        }
 
     # -- for threads ---------------------------------------------------------------------------------------------
 
@@ -96,15 +112,16 @@ class Client:
             return None
         return self._connections
 
+    @any_thread
     def _dial_for_thread(self, timeout_s: float) -> Exchange | None:
         entry, link = self._node.find(self.provider), self.link
-        if entry is None or entry.status is not Status.UP or link is None:
+        if entry is None or entry.status is not Presence.UP or link is None:
             return None
         hello = self._hello(THREADS)
-        here = self._node.registrars.get(self.provider)
+        here = self._registrar.peers.get(self.provider)
         line: Exchange
         if here is not None:
-            line = LocalLine(self._node, here, hello)
+            line = here.line(hello)
         else:
             line = self._node.transport.dial(entry.address, hello, timeout_s)
         if line.epoch != link.welcome.epoch:
@@ -134,10 +151,10 @@ class Client:
     def describe(self, server: str, *, at_once: bool = False) -> None:
         """Ask for a server's types, unless this link has brought them; `at_once`: do not wait for other messages."""
         if self.link is None:
-            self._undescribed.add(server)
+            self.undescribed.add(server)
             self.want()
         elif server not in self._described:
-            self._undescribed.add(server)  # until the answer is there: this link may break before
+            self.undescribed.add(server)  # until the answer is there: this link may break before
             self.link.send(Describe(server))
             if at_once:
                 self.link.flush()
@@ -186,21 +203,24 @@ class Client:
     async def _try_once(self, delay: float) -> float | None:
         """Try once to connect; return the seconds to wait before the next try, or None if no other is needed."""
         entry = self._node.find(self.provider)
-        if entry is None:
-            self._unreachable(self._node.directory.no_registrar(self.provider), final=True)
+        if entry is None:  # if it had anything, its catalog would have been found, and it would be dormant
+            self._unreachable(self._node.directory.no_registrar(self.provider), final=True, empty=True)
             return None
-        if entry.status is Status.GONE:
-            text = f"registrar {self.provider!r}: gone for good{entry.because}"
-            self._unreachable(RegistrarDown(text, registrar=self.provider, status=str(entry.status)), final=True)
-            return None
-        if entry.status in (Status.STOPPED, Status.DORMANT):
+        if entry.status is Presence.GONE:
+            if self._asked or self._fetching or not self._gone:
+                self._gone = True
+                text = f"registrar {self.provider!r}: gone for good{entry.because}"
+                self._unreachable(RegistrarDown(text, registrar=self.provider, status=str(entry.status)), final=True)
+            return _STOPPED_RETRY_S  # what is owed there is delivered if it is started again under its name
+        self._gone = False
+        if entry.status in (Presence.STOPPED, Presence.DORMANT):
             if self._asked or self._fetching:
                 self._say_releases_wait(entry)
                 text = f"registrar {self.provider!r}: {entry.status}{entry.because}; start it again, or take another"
                 down = RegistrarDown(text, registrar=self.provider, status=str(entry.status))
                 self._unreachable(down, final=False)
             return _STOPPED_RETRY_S
-        if entry.status is Status.STARTING:
+        if entry.status is Presence.STARTING:
             if self._known is None and entry.address:  # its process is reading its catalog, so there is time for this
                 self._known = await self._look_ahead()
             return min(delay, _STARTING_RETRY_S)
@@ -246,6 +266,7 @@ class Client:
         self._send_fetch(link, resume=True, known=known)
         self.opened = self._number
 
+    @any_thread
     def _hello(self, kind: str) -> Hello:
         return Hello(kind, self.provider, self._registrar.name, self._registrar.epoch)
 
@@ -255,7 +276,7 @@ class Client:
         link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
         link.flush()
 
-    def _say_releases_wait(self, entry: Entry) -> None:
+    def _say_releases_wait(self, entry: NameEntry) -> None:
         """Log that callers wait for releases at a provider that has to be started again."""
         held = self._registrar.catalog.held
         rows = (held.get(query_id) for query_id in list(self._registrar.unloads))
@@ -263,17 +284,17 @@ class Client:
             text = "%s: a release waits for registrar %r, which is %s%s: start it again; until then the release is owed"
             logger.warning(text, self._registrar.name, self.provider, entry.status, entry.because)
 
-    def _unreachable(self, error: RrError, *, final: bool) -> None:
+    def _unreachable(self, error: RrError, *, final: bool, empty: bool = False) -> None:
         self._asked = False
         self._end_fetches(error)
-        self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id()))
+        self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id(), empty))
 
     def _end_fetches(self, error: RrError) -> None:
         fetching, self._fetching = self._fetching, []
         for done in fetching:
             done(None, error)
 
-    def _attach(self, _link: Link) -> Client:
+    def _attach(self, _link: Link) -> ProviderLink:
         return self
 
     # -- messages of the provider --------------------------------------------------------------------------------
@@ -281,27 +302,25 @@ class Client:
     def received(self, link: Link, message: Any) -> None:
         """Take a message of the provider; raise Unavailable, which closes the link, if it is a consumer's."""
         kind = message.__class__
-        if kind not in _A_PROVIDERS:
+        if kind not in _A_PROVIDERS and kind not in self._side:
             raise Unavailable(f"{kind.__name__} is a consumer's to say, not a provider's")
         if self._node.watched.level[0] > 1:
-            self._node.recorder.message("received", self._registrar.name, self.provider, message)
+            self._registrar.recorder.message("received", self._registrar.name, self.provider, message)
         if kind in _ANSWERS or (kind is Noticed and self._reconciled):
             self._registrar.monitor.receive(message, self.provider, more=link.more)
         elif kind is Fetched:
             self._fetched(link, message)
-        elif kind is Described:
-            self._take_types(message)
-        elif kind is Progressed:
-            self._registrar.listeners.hear(self.provider, message)
+        elif kind in self._side:
+            self._side[kind](message)
         # A notice that comes before the list of queries is sent again behind it.
 
     def _take_types(self, message: Described) -> None:
         """Keep the types of a server, if they were asked for or an older version of them is known."""
         server = f"{self.provider}/{message.server}"
-        if message.server in self._undescribed or server in self._registrar.catalog.server_types:
+        if message.server in self.undescribed or server in self._registrar.catalog.server_types:
             self._described.add(message.server)
-            self._undescribed.discard(message.server)
-            self._registrar.types.described(server, message.blob)
+            self.undescribed.discard(message.server)
+            self._registrar.described(server, message.blob)
             self.checksums[message.server] = zlib.crc32(message.blob)
 
     def _fetched(self, link: Link, message: Fetched) -> None:
@@ -313,20 +332,22 @@ class Client:
         queries, self._chunks = self._chunks, []
         if not self._reconciled:
             self._reconciled = True
-            self._undescribed.update(query.server for query in queries)
+            self.undescribed.update(query.server for query in queries)
             prefix = f"{self.provider}/"
             with self._registrar.lock:
                 catalog = self._registrar.whole()
                 if message.same and not self._linked:  # and those of queries that agree, and so are not listed
-                    self._undescribed.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
+                    self.undescribed.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
                 known = [row for server, row in catalog.server_types.items() if server.startswith(prefix)]
             self._linked = True
             self.checksums = {row.id.removeprefix(prefix): zlib.crc32(row.blob) for row in known}
-            self._undescribed.update(self.checksums)  # types that were sent to an earlier incarnation
-            for server in self._undescribed:
+            self.undescribed.update(self.checksums)  # types that were sent to an earlier incarnation
+            for server in self.undescribed:
                 link.send(Describe(server))
             link.flush()
-            reconcile = c.Reconcile(self.provider, queries, new_id(), message.same, message.number)
+            run = link.welcome.epoch
+            link_facts = (message.same, message.number, run, message.notices)
+            reconcile = c.Reconcile(self.provider, queries, new_id(), *link_facts)
             # with `more`: notices follow, which say why a query is not in the list
             self._registrar.post(reconcile, more=link.more)
         answered, self._fetching = self._fetching[: self._listed_for], self._fetching[self._listed_for :]
@@ -351,3 +372,55 @@ class Client:
             asked = self._asked
             self.want()
             self._asked = asked  # unchanged: if no caller asks, it is no error that the provider is stopped
+
+
+class ProviderLinks(dict[str, ProviderLink]):
+    """The clients of one registrar, by provider; one that is asked for is made."""
+
+    def __init__(self, registrar: RegistrarBase) -> None:
+        super().__init__()
+        self._registrar = registrar
+
+    def __missing__(self, provider: str) -> ProviderLink:
+        client = self[provider] = ProviderLink(self._registrar, provider)
+        return client
+
+
+@on_loop
+class ServerTypes:
+    """The types of the servers of one registrar's providers; its catalog keeps them."""
+
+    def __init__(self, registrar: RegistrarBase, clients: ProviderLinks) -> None:
+        self._registrar = registrar
+        self._clients = clients
+        self._wanting: dict[str, list[Callable[[], None]]] = {}
+        self._newest: dict[str, bytes] = {}
+
+    def tell(self, server: ServerId, told: Callable[[], None]) -> None:
+        """Call `told` when the types of a provider's server are known."""
+        if str(server) in self._registrar.catalog.server_types:
+            told()
+            return
+        self._wanting.setdefault(str(server), []).append(told)
+        self._clients[server.registrar].describe(server.server, at_once=True)
+
+    def described(self, server: str, blob: bytes) -> None:
+        """Keep the types that a provider has sent, and call the callers that wait for them."""
+        self._newest[server] = blob
+        self._keep(server, blob)
+
+    def _keep(self, server: str, blob: bytes) -> None:
+        registrar = self._registrar
+        if registrar.closed or self._newest[server] is not blob:
+            return
+        known = registrar.catalog.server_types.get(server)
+        if known is None or known.blob != blob:
+            row = ServerType(server, blob)  # written now: after a respawn, on_start reads queries before a link is up
+            try:
+                registrar.commit_rows([Put(row)])
+            except CatalogError as error:  # a full disk, for instance: the callers wait, within their time limits
+                logger.warning("%s: the types of %s are written later: %s", registrar.name, server, error)
+                registrar.node.dispatcher.loop.call_later(_WRITE_AGAIN_S, self._keep, server, blob)
+                return
+        for told in self._wanting.pop(server, ()):
+            told()

@@ -13,16 +13,22 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.effects import Effect, StartStatus
-from rr_actors.registrar.model.messages import Failure
 from rr_actors.registrar.model.rows import (
     HELD,
+    HIGHEST,
     LOADED,
     LOADING,
+    LOWEST,
     OWED,
+    PAUSED,
     QUEUED,
+    RESTING,
+    STANDBY,
     TABLE_OF,
     UNLOADING,
+    CallbackRun,
     Change,
     Content,
     Drop,
@@ -32,6 +38,7 @@ from rr_actors.registrar.model.rows import (
     Put,
     Query,
     Resource,
+    Revocation,
     Row,
     ServerType,
     State,
@@ -41,7 +48,7 @@ from rr_actors.registrar.model.rows import (
     is_own,
 )
 
-_JOINABLE = (LOADED, LOADING, QUEUED)
+_JOINABLE = (LOADED, LOADING, QUEUED, *RESTING)
 _MOVING = (LOADING, QUEUED, UNLOADING)
 
 _seq, _origin, _server, _resource_id = map(attrgetter, ("seq", "origin", "server", "resource_id"))
@@ -68,12 +75,16 @@ class Server(msgspec.Struct, frozen=True):
     has_recover: bool = False
     types: bytes = b""  # the types of requests and responses, for consumers (rows.ServerType)
     types_checksum: int = 0
+    recover_timeout_s: float | None = None
+    pauses: bool = False
+    paused_s: float | None = None
 
 
 class Closing(msgspec.Struct, frozen=True):
-    """Releases to be sent after the one in progress, newest first; the effects `after` follow the last of them."""
+    """The releases of a resource's parts, newest first; `sent` are sent; the effects `after` follow the last."""
 
-    remaining: tuple[str, ...]
+    ids: tuple[str, ...]
+    sent: int
     after: tuple[Effect, ...]
 
 
@@ -93,8 +104,8 @@ class Catalog:
     """All that one registrar knows.
 
     Rows, as on disk: `resources` and `queries` that it serves, `held` queries of its own, `notices` to deliver, `peers`
-    it has asked, `stored_servers`, `server_types`. Indexes follow the rows. All else is in memory only. A crash may
-    lose it, because each caller that waits asks again:
+    it has asked, `stored_servers`, `server_types`, `callback_runs`. Indexes follow the rows. All else is in memory
+    only. A crash may lose it, because each caller that waits asks again:
 
     - `deaths`: how the last processes of this registrar died, one after another, in words for people.
     - `servers`: the servers registered now. `leaving`: those of them that take no new loads.
@@ -106,25 +117,49 @@ class Catalog:
     - `recovering`: resources whose recover callback runs, with the messages parked until it has returned.
     - `closings`: releases of parts in progress, by the query whose release has been sent.
     - `direct`: queries whose Load a thread has sent by its own connection, which has not answered yet; False: the query
-      has ended by another way. `fresh`: queries that such a connection answered while the provider's link was down: the
-      list sent over the next link may be older. `in_flight`: the rows of loads sent by such connections, until a
-      decision concerns them; the threads add to it.
+      has ended by another way. `fresh`: queries that such a connection answered while the provider's link was down, and
+      the epoch of the provider that did: a list of the same epoch over the next link may be older. `in_flight`: the
+      rows of loads sent by such connections, until a decision concerns them; the threads add to it.
     - `kept`: held queries that were owed for a while, until their unload failed. A second try may still succeed.
       Statuses of that time were passed over, so for these a response that is sent again may be newer than the row's;
       for other queries it is older.
+    - `unread`: resources that an earlier version stored, and that do not fit today's types, with the reason.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
-    - `told`: notices sent before; a second sending is marked repeated. `heard`: statuses received, by receiver (a
-      query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver.
-      `hearing`: these notices. `deferred`: by resource, the statuses that its server hears after its load or recover
-      callback has returned. `next_to_hear`: by notice, the statuses of a part that the resource hears after the
-      listeners of the part. `ending`: queries that were taken away and whose holders are still hearing of it.
-    - `acked`: providers with acknowledgements sent, or to be sent, which a lost link may lose.
+    - `told`: notices sent before; a second sending is marked repeated. True: on its way, sent over the present link.
+      `behind`: queries with more notices than `window`, and how many are on their way; others are sent later. `heard`:
+      statuses received, by receiver (a query, or the resource that depends on it) and event, with the ids of the
+      notices that wait for the receiver. `hearing`: these notices. `deferred`: by resource, the statuses that its
+      server hears after its load or recover callback has returned. `next_to_hear`: by notice, the statuses of a part
+      that the resource hears after the listeners of the part. `ending`: queries that were taken away and whose holders
+      are still hearing of it.
+    - `statuses`: by resource, how many runs of its status callback have been caused and have not ended. `late`: its
+      own statuses that wait while `window` of them have not. `suspects`: ids of callback runs that wait for their turn,
+      because they run one at a time. `trial`: the one whose turn it is. `refusing`: the ids of requests that are
+      refused for a while, as their load was given up.
+      `doubted`: queries that are lost because their provider is gone for good, whose catalog may still have them, and
+      whose holders are to hear of it. Then they are in `ending`, with True.
+    - `acked`: providers with acknowledgements sent, or to be sent, which a lost link may lose, or their notices.
+    - `agreed`: providers that have no query from before this incarnation which is unknown here: they have listed what
+      we hold there (True), or were never asked before (False). False, too, after such a provider is gone for good.
+    - `touched`: resources whose priority this decision may change, with the priority before; None: nobody held them.
+      `idle`: resources that idle since the timer was set that pauses or unloads them. `rising`: resources to be resumed
+      when their parts are: the parts that have not said so, or None before they were asked.
+      `unsent`: queries whose priority has changed while the provider's link was not reconciled.
+    - `shut`: why this registrar loads nothing any more for others (False), or for itself (True): it is being closed.
 
     Args:
         name: the registrar's name.
         content: the rows on disk. From now on the catalog owns this object.
         epoch: how often the catalog has been opened. Running numbers and resource ids of different epochs differ.
     """
+
+    window = 1000
+    """How many notices of one query are on their way at most, and statuses of one resource to its own server."""
+    max_priority = HIGHEST
+    """The highest priority of a query that this registrar holds (RegistrarConfig.max_priority)."""
+
+    backlog = 100_000
+    """How many notices of one query, or statuses of one resource to its own server, wait here before older ones go."""
 
     def __init__(self, name: str, content: Content | None = None, epoch: int = 1) -> None:
         self.name = name
@@ -137,12 +172,15 @@ class Catalog:
         self.peers: dict[str, Peer] = self.tables["peers"]
         self.stored_servers: dict[str, StoredServer] = self.tables["stored_servers"]
         self.server_types: dict[str, ServerType] = self.tables["server_types"]
+        self.callback_runs: dict[str, CallbackRun] = self.tables["callback_runs"]
+        self.revocations: dict[str, Revocation] = self.tables["revocations"]
         self._fill_indexes()
         self._index: dict[Table, Callable[[Any, Any], None]] = {
             "resources": self._index_resource,
             "queries": self._index_query,
             "held": self._index_held,
             "notices": self._index_notice,
+            "revocations": self._index_revocation,
         }
         # in memory only
         self.deaths = ""
@@ -153,20 +191,34 @@ class Catalog:
         self.unanswered: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
         self.closings: dict[str, Closing] = {}
+        self.unread: dict[str, str] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}
-        self.told: dict[str, bool] = dict.fromkeys(self.notices, True)
+        self.told: dict[str, bool] = dict.fromkeys(self.notices, False)
+        self.behind: dict[str, int] = {}
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.hearing: dict[str, Hearing] = {}
         self.deferred: dict[str, tuple[StartStatus, ...]] = {}
         self.next_to_hear: dict[str, StartStatus] = {}
         self.listened: set[str] = set()  # queries and server ids with a listener, which may deal with a status
         self.ending: dict[str, bool] = {}
+        self.doubted: dict[str, bool] = {}
         self.acked: dict[str, bool] = {}
+        self.agreed: dict[str, bool] = {}
+        self.touched: dict[str, int | None] = {}
+        self.unsent: dict[str, bool] = {}
+        self.idle: dict[str, bool] = {}
+        self.rising: dict[str, tuple[str, ...] | None] = {}
+        self.shut: dict[bool, Failure] = {}
         self.direct: dict[str, bool] = {}
         self.kept: dict[str, bool] = {}
-        self.fresh: dict[str, bool] = {}
+        self.fresh: dict[str, int] = {}
         self.in_flight: dict[str, Held] = {}
         self.leaving: dict[str, Any] = {}
+        self.statuses: dict[str, int] = {}
+        self.late: dict[str, dict[str, StartStatus]] = {}
+        self.suspects: dict[str, bool] = {}
+        self.trial: dict[str, bool] = {}
+        self.refusing: dict[str, bool] = {}
         self.consumers: dict[str, bool] = {}
         self.unfinished: Undo | None = None  # how to undo the decision that is being applied; None between decisions
         # this Catalog asked for all queries with a greater number, and knows all about them
@@ -175,8 +227,9 @@ class Catalog:
     def _fill_indexes(self) -> None:
         """Build the indexes that set() keeps for each row; one index at a time, as there may be a million rows."""
         self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> resource to join
-        self.unloading: dict[RequestKey, Ids] = {}
+        self.unloading: dict[RequestKey, Ids] = {}  # also those that are revoked: the next of that request waits
         self.queued: dict[RequestKey, Ids] = {}
+        self.resting: dict[str, bool] = {}  # resources that are pausing, paused, or resuming
         self.moving: dict[str, bool] = {}  # resources that are loading, queued, or being unloaded
         loaded, fatal, by_request = LOADED, State.FATAL, self.by_request
         for row in self.resources.values():
@@ -184,9 +237,13 @@ class Catalog:
                 self._index_phase(None, row)
             elif row.state is not fatal:
                 by_request[row.server][row.request] = row.id
+        for revocation in self.revocations.values():
+            self._index_revocation(None, revocation)
         self.by_server = built(map(_server, self.resources.values()), self.resources)
         self.holders = built(map(_resource_id, self.queries.values()), self.queries)  # resource -> queries
         self.by_origin = built(map(_origin, self.queries.values()), self.queries)  # origin -> queries
+        ranked = {id: row for id, row in self.queries.items() if row.priority}
+        self.ranked = built(map(_resource_id, ranked.values()), ranked)  # resource -> queries not of priority 0
         self.outbound = built(map(_registrar, self.held.values()), self.held)  # provider -> held
         parts = {id: row for id, row in self.held.items() if row.parent and row.hold is not OWED}
         self.parts = built(map(_parent, parts.values()), parts)  # resource -> held, without owed ones
@@ -245,6 +302,23 @@ class Catalog:
         """Return the queries on a resource."""
         return [self.queries[id] for id in self.holders.get(resource_id, ())]
 
+    def priority_of(self, resource_id: str) -> int:
+        """Return the priority of a resource: the highest of its queries; STANDBY if nobody holds it."""
+        if resource_id in self.ranked:
+            return max(self.queries[id].priority for id in self.holders[resource_id])
+        return 0 if resource_id in self.holders else STANDBY
+
+    def inherited(self, resource_id: str) -> int:
+        """Return the priority that the parts of a resource inherit.
+
+        A resource that its server pauses needs its parts until it is paused, and before it is resumed.
+        """
+        priority = min(self.priority_of(resource_id), self.max_priority)
+        if priority <= STANDBY and (row := self.resources.get(resource_id)) and row.phase is not PAUSED:
+            server = self.servers.get(row.server)
+            return LOWEST if server is not None and server.pauses else priority
+        return priority
+
     def holder_of(self, resource_id: str) -> str:
         """Return the registrar whose query on a resource is the oldest; "" if nobody holds it."""
         for query_id in self.holders.get(resource_id, ()):
@@ -253,7 +327,12 @@ class Catalog:
 
     def needs(self, provider: str) -> bool:
         """Return whether a link is needed: the provider may have queries of ours, or is to get an acknowledgement."""
-        return provider in self.outbound or provider in self.acked or (self.epoch > 1 and provider in self.peers)
+        unknown = provider in self.peers and (self.epoch > 1 or provider not in self.agreed)
+        return unknown or provider in self.outbound or provider in self.acked
+
+    def last_number(self) -> int:
+        """Return a running number that no query of this incarnation exceeds, and every one of the next does."""
+        return max(self.since, after_epoch(self.epoch))
 
     def set(self, table: Table, id: str, new: Any, undo: Undo | None = None) -> None:
         """Put a row into memory, or remove it (None); note the old one in `undo` first."""
@@ -305,6 +384,8 @@ class Catalog:
                 del self.by_request[old.server][old.request]
                 if not self.by_request[old.server]:
                     del self.by_request[old.server]
+            if old.phase in RESTING:
+                self.resting.pop(old.id, None)
             if old.phase is UNLOADING:
                 discard(self.unloading, key, old.id)
             elif old.phase is QUEUED:
@@ -312,6 +393,8 @@ class Catalog:
         if new is not None:
             if new.phase in _MOVING:
                 self.moving[new.id] = True
+            if new.phase in RESTING:
+                self.resting[new.id] = True
             if new.phase in _JOINABLE and new.state is not State.FATAL:
                 self.by_request[new.server][new.request] = new.id
             elif new.phase is UNLOADING:
@@ -319,13 +402,22 @@ class Catalog:
             if new.phase is QUEUED:
                 add(self.queued, (new.server, new.request), new.id)
 
+    def _index_revocation(self, old: Revocation | None, new: Revocation | None) -> None:
+        row = new or old
+        if row is not None and (resource := self.resources.get(row.id)) is not None:
+            (discard if new is None else add)(self.unloading, (resource.server, resource.request), resource.id)
+
     def _index_query(self, old: Query | None, new: Query | None) -> None:
         if old is not None:
             discard(self.holders, old.resource_id, old.id)
             discard(self.by_origin, old.origin, old.id)
+            if old.priority:
+                discard(self.ranked, old.resource_id, old.id)
         if new is not None:
             add(self.holders, new.resource_id, new.id)
             add(self.by_origin, new.origin, new.id)
+            if new.priority:
+                add(self.ranked, new.resource_id, new.id)
 
     def _index_held(self, old: Held | None, new: Held | None) -> None:
         if new is not None and new.hold is not HELD:
@@ -356,6 +448,14 @@ class Catalog:
         elif new is not None:
             add(self.notices_to, new.origin, new.id)
             add(self.notices_on, new.query_id, new.id)
+
+
+def after_epoch(epoch: int) -> int:
+    """Return a number that is greater than the running numbers of this epoch, and not greater than those of the next.
+
+    A running number has its epoch in its upper bits.
+    """
+    return (epoch + 1) << _EPOCH_BITS
 
 
 def _stands_there(old: Held, new: Held) -> bool:

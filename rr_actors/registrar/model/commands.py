@@ -10,8 +10,9 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.catalog import Server
-from rr_actors.registrar.model.messages import Failure, FetchedQuery
+from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Change, Notice, State
 
 
@@ -21,6 +22,17 @@ class Command(msgspec.Struct, frozen=True):
 
 class BeginAgain(Command, frozen=True):
     """The registrar has opened its catalog. This is the first command, before any server is registered."""
+
+
+class BeginClosing(Command, frozen=True):
+    """The registrar is being closed for good: it loads nothing any more for others; `own`: nor for itself."""
+
+    failure: Failure
+    own: bool = False
+
+
+class EndClosing(Command, frozen=True):
+    """The registrar is closed for good: what it served and held is released, as far as that was possible."""
 
 
 class SetRows(Command, frozen=True):
@@ -40,11 +52,25 @@ class RefuseLoad(Command, frozen=True):
     failure: Failure
 
 
+class Reread(msgspec.Struct, frozen=True):
+    """What today's types make of a stored resource: its request and response today, or why they do not fit."""
+
+    resource_id: str
+    request: bytes
+    response: bytes | None
+    misfit: str = ""
+
+
 class Register(Command, frozen=True):
-    """A server is registered; it serves its earlier resources again."""
+    """A server is registered; it serves its earlier resources again.
+
+    `reread`: those that an earlier version stored. `digest`: of today's types, to which all others fit (rows.types_id).
+    """
 
     server: Server
     event: str
+    reread: tuple[Reread, ...] = ()
+    digest: bytes = b""
 
 
 class Unregister(Command, frozen=True):
@@ -112,8 +138,67 @@ class RecoverErred(Command, frozen=True):
     event: str
 
 
+class RecoverOverdue(Command, frozen=True):
+    """The recover callback has run for longer than the server's recover_timeout_s."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+
+
+class PauseDone(Command, frozen=True):
+    """The pause callback returned."""
+
+    resource_id: str
+    attempt: int
+
+
+class PauseErred(Command, frozen=True):
+    """The pause callback raised."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+
+
+class ResumeDone(Command, frozen=True):
+    """The resource runs again; `response` is None if it has not changed."""
+
+    resource_id: str
+    attempt: int
+    response: bytes | None
+    event: str
+
+
+class ResumeErred(Command, frozen=True):
+    """The resume callback raised: the resource is lost."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+    event: str
+
+
+class BeginTrial(Command, frozen=True):
+    """It is this callback's turn to run, alone among those in whose runs the process has died."""
+
+    run_id: str
+
+
+class TrialOver(Command, frozen=True):
+    """The callback has run for long enough: it is the next one's turn."""
+
+    run_id: str
+
+
+class RefusalOver(Command, frozen=True):
+    """The time is over for which a request is refused, or remembered, because its load was given up."""
+
+    run_id: str
+
+
 class LingerOver(Command, frozen=True):
-    """The time is over for which an unheld resource is kept warm."""
+    """The time is over for which an idle resource is kept running, or an unheld one is kept."""
 
     resource_id: str
 
@@ -161,12 +246,36 @@ class Swap(Command, frozen=True):
 
 
 class ForceUnload(Command, frozen=True):
-    """Unload a resource that others may hold; its holders hear `why`. `target`: its id, or that of a query on it."""
+    """Unload a resource that others may hold; its holders hear `why`. `target`: its id, or that of a query on it.
+
+    `clears`: a resource whose unload callback is not run any more is removed without it.
+    """
 
     target: str
     event: str
     ticket: Any
     why: str = "unloaded by its owner"
+    clears: bool = False
+
+
+class Revoke(Command, frozen=True):
+    """Have all holders let a resource go, the highest first. `target`: its id, or that of a query on it.
+
+    What still holds it after `grace_ms` loses it, as by ForceUnload.
+    """
+
+    target: str
+    event: str
+    why: str
+    grace_ms: int
+    ticket: Any
+
+
+class GraceOver(Command, frozen=True):
+    """The time is over in which a revoked resource's holders could let it go."""
+
+    resource_id: str
+    event: str
 
 
 # -- as a consumer ---------------------------------------------------------------------------------------------------
@@ -175,7 +284,7 @@ class ForceUnload(Command, frozen=True):
 class Ask(Command, frozen=True, gc=False):
     """Load from a provider's server, for a resource of this registrar (`parent`, "" for none).
 
-    `seq`: its running number in the order of loads.
+    `seq`: its running number in the order of loads. `own`: the caller gave a `priority`; else a part inherits it.
     """
 
     query_id: str
@@ -184,14 +293,18 @@ class Ask(Command, frozen=True, gc=False):
     request: bytes
     parent: str
     seq: int
+    priority: int = 0
+    own: bool = False
 
 
 class Got(Command, frozen=True, gc=False):
-    """A provider has answered a load in flight, on the connection of the caller's thread."""
+    """A provider has answered a load in flight, on the connection of the caller's thread; `run` is its epoch."""
 
     query_id: str
     resource_id: str
     response: bytes
+    state: State = State.OK
+    run: int = 0
 
 
 class SendAgain(Command, frozen=True):
@@ -217,6 +330,14 @@ class Release(Command, frozen=True, gc=False):
     query_id: str
 
 
+class SetPriority(Command, frozen=True):
+    """Give a query of this registrar a priority of its own."""
+
+    query_id: str
+    priority: int
+    ticket: Any
+
+
 class AddInFlight(Command, frozen=True):
     """Add the row of every load in flight, because somebody is about to read all rows."""
 
@@ -229,11 +350,15 @@ class ReleaseOverdue(Command, frozen=True):
 
 
 class Heard(Command, frozen=True, gc=False):
-    """All listeners of a query have heard what Hear told them. `handled`: one of them has dealt with it."""
+    """All listeners of a query have heard what Hear told them. `handled`: one of them has dealt with it.
+
+    `revoked`: it says that the resource is revoked.
+    """
 
     query_id: str
     event: str
     handled: bool = False
+    revoked: bool = False
 
 
 class StatusDone(Command, frozen=True):
@@ -250,7 +375,7 @@ class StatusDone(Command, frozen=True):
 class Reconcile(Command, frozen=True):
     """A link to a provider is up, with the provider's list of our queries; those in `same` agree, and are not listed.
 
-    `link` is the number of the Fetch that opened the link.
+    `link` is the number of the Fetch that opened the link, `run` the provider's epoch, `notices` whether some follow.
     """
 
     registrar: str
@@ -258,6 +383,8 @@ class Reconcile(Command, frozen=True):
     event: str
     same: list[tuple[int, int]] = []
     link: int = 0
+    run: int = 0
+    notices: bool = False
 
 
 class ConsumerLost(Command, frozen=True):
@@ -273,9 +400,14 @@ class LinkLost(Command, frozen=True):
 
 
 class PeerGone(Command, frozen=True):
-    """A provider cannot be reached. `final`: it is gone for good, and with it every query that we held there."""
+    """A provider cannot be reached. `final`: it is gone for good, and with it every query that we held there.
+
+    `empty`: no catalog of it is left, or one without anything. Otherwise its catalog may still have these queries, and
+    it may be started again under this name.
+    """
 
     registrar: str
     failure: Failure
     final: bool
     event: str
+    empty: bool = False

@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import msgspec
 
-from rr_actors.registrar.model.messages import Failure, Message
+from rr_actors.base.values.failure import Failure
+from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import Held, Notice, Resource
 
 
@@ -55,6 +56,18 @@ class StartRecover(Effect, frozen=True):
 
     resource: Resource
     reload: bool
+
+
+class StartPause(Effect, frozen=True):
+    """Run the pause callback."""
+
+    resource: Resource
+
+
+class StartResume(Effect, frozen=True):
+    """Run the resume callback."""
+
+    resource: Resource
 
 
 class StartStatus(Effect, frozen=True):
@@ -105,6 +118,20 @@ class Hear(Effect, frozen=True):
     repeated: bool
 
 
+class FellBehind(Effect, frozen=True):
+    """Say that a consumer is slow with the statuses of one query: `on_way` wait there, and newer ones wait here.
+
+    `dropped`: how many of those that waited here are dropped. Without a query it is the server of the resource itself
+    that is slow.
+    """
+
+    origin: str
+    resource_id: str
+    query_id: str
+    on_way: int
+    dropped: int = 0
+
+
 class Answer(Effect, frozen=True):
     """Answer a call of the owner."""
 
@@ -112,13 +139,37 @@ class Answer(Effect, frozen=True):
     failure: Failure | None
 
 
-Happening = Literal["loaded", "load_failed", "unloaded", "unload_failed", "status"]
+class Died(Effect, frozen=True):
+    """The process before this one died while callbacks of resources ran, and not of something else.
+
+    `runs` names them; `given_up` has a sentence for each callback that will not run again.
+    """
+
+    runs: tuple[str, ...]
+    given_up: tuple[str, ...]
+
+
+Happening = Literal[
+    "loaded",
+    "load_failed",
+    "unloaded",
+    "unload_failed",
+    "status",
+    "priority",
+    "revoked",
+    "paused",
+    "pause_failed",
+    "resumed",
+]
 
 
 class Happened(Effect, frozen=True):
-    """Tell the watchers of the system what has happened to a resource: "loaded", "unloaded", "status" ..."""
+    """Tell the watchers of the system what has happened to a resource: "loaded", "unloaded", "status" ...
+
+    `notice`: the status that the resource has got.
+    """
 
     what: Happening
-    resource_id: str
-    server: str
+    resource: Resource
     detail: str
+    notice: Notice | None = None

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from rr_actors.base.errors import did_you_mean, shortened, shown
 from rr_actors.base.values.canonical import shown_plain
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.messages import Failure
 from rr_actors.registrar.model.rows import Held, Hold, Resource
 
 
@@ -51,6 +51,11 @@ def no_response_yet(resource: Resource) -> Failure:
     return Failure("UsageError", text)
 
 
+def not_revoked(resource: Resource, what: str) -> Failure:
+    """Return the failure of revoke() for a resource that is not loaded, or is revoked already."""
+    return Failure("UsageError", f"revoke: expected a resource that is loaded, got {resource.id}, which {what}")
+
+
 def not_swapped(catalog: Catalog, resource_id: str, part: str) -> Failure:
     """Return the failure of a swap of a part that its resource does not hold any more."""
     text = f"query {shortened(part)}: resource {resource_id} of {catalog.name!r} does not hold this part any more"
@@ -63,11 +68,77 @@ def overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
     return load_failed(catalog, resource, why, timeout_s=limit_s)
 
 
-def interrupted(catalog: Catalog, resource: Resource) -> Failure:
-    """Return the failure of a load in each of whose attempts the process died."""
+def interrupted(catalog: Catalog, resource: Resource, wait_s: float) -> Failure:
+    """Return the failure of a load in each of whose attempts the process died; `wait_s`: how long it is refused."""
     how = f" (it died of: {catalog.deaths})" if catalog.deaths else ""
-    why = f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again"
+    why = (
+        f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again, and the"
+        f" same request is refused for {wait_s:g} s"
+    )
     return load_failed(catalog, resource, why)
+
+
+def still_refused(catalog: Catalog, server: str, rounds: int, wait_s: float) -> Failure:
+    """Return the failure of a load whose request was given up lately."""
+    origin = f"{catalog.name}/{server}"
+    times = "once" if rounds == 1 else f"{rounds} times"
+    why = (
+        f"given up {times}, as the process died in each attempt to load this request; it is refused for {wait_s:g} s"
+        " from then on, and longer each time"
+    )
+    return Failure("LoadFailed", f"{origin}: {why}", {"server": origin}, [(origin, why)])
+
+
+def not_run_again(catalog: Catalog, resource: Resource, role: str, deaths: int) -> str:
+    """Say that a callback of a resource is not run any more, and what becomes of the resource."""
+    what = f"{catalog.origin_of(resource)}: the process died in each of {deaths} runs of the {role} callback"
+    return f"{what} for resource {resource.id}; it is not run again: {_BECOMES[role].format(id=resource.id)}"
+
+
+_BECOMES = {
+    "recover": "the resource is lost",
+    "reload": "the resource is lost",
+    "pause": "the resource runs on, or is unloaded if nobody holds it",
+    "resume": "the resource is lost",
+    "status": "statuses of the resource go on to its holders without it",
+    "unload": "the resource is kept as unload_failed; `rr-actors unload --force {id}` removes it without the callback",
+}
+
+
+def unload_given_up(catalog: Catalog, resource: Resource, deaths: int) -> Failure:
+    """Return the failure of an unload whose callback is not run any more."""
+    origin = catalog.origin_of(resource)
+    text = not_run_again(catalog, resource, "unload", deaths)
+    return Failure("UnloadFailed", text, {"resource_id": resource.id, "server": origin}, [(origin, text)])
+
+
+def serverless(catalog: Catalog, resource: Resource) -> Failure:
+    """Return the failure of an unload of a resource whose server is not registered."""
+    origin = catalog.origin_of(resource)
+    text = f"{origin}: resource {resource.id} {waits_for_server(catalog, resource)}; the release stays owed"
+    return Failure("Unavailable", text)
+
+
+def waits_for_server(catalog: Catalog, resource: Resource) -> str:
+    """Say that a resource cannot be unloaded before its server is registered, and what else clears it."""
+    origin = catalog.origin_of(resource)
+    clears = f"register it, or clear it by `rr-actors unload --force {origin}`"
+    return f"{WAITS_FOR_SERVER} {origin!r}, which is not registered: {clears}"
+
+
+WAITS_FOR_SERVER = "waits for its server"
+
+
+def unread(catalog: Catalog, resource: Resource) -> str:
+    """Say that a resource is lost, as it does not fit the types of today."""
+    why = catalog.unread[resource.id]
+    return f"lost: {why}; its unload callback does not run, as it cannot have its request and response"
+
+
+def recover_overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
+    """Return the failure of a recovery whose callback takes too long."""
+    why = f"lost: the recover callback took longer than recover_timeout_s={limit_s:g} s"
+    return load_failed(catalog, resource, why, timeout_s=limit_s)
 
 
 def load_failed(catalog: Catalog, resource: Resource, why: str, **details: float) -> Failure:

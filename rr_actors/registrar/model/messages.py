@@ -4,34 +4,18 @@ Every message is a frozen msgspec Struct, encoded as a MessagePack array behind 
 peer's bytes can make no other objects. Request and response bytes inside are canonical MessagePack
 (base/values/canonical.py).
 
-Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded,
-LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed. The sender of a request sends it again,
-with the same id, until it is answered. So every message may arrive twice (docs/consistency.md says what the second one
-does). A Fetch with `resume` opens a link, and comes once on each.
+Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone, Reprioritise. Provider to consumer:
+Loaded, LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed, Reprioritised. The sender of a
+request sends it again, with the same id, until it is answered. So every message may arrive twice (docs/consistency.md
+says what the second one does). A Fetch with `resume` opens a link, and comes once on each.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
-from typing import Any, cast
-
 import msgspec
 
-from rr_actors.base import errors
-from rr_actors.registrar.model.rows import Int64, Notice
-
-PROTOCOL = 2
-"""Version of the messages; peers of another version are refused at the handshake."""
-
-
-class Failure(msgspec.Struct, frozen=True, array_like=True):
-    """An error as it is sent: the name of its class in errors.py, its text and attributes, and the frames it passed."""
-
-    kind: str
-    message: str
-    details: dict[str, Any] = {}
-    trace: list[tuple[str, str]] = []
+from rr_actors.base.values.failure import Failure
+from rr_actors.registrar.model.rows import Int64, Notice, State
 
 
 class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
@@ -44,18 +28,22 @@ class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
     parent: str
     attempt: Int64
     seq: Int64
+    priority: Int64 = 0
+    own: bool = False
 
 
 class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
     """The query is held, and is on disk in the provider's catalog.
 
-    `types`: the checksum (CRC-32) of the types in Described with which the response is to be read.
+    `types`: the checksum (CRC-32) of the types in Described with which the response is to be read. `state`: that of
+    the resource's last status.
     """
 
     query_id: str
     resource_id: str
     response: bytes
     types: int = 0
+    state: State = State.OK
 
 
 class LoadRefused(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -89,7 +77,7 @@ class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
     """List all queries that `origin` holds here; with `resume`, then send the notices it has not dealt with.
 
     `number` comes back in the answer, because the answer to a dead incarnation may reach the next one. `spans`: the
-    digests of the queries that `origin` knows (registrar/core/digests.py). Then the answer lists only the queries that
+    digests of the queries that `origin` knows (registrar/model/digests.py). Then the answer lists only the queries that
     differ.
     """
 
@@ -111,18 +99,22 @@ class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
     attempt: Int64
     seq: Int64
     state: str
+    priority: Int64 = 0
+    own: bool = False
 
 
 class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
     """The queries that the receiver holds at the sender at that moment; with `more`, other parts of the list follow.
 
-    `same`: the ranges of running numbers in which nothing differs from Fetch, and which are not listed.
+    `same`: the ranges of running numbers in which nothing differs from Fetch, and which are not listed. `notices`: some
+    follow, perhaps of queries that the receiver does not know.
     """
 
     queries: list[FetchedQuery]
     more: bool = False
     number: int = 0
     same: list[tuple[int, int]] = []
+    notices: bool = False
 
 
 class Describe(msgspec.Struct, frozen=True, array_like=True, tag=9):
@@ -180,6 +172,21 @@ class Progressed(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=15)
     text: str
 
 
+class Reprioritise(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=16):
+    """The query has this priority now."""
+
+    query_id: str
+    origin: str
+    priority: Int64
+
+
+class Reprioritised(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=17):
+    """The query's row has this priority, on disk. If that is not what the holder wants, it sends that again."""
+
+    query_id: str
+    priority: Int64
+
+
 def retired(name: str) -> str:
     """Return the origin of a link on which the registrar `name` is said to be gone; no registrar's name has a colon."""
     return f"{name}:retired"
@@ -201,97 +208,6 @@ Message = (
     | Probe
     | Gone
     | Progressed
+    | Reprioritise
+    | Reprioritised
 )
-
-
-_LONGEST_TEXT = 10_000
-_LONGEST_TRACE = 30_000
-_NO_DETAILS = ("self", "details", "trace")  # an error with such details could not be pickled or sent on
-
-
-def failure_of(error: BaseException, origin: str | None = None) -> Failure:
-    """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace.
-
-    The frames of its cause or context come first, as these errors have come the same way. An error of a user's class
-    may be unusual: its `trace` or `details` may be of another kind, say. Then only its text is used. Of a very long
-    trace only the first frames are kept, as the message could be too long for a frame of the wire.
-    """
-    text = readable(errors.text_of(error))
-    frames = [] if origin is None else [(origin, text)]
-    try:
-        trace = [] if origin is None else _trace_of(error)
-        if not isinstance(error, errors.RrError):
-            return Failure("RrError", text, {}, _first_of(trace + frames))
-        trace = trace or _own_trace(error)
-        details = {k: _readable(v) for k, v in error.details.items() if k != "trace" and _is_plain(v)}
-        return Failure(type(error).__name__, readable(error.message), details, _first_of(trace + frames))
-    except Exception:
-        return Failure("RrError", text, {}, frames)
-
-
-def _first_of(frames: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    lengths = itertools.accumulate(len(origin) + len(text) for origin, text in frames)
-    return [frame for frame, length in zip(frames, lengths, strict=True) if length <= _LONGEST_TRACE]
-
-
-def _own_trace(error: BaseException) -> list[tuple[str, str]]:
-    return [(f.origin, f.message) for f in getattr(error, "trace", ())] if isinstance(error, errors.RrError) else []
-
-
-def _trace_of(error: BaseException) -> list[tuple[str, str]]:
-    """Return the frames of an error, or of the nearest one behind it, in the order in which Python shows them."""
-    left: list[BaseException | None] = [error]
-    seen: set[int] = set()
-    while left:
-        error_now = left.pop()
-        if error_now is None or id(error_now) in seen:
-            continue
-        seen.add(id(error_now))
-        if trace := _own_trace(error_now):
-            return trace
-        left.append(None if error_now.__suppress_context__ else error_now.__context__)
-        left.append(error_now.__cause__)
-        if isinstance(error_now, BaseExceptionGroup):  # from an asyncio.TaskGroup, say
-            left.extend(reversed(cast("BaseExceptionGroup[BaseException]", error_now).exceptions))
-    return []
-
-
-def readable(text: str) -> str:
-    """Return a text for people in a form that can be sent and stored; half a character becomes its code.
-
-    File names may have such half characters. A very long text is cut: otherwise a frame could be too long, and would
-    never be sent.
-    """
-    text = errors.exact_text(text)
-    if len(text) > _LONGEST_TEXT:
-        text = f"{text[: _LONGEST_TEXT - 50]} ... ({len(text) - _LONGEST_TEXT + 50} characters more)"
-    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()
-
-
-def error_of(failure: Failure) -> errors.RrError:
-    """Return the error that a Failure describes; one of a class that this version does not know becomes RrError."""
-    cls = getattr(errors, failure.kind, errors.RrError)
-    if not (isinstance(cls, type) and issubclass(cls, errors.RrError)):
-        cls = errors.RrError
-    details: dict[str, Any] = {}
-    for key, value in failure.details.items():
-        if key.isidentifier() and key not in _NO_DETAILS and not hasattr(errors.RrError, key):  # a peer's
-            details[key] = tuple(cast("Sequence[object]", value)) if isinstance(value, list) else value
-    if failure.trace or issubclass(cls, (errors.LoadFailed, errors.UnloadFailed)):
-        details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)
-    error = cls(failure.message, **details)
-    if lines := details.get("traceback"):
-        error.add_note(f"raised in {failure.trace[0][0] if failure.trace else 'a callback'}:\n{lines}")
-    return error
-
-
-def _readable(value: object) -> object:
-    if isinstance(value, (list, tuple)):
-        return [_readable(item) for item in cast("Sequence[object]", value)]
-    return readable(value) if isinstance(value, str) else value
-
-
-def _is_plain(value: object) -> bool:
-    if isinstance(value, (list, tuple)):
-        return all(_is_plain(item) for item in cast("Sequence[object]", value))
-    return value is None or isinstance(value, (str, int, float, bool))

@@ -10,10 +10,11 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import shortened
+from rr_actors.base.errors import readable, shortened
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model import messages as m
 from rr_actors.registrar.model.messages import Message
+from rr_actors.registrar.model.rows import shown_priority
 
 _LONG = 1000  # the bytes of a request that is shown, at most
 
@@ -70,9 +71,11 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
         case m.Noticed():
             notice = message.notice
             text = f"{notice.state} {notice.message}".rstrip()
-            return Entry(*where, notice.query_id, notice.resource_id, detail=m.readable(shortened(text)))
+            return Entry(*where, notice.query_id, notice.resource_id, detail=readable(shortened(text)))
         case m.Probe():
             return Entry(*where, message.query_id, detail=shortened(" > ".join(message.ring)))
+        case m.Reprioritise() | m.Reprioritised():
+            return Entry(*where, message.query_id, detail=shown_priority(message.priority))
         case m.Gone():
             return Entry(*where, detail=message.origin)
         case _:

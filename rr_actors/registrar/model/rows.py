@@ -27,13 +27,19 @@ class State(enum.StrEnum):
 
 
 class Phase(enum.StrEnum):
-    """The phase of a resource's life. A QUEUED one waits until an UNLOADING one of the same request is gone."""
+    """The phase of a resource's life. A QUEUED one waits until an UNLOADING one of the same request is gone.
+
+    A server that pauses its idle resources takes them LOADED -> PAUSING -> PAUSED -> RESUMING -> LOADED.
+    """
 
     QUEUED = "queued"
     LOADING = "loading"
     LOADED = "loaded"
     UNLOADING = "unloading"
     UNLOAD_FAILED = "unload_failed"
+    PAUSING = "pausing"
+    PAUSED = "paused"
+    RESUMING = "resuming"
 
 
 class Hold(enum.StrEnum):
@@ -46,8 +52,27 @@ class Hold(enum.StrEnum):
 
 # To look up an enum's member takes 0.1 µs before Python 3.12. The code of each load and unload uses these names.
 OK = State.OK
-QUEUED, LOADING, LOADED, UNLOADING, UNLOAD_FAILED = Phase
+QUEUED, LOADING, LOADED, UNLOADING, UNLOAD_FAILED, PAUSING, PAUSED, RESUMING = Phase
 PENDING, HELD, OWED = Hold
+
+
+RESTING = (PAUSING, PAUSED, RESUMING)
+"""The phases of a loaded resource that may not be running."""
+
+LOWEST, HIGHEST = -1000, 1000
+"""The priorities that a load may be given."""
+STANDBY = LOWEST - 1
+"""The priority of a query on standby, and of a resource that nobody holds: they have none (None, for users)."""
+
+
+def priority_of(number: int) -> int | None:
+    """Return a row's priority as users have it: None for STANDBY."""
+    return None if number <= STANDBY else number
+
+
+def shown_priority(priority: int) -> str:
+    """Return the words for a priority: "priority 5", or "standby"."""
+    return "standby" if priority <= STANDBY else f"priority {priority}"
 
 
 NOT_BEGUN = -1
@@ -78,7 +103,8 @@ class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One hold on a resource of this registrar, by `origin` (a registrar's name).
 
     `parent` is the origin's resource that depends on it ("" for none), and `attempt` that resource's attempt when it
-    asked. `seq` is the origin's running number; releases go newest first by it.
+    asked. `seq` is the origin's running number; releases go newest first by it. `priority` is the last that the origin
+    has sent; `own`: the load was given one, so that the query does not inherit that of `parent`.
     """
 
     id: str
@@ -87,12 +113,17 @@ class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
     parent: str
     attempt: Int64
     seq: Int64
+    priority: Int64 = 0
+    own: bool = False
 
 
 class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One query of this registrar at a provider, as this side knows it; its server is "`registrar`/`server`".
 
     The provider's Query row can rebuild it, except while it is OWED: only this side knows of the release.
+
+    `priority` is what the provider is to have, too. While the row is PENDING, it is that of the Load. Without `own`, a
+    query with a `parent` inherits that resource's priority.
     """
 
     id: str
@@ -106,6 +137,8 @@ class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
     seq: Int64
     hold: Hold
     state: State
+    priority: Int64 = 0
+    own: bool = False
 
 
 class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -113,7 +146,7 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
     `event` is the same on all ways of the status through the graph, and `source` is the server where it began.
     `released`: the provider took the query away (forced unload). `response`: a new response of the resource (late
-    response).
+    response). `reason`: REVOKED, or "" for an ordinary status; then the resource is unloaded by force in `grace_ms`.
 
     A notice without `origin` and `query_id` is for the server of the resource itself: its status callback runs first.
     It is dropped in the commit that adds the notices for the holders, or when the callback has dealt with the status.
@@ -129,6 +162,17 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
     source: str
     released: bool = False
     response: bytes | None = None
+    reason: str = ""
+    grace_ms: Int64 = 0
+
+
+REVOKED = "revoked"
+"""Notice.reason of a resource whose holders are to let it go."""
+
+
+def is_revocation(notice: Notice) -> bool:
+    """Return whether the notice asks its holder to let the resource go, and has not taken it away yet."""
+    return notice.reason == REVOKED and not notice.released
 
 
 def is_own(notice: Notice) -> bool:
@@ -137,9 +181,13 @@ def is_own(notice: Notice) -> bool:
 
 
 class Peer(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """A registrar that this one has asked for something: after a crash its queries are looked for there."""
+    """A registrar that this one has asked for something: after a crash its queries are looked for there.
+
+    `released`: queries with this running number or a smaller one are not wanted, as this registrar was closed since.
+    """
 
     id: str
+    released: Int64 = 0
 
 
 class StoredServer(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -150,14 +198,53 @@ class StoredServer(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class ServerType(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """Request and response type of a provider's server (id "registrar/server"), cloudpickled, to decode its values."""
+    """Request and response type of a provider's server (id "registrar/server"), cloudpickled, to decode its values.
+
+    For a registrar's own server (types_id) it has a digest of the types that all stored values were read with.
+    """
 
     id: str
     blob: bytes
 
 
-Row = Resource | Query | Held | Notice | Peer | StoredServer | ServerType
-Table = Literal["resources", "queries", "held", "notices", "peers", "stored_servers", "server_types"]
+def types_id(server: str) -> str:
+    """Return the id of the ServerType of a registrar's own server."""
+    return f"types:{server}"
+
+
+class CallbackRun(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """The deaths of processes in runs of one callback of a resource, or of all attempts of one request.
+
+    Its id is "role:resource id". `begun`: a run has begun, and has not ended. It is on disk before the callback runs,
+    except in two cases: the rows of a load and of a first unload say that themselves, by their phase. The row goes when
+    a run ends. After too many deaths (callback_runs.ATTEMPTS) it stays with the resource: the callback runs no more.
+
+    With the role "request", the id goes on with a server and a digest of a request, and `deaths` counts how often its
+    load was given up.
+    """
+
+    id: str
+    deaths: Int64 = 0
+    begun: bool = False
+
+
+class Revocation(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """The resource of this id is revoked: no new request joins it, and in `grace_ms` it is unloaded by force.
+
+    `event` and `why` are those of the status that its holders hear. The row goes with the resource, or when its unload
+    fails. A crash begins the grace again.
+    """
+
+    id: str
+    event: str
+    why: str
+    grace_ms: Int64
+
+
+Row = Resource | Query | Held | Notice | Peer | StoredServer | ServerType | CallbackRun | Revocation
+Table = Literal[
+    "resources", "queries", "held", "notices", "peers", "stored_servers", "server_types", "callback_runs", "revocations"
+]
 
 TABLES: dict[Table, type[Row]] = {
     "resources": Resource,
@@ -167,6 +254,8 @@ TABLES: dict[Table, type[Row]] = {
     "peers": Peer,
     "stored_servers": StoredServer,
     "server_types": ServerType,
+    "callback_runs": CallbackRun,
+    "revocations": Revocation,
 }
 TABLE_OF: dict[type[Row], Table] = {cls: table for table, cls in TABLES.items()}
 

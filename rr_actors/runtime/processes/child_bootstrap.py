@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import gc
 import importlib
 import logging
 import multiprocessing.forkserver
 import os
+import select
 import signal
 import socket
 import sys
@@ -22,10 +24,12 @@ import traceback
 import weakref
 from collections.abc import Callable, Sequence
 from multiprocessing import resource_tracker, util
+from multiprocessing.reduction import ForkingPickler
 from types import TracebackType
 from typing import Any, NoReturn
 
-from rr_actors.base.pickling import CUT_OFF
+from rr_actors.base import pickling
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime import garbage, interpreter
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, call_by_name
@@ -37,16 +41,23 @@ _run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
 _clear_exit_handlers: Callable[[], None] = vars(atexit)["_clear"]
 _end_multiprocessing: Callable[[], None] = vars(util)["_exit_function"]
 _FINALIZERS: Any = weakref.finalize
+_serve_one: Callable[..., int] = vars(multiprocessing.forkserver)["_serve_one"]
 
 _LEAVE_GRACE_S = 2.0
 _AT_EXIT_S = 5.0
 """The longest time for the handlers that were registered with atexit."""
+_REQUEST_S = 5.0  # the longest wait for a request that is connected already
+_RETRY_S = 0.02  # before the next attempt to accept a connection
+_FDS = 16  # more descriptors than a request has
+_SAY_WHY = "rr_actors.supervision.child_main:could_not_begin"
 
 
 def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int, family: int) -> NoReturn:
     """Run a child process from its first step to its end, on its main thread."""
     code = 1
     sys.excepthook = _Hook.before
+    control, life = _SERVER._inherited_fds
+    end = socket.socket(fileno=control)
     try:
         os.setpgid(0, 0)
         lifeline.mark(family)
@@ -56,17 +67,29 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
         signal.signal(signal.SIGINT, _ignore)
         os.environ.clear()
         os.environ.update(environment)
-        control, life = _SERVER._inherited_fds
         lifeline.hold(life, parent_pid)
         os.close(_SERVER._forkserver_alive_fd)  # /dev/null here: the server's launcher has the real one
         _forget_false_tracker()
-        code = call_by_name(entry, Inherited(name, payload, socket.socket(fileno=control)))
+        pickling.adopt_main()
+        ForkingPickler.reducer_override = pickling.of_main_by_value
+        code = call_by_name(entry, Inherited(name, payload, end))
     except SystemExit as left:
         code = left.code if isinstance(left.code, int) else int(left.code is not None)
-    except BaseException:
-        traceback.print_exc()
+    except BaseException as error:
+        if not (_say_why(end, error) and wanted_by(error)):
+            traceback.print_exc()
     finally:
         leave(code)
+
+
+def _say_why(control: socket.socket, error: BaseException) -> bool:
+    """Tell the parent why this child cannot begin. Return False if that is not possible any more."""
+    if isinstance(error, pickling.CUT_OFF) or control.fileno() < 0:
+        return False
+    with contextlib.suppress(Exception):
+        call_by_name(_SAY_WHY, control, error)
+        return True
+    return False
 
 
 class _Hook:
@@ -79,7 +102,7 @@ def _show_unless_cut_off(kind: type[BaseException], error: BaseException, trace:
 
     The sender of that message has ended or given the child up, so a traceback would not help anyone.
     """
-    if not isinstance(error, CUT_OFF):
+    if not isinstance(error, pickling.CUT_OFF):
         _Hook.before(kind, error, trace)
 
 
@@ -100,10 +123,18 @@ def leave(code: int) -> NoReturn:
 
 
 def _in_thread(fn: Callable[[], object], limit_s: float) -> None:
-    """Run fn in a thread, at most `limit_s` seconds: another thread may never release a stream's lock, for example."""
+    """Run fn in a thread, at most `limit_s` seconds: another thread may never release a stream's lock, for example.
+
+    If the machine gives no thread, run it here, without a limit.
+    """
     thread = threading.Thread(target=fn, daemon=True)
-    thread.start()
-    thread.join(limit_s)
+    try:
+        thread.start()
+    except RuntimeError:
+        with contextlib.suppress(Exception):
+            fn()
+    else:
+        thread.join(limit_s)
 
 
 def _ignore(*_: object) -> None:
@@ -123,19 +154,26 @@ def _forget_false_tracker() -> None:
 # -- the fork server's main program ----------------------------------------------------------------------------------
 
 
-def serve(listener: int, alive: int, address: int, preload: Sequence[str], family: int) -> None:
-    """Run a fork server until its launcher closes it or has ended: its main program."""
+def serve(listener: int, alive: int, address: int, errors: int, preload: Sequence[str], family: int) -> None:
+    """Run a fork server until its launcher closes it or has ended: its main program.
+
+    Args:
+        errors: the standard error for later. What is written before is the launcher's, if this server never serves.
+    """
     os.set_inheritable(address, False)  # children have it, but the programs that they start do not
     fork_server.inherited = ForkServer(address, -1, os.getpid())
     lifeline.mark(family)
     signal.signal(signal.SIGINT, _ignore)  # for its children, too, until they reset their signals
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTTOU])  # what it writes to a terminal may not stop it
     gc.freeze()  # the modules, which stay: to collect among them takes a tenth of this start
     for module in preload:
         try:
             importlib.import_module(module)
-        except Exception:
+        except (Exception, SystemExit):
             sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
             traceback.print_exc()
+    interpreter.check_not_patched()
+    _show_errors(errors)
     server = os.getpid()
 
     def clean_up() -> None:
@@ -151,10 +189,126 @@ def serve(listener: int, alive: int, address: int, preload: Sequence[str], famil
     os.register_at_fork(after_in_child=leave_handlers)
     garbage.share()
     _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
-    try:
-        multiprocessing.forkserver.main(listener, alive, [])
-    except SystemExit:  # in the server alone: its children end inside
-        leave(0)  # an orderly end of the interpreter would take 4 ms more, for which System.stop() waits
+    _Forking(listener, alive).run()
+    leave(0)  # an orderly end of the interpreter would take 4 ms more, for which System.stop() waits
+
+
+def _show_errors(errors: int) -> None:
+    """Write what has been said to the standard error `errors`, which this process has from now on."""
+    sys.stderr.flush()
+    with contextlib.suppress(OSError), os.fdopen(os.dup(2), "rb") as said:
+        said.seek(0)
+        os.write(errors, said.read())
+    os.dup2(errors, 2)
+    os.close(errors)
+
+
+class _Forking:
+    """The loop of a fork server: fork a child for each connection, collect the children, and send their exit codes.
+
+    multiprocessing's own loop (multiprocessing.forkserver.main) ends at the first fork that fails. This one answers
+    with the error's number, and goes on.
+    """
+
+    def __init__(self, listener: int, alive: int) -> None:
+        self._listener = socket.socket(fileno=listener)
+        self._alive = alive
+        self._wake, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._own = [alive, self._wake, wake]
+        self._statuses: dict[int, int] = {}  # the pipe for the exit code of each child
+        self._spare = -1  # without a descriptor left, a connection could not even be refused
+        self._signals = {
+            signal.SIGCHLD: signal.signal(signal.SIGCHLD, _ignore),
+            signal.SIGINT: signal.signal(signal.SIGINT, signal.SIG_IGN),
+        }
+        signal.set_wakeup_fd(wake)
+
+    def run(self) -> None:
+        """Serve until the pipe `alive` closes."""
+        ready = select.poll()
+        for fd in (self._listener.fileno(), self._alive, self._wake):
+            ready.register(fd, select.POLLIN)
+        while True:
+            with contextlib.suppress(MemoryError):
+                self._keep_spare()
+                fds = {fd for fd, _ in ready.poll()}
+                if self._alive in fds:
+                    return
+                if self._wake in fds:
+                    os.read(self._wake, 65536)
+                    self._collect()
+                if self._listener.fileno() in fds:
+                    self._serve()
+
+    def _keep_spare(self) -> None:
+        if self._spare < 0:
+            with contextlib.suppress(OSError):
+                self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+
+    def _collect(self) -> None:
+        with contextlib.suppress(ChildProcessError):
+            while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                status = self._statuses.pop(ended[0], -1)
+                if status >= 0:
+                    with contextlib.suppress(BrokenPipeError):  # its parent has ended
+                        os.write(status, fork_server.signed(os.waitstatus_to_exitcode(ended[1])))
+                    os.close(status)
+
+    def _serve(self) -> None:
+        """Answer one connection: with the new process's id, or with an error's number, made negative."""
+        try:
+            client = self._listener.accept()[0]
+        except OSError:  # the connection waits until this process has a descriptor for it
+            if self._spare >= 0:
+                os.close(self._spare)
+                self._spare = -1
+            else:
+                time.sleep(_RETRY_S)
+            return
+        with client:
+            try:
+                answer = self._fork(client)
+            except OSError as error:
+                answer = -(error.errno or errno.EIO)
+            except MemoryError:
+                answer = -errno.ENOMEM
+            with contextlib.suppress(OSError):  # the client has ended
+                client.sendall(fork_server.signed(answer))
+
+    def _fork(self, client: socket.socket) -> int:
+        client.settimeout(_REQUEST_S)
+        _, fds, flags, _ = socket.recv_fds(client, 1, _FDS, socket.MSG_CMSG_CLOEXEC)
+        try:
+            if flags & socket.MSG_CTRUNC:
+                raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+            if not fds:
+                raise ConnectionResetError(errno.ECONNRESET, os.strerror(errno.ECONNRESET))
+            data, status, *inherited = fds
+            pid = os.fork()
+            if pid == 0:
+                self._be_child(client, data, status, inherited)
+            self._statuses[pid] = status
+            fds.remove(status)
+            return pid
+        finally:
+            for fd in fds:
+                os.close(fd)
+
+    def _be_child(self, client: socket.socket, data: int, status: int, inherited: list[int]) -> NoReturn:
+        code = 1
+        try:
+            client.close()
+            self._listener.close()
+            unused = [*self._own, status, *self._statuses.values()]
+            if self._spare >= 0:
+                unused.append(self._spare)
+            code = _serve_one(data, inherited, unused, self._signals)
+        except BaseException as error:
+            if not (_say_why(socket.socket(fileno=inherited[-2]), error) and wanted_by(error)):
+                sys.excepthook(type(error), error, error.__traceback__)
+                sys.stderr.flush()
+        finally:
+            os._exit(code)
 
 
 def _forget_exit_handlers() -> None:

@@ -1,10 +1,10 @@
 """The fork server's client: launch a fork server, ask it for a child, and end it.
 
 A fork server is a small process without threads that has imported the package already; it forks children, collects
-them and reports their exit codes. Its main loop is the standard library's
-(rr_actors/runtime/processes/child_bootstrap.py). The client is this package's own: multiprocessing.forkserver's client
-ties the server to a resource tracker and to this process's default start method. It also does not use the server that a
-child inherits. The parent's __main__ is not run again in the child: all that a child needs travels by value.
+them and reports their exit codes (rr_actors/runtime/processes/child_bootstrap.py). Server and client are this package's
+own: multiprocessing.forkserver's server ends when it cannot fork, and its client ties the server to a resource tracker
+and to this process's default start method, and does not use the server that a child inherits. The parent's __main__ is
+not run again in the child: all that a child needs travels by value.
 """
 
 from __future__ import annotations
@@ -20,12 +20,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib.machinery import PathFinder
 from multiprocessing import process, reduction
 from multiprocessing.context import ForkServerProcess, set_spawning_popen
 from typing import Any
 
 import msgspec
 
+from rr_actors.base.errors import UsageError, readable
+from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes import lifeline
 
 # Private parts of the standard library; the same in Python 3.11, 3.12 and 3.13.
@@ -39,7 +42,11 @@ _ALIKE_BYTES = 1 << 24
 """Some processors take branches of two processes for one branch if they are this far apart, or a multiple of it. Both
 are then predicted wrongly: messages between the two take a third longer on one core (docs/performance.md)."""
 _PLACINGS = 5
-_SIGNED = struct.Struct("q")  # how the standard library's fork server writes process ids and exit codes
+_IN_FROZEN = "--rr-actors-fork-server"
+"""The first argument of a frozen program that is started as a fork server; the code to run is the second."""
+_WORDS = 2_000  # the most characters of a server's last words
+_LONGEST_VARIABLE = 128 * 1024 - 1  # bytes of "name=value" that the kernel gives a program
+_SIGNED = struct.Struct("q")  # process ids, numbers of errors and exit codes
 
 
 class Inherited(msgspec.Struct, frozen=True):
@@ -66,39 +73,54 @@ class ForkServer:
         alive: the write end of a pipe: the server ends when it closes. No descendant of the server has it: one that
             outlived its parent would keep the server alive. -1: another process has it.
         server: the process that was launched here; or the server's id, if this process is its child.
+        words: the standard error of a server that was launched here, until it serves.
     """
 
-    def __init__(self, address: int, alive: int, server: subprocess.Popen[bytes] | int) -> None:
+    def __init__(
+        self, address: int, alive: int, server: subprocess.Popen[bytes] | int, words: io.FileIO | None = None
+    ) -> None:
         self._address = address
         self._alive = alive
         self._server = server
+        self._words = words
+        self.last_words = ""
+        """The end of what a server that never served has written to its standard error, once it is closed."""
         self._has_answered = isinstance(server, int)
 
     @classmethod
-    def launch(cls, preload: Sequence[str], family: int) -> ForkServer:
-        """Start a server that has imported the modules `preload`. Returns at once; the first child waits for it."""
+    def launch(cls, preload: Sequence[str], family: int, directory: str = "") -> ForkServer:
+        """Start a server that has imported the modules `preload`. Returns at once; the first child waits for it.
+
+        Args:
+            directory: for its socket, if no directory for temporary files can be used.
+        """
         with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
             listener = theirs.enter_context(socket.socket(socket.AF_UNIX))
-            address = _bind(listener)
+            address = _bind(listener, directory)
             on_failure.callback(os.close, address)
             listener.listen(512)
             alive_r, alive_w = _pipe(theirs, on_failure)
-            fds = (listener.fileno(), alive_r, address)
+            words = io.FileIO(os.memfd_create("rr-last-words"), "r+")
+            on_failure.callback(words.close)
+            errors = os.dup(2)
+            theirs.callback(os.close, errors)
+            fds = (listener.fileno(), alive_r, address, errors)
             call = (
-                f"{_placed_apart()}; sys.path[:] = {_sys_path()!r}; "
+                f"import sys; sys.path[:] = {_sys_path()!r}; "
                 "from rr_actors.runtime.processes.child_bootstrap import serve; "
-                f"serve({fds[0]}, {fds[1]}, {fds[2]}, {tuple(preload)!r}, {family})"
+                f"serve({fds[0]}, {fds[1]}, {fds[2]}, {fds[3]}, {tuple(preload)!r}, {family})"
             )
-            server = _interpreter(call, fds)
+            server = _interpreter(call, fds, words.fileno())
             on_failure.pop_all()
-        return cls(address, alive_w, server)
+        return cls(address, alive_w, server, words)
 
     def fork(self, fds: Sequence[int], deadline: float) -> Forked:
         """Make a process that inherits `fds`. Blocks until `deadline` (time.monotonic) at most.
 
         Raises:
             TimeoutError: the server has not answered in time.
-            OSError, EOFError: the server does not run.
+            ConnectionError, EOFError: the server does not run.
+            OSError: the server could not fork, or this process lacks descriptors.
         """
         if self._has_answered:
             deadline = min(deadline, time.monotonic() + ANSWER_S)
@@ -111,14 +133,22 @@ class ForkServer:
             with socket.socket(socket.AF_UNIX) as client:
                 client.settimeout(max(0.001, deadline - time.monotonic()))
                 client.connect(f"/proc/self/fd/{self._address}")
-                reduction.sendfds(client, [data_r, status_w, null, null if tracker is None else tracker, *fds])
-            theirs.close()  # otherwise the pipe would not show the death of the server
-            if not lifeline.is_readable(status_r, deadline - time.monotonic()):
-                raise TimeoutError("the fork server did not answer in time")
-            pid = read_signed(status_r)
+                socket.send_fds(client, [b"f"], [data_r, status_w, null, null if tracker is None else tracker, *fds])
+                if not lifeline.is_readable(client.fileno(), deadline - time.monotonic()):
+                    raise TimeoutError("the fork server did not answer in time")
+                pid = read_signed(client.fileno())
+            if pid < 0:
+                raise OSError(-pid, f"the fork server could not fork: {os.strerror(-pid)}")
             on_failure.pop_all()
         self._has_answered = True
+        if self._words is not None:
+            self._words.close()
         return Forked(pid, status_r, data_w)
+
+    @property
+    def pid(self) -> int:
+        """The id of its process."""
+        return self._server if isinstance(self._server, int) else self._server.pid
 
     def is_running(self) -> bool:
         """Return whether the server runs."""
@@ -147,6 +177,11 @@ class ForkServer:
         except subprocess.TimeoutExpired:
             self._server.kill()
             self._server.wait()
+        if self._words is not None and not self._words.closed:
+            self._words.seek(0)
+            said = readable(self._words.readall().decode(errors="replace").strip()[-_WORDS:])
+            self.last_words = "\n".join(filter(None, (_hiding(), said)))
+            self._words.close()
 
 
 def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[int, int]:
@@ -157,25 +192,33 @@ def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[i
     return read, write
 
 
-def _bind(listener: socket.socket) -> int:
+def _bind(listener: socket.socket, directory: str) -> int:
     """Bind the socket, unlink its file, and return a descriptor of that file (O_PATH).
 
     So no file is left, however its processes end, and only processes that have the descriptor can connect. A process
-    that connects can run code in the server. The file is in TMPDIR, as tempfile's are, or in the next usable directory.
+    that connects can run code in the server. The file is in TMPDIR, as tempfile's are, or in the next usable directory;
+    `directory` is the last of them.
     """
     os.fchmod(listener.fileno(), 0o600)  # the file gets the socket's own mode
     failure: OSError | None = None
-    for parent in filter(None, (*map(os.environ.get, ("TMPDIR", "TEMP", "TMP")), "/tmp", "/var/tmp")):
-        file = os.path.join(parent, f"rr-fork-{os.urandom(8).hex()}")
+    for parent in filter(None, (*map(os.environ.get, ("TMPDIR", "TEMP", "TMP")), "/tmp", "/var/tmp", directory)):
         try:
-            listener.bind(file)
-        except OSError as error:  # too long for an address, too
+            at = os.open(parent, os.O_PATH | os.O_DIRECTORY)
+        except OSError as error:
             failure = failure or error
             continue
         try:
-            return os.open(file, os.O_PATH | os.O_NOFOLLOW)
+            file = f"/proc/self/fd/{at}/rr-fork-{os.urandom(8).hex()}"  # a longer path could be no address
+            listener.bind(file)
+            try:
+                return os.open(file, os.O_PATH | os.O_NOFOLLOW)
+            finally:
+                os.unlink(file)
+        except OSError as error:
+            error.filename = parent
+            failure = failure or error
         finally:
-            os.unlink(file)
+            os.close(at)
     raise failure or OSError("no directory for temporary files")
 
 
@@ -183,6 +226,11 @@ def _tracker() -> int | None:
     """Return the descriptor of multiprocessing's resource tracker, if this process has one, without starting one."""
     tracker = sys.modules.get("multiprocessing.resource_tracker")
     return None if tracker is None else vars(tracker)["_resource_tracker"]._fd
+
+
+def signed(number: int) -> bytes:
+    """Return the bytes that read_signed() reads as this number."""
+    return _SIGNED.pack(number)
 
 
 def read_signed(fd: int) -> int:
@@ -196,12 +244,28 @@ def read_signed(fd: int) -> int:
     return _SIGNED.unpack(data)[0]
 
 
-def _interpreter(call: str, fds: Sequence[int]) -> subprocess.Popen[bytes]:
+def _interpreter(call: str, fds: Sequence[int], words: int) -> subprocess.Popen[bytes]:
     spawn = sys.modules.get("multiprocessing.spawn")  # only this module can have another interpreter set
-    executable = sys.executable if spawn is None else os.fsdecode(vars(spawn)["get_executable"]())
-    command = [executable, *_interpreter_flags(), "-c", call]
+    executable = sys.executable if spawn is None else os.fsdecode(vars(spawn)["get_executable"]() or b"")
+    if not executable:
+        raise UsageError(
+            "sys.executable is not set, as in a program with Python built in: name the Python interpreter whose "
+            "packages these are, multiprocessing.set_executable('/usr/bin/python3')"
+        )
+    if not interpreter.is_frozen():
+        command = [executable, *_interpreter_flags(), "-c", f"{_placed_apart()}; {call}"]
+    elif _IN_FROZEN in sys.argv:
+        raise UsageError("this process was to be a fork server: a frozen program must not catch what an import raises")
+    else:
+        command = [executable, _IN_FROZEN, call]  # rr_actors/supervision/frozen.py
+    # The kernel would refuse a longer variable. Children have all, by their launch messages.
+    environment = {
+        name: value for name, value in os.environb.items() if len(name) + len(value) + 1 <= _LONGEST_VARIABLE
+    }
     # A process group of its own, so that a ^C at the terminal reaches the parent alone, which decides.
-    return subprocess.Popen(command, pass_fds=fds, stdin=subprocess.DEVNULL, process_group=0)
+    return subprocess.Popen(
+        command, pass_fds=fds, stdin=subprocess.DEVNULL, stderr=words, process_group=0, env=environment
+    )
 
 
 def _placed_apart() -> str:
@@ -216,6 +280,14 @@ def _placed_apart() -> str:
 
 def _sys_path() -> list[str]:
     return [path or _ORIGINAL_DIR or "" for path in sys.path]
+
+
+def _hiding() -> str:
+    """Name the files that a new interpreter would import in place of modules of the standard library; "" if none."""
+    library = os.path.dirname(os.__file__)
+    specs = (PathFinder.find_spec(name, _sys_path()) for name in sorted(sys.stdlib_module_names))
+    files = [spec.origin for spec in specs if spec and spec.origin and not spec.origin.startswith(library)]
+    return f"these files hide modules of the standard library: {', '.join(files)}" if files else ""
 
 
 inherited: ForkServer | None = None

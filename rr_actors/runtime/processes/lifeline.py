@@ -9,14 +9,13 @@ Descendants outside of the group are found by their mark, and swept. The mark is
 Linux 2.4 uses: the soft limit of RLIMIT_LOCKS. Every descendant inherits it, through fork, setsid, exec with another
 environment, a change of name or of user, and without an open descriptor. Its upper bits are the family: all processes
 of one application. Its lower bits are the owner: the process id of the child to which the descendants belong. When the
-owner is dead, they are killed. A program that is meant to outlive its owner removes the mark, as managers/shim.py does.
+owner is dead, they are killed. A program that is meant to outlive its owner has the mark OUTLIVES, as managers/shim.py.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import logging
 import os
 import resource
 import select
@@ -24,13 +23,18 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 
-logger = logging.getLogger("rr_actors")
+from rr_actors.base.reporting.log import Log
+
+logger = Log("rr_actors")
 
 _LOCKS = 10
 """RLIMIT_LOCKS on every architecture of Linux; Python's resource module has no name for it."""
 _PID_BITS = 22  # the kernel's own limit for process ids
 _FAMILY_BITS = 40  # 62 in all: Python takes a limit for a signed number
+OUTLIVES = 0
+"""The mark of what belongs to an application, and to none of its processes."""
 _ROUNDS = 20
 _LOOK_S = 0.005  # between two checks of a process, if there are no pidfds
 _END_S = 1.0  # the longest wait for the end of a swept process
@@ -53,11 +57,10 @@ def hold(lifeline: int, parent_pid: int) -> None:
 def _watch(lifeline: int, parent_pid: int) -> None:
     poll = select.poll()
     poll.register(lifeline, select.POLLIN)
-    parent = -1
-    with contextlib.suppress(AttributeError, OSError):
-        parent = os.pidfd_open(parent_pid)
-        poll.register(parent, select.POLLIN)
-    if not (hasattr(os, "pidfd_open") and parent < 0):  # if the parent has no pidfd, it is dead already
+    with contextlib.suppress(ProcessLookupError):  # it is dead already
+        parent = _pidfd(parent_pid)
+        if parent >= 0:
+            poll.register(parent, select.POLLIN)
         poll.poll()
     with contextlib.suppress(OSError):
         os.killpg(os.getpid(), signal.SIGKILL)
@@ -73,12 +76,11 @@ def kill_group(leader: int) -> None:
 def signal_if(pid: int, number: int, is_meant: Callable[[], bool]) -> bool:
     """Send a signal to a process if `is_meant()` is true. Return whether it was sent.
 
-    If Python has pidfds, the signal never goes to a later process with the same id.
+    If there are pidfds, the signal never goes to a later process with the same id.
     """
     handle = -1
     try:
-        if hasattr(os, "pidfd_open"):
-            handle = os.pidfd_open(pid)
+        handle = _pidfd(pid)
         if not is_meant():
             return False
         if handle >= 0:
@@ -91,6 +93,22 @@ def signal_if(pid: int, number: int, is_meant: Callable[[], bool]) -> bool:
         if handle >= 0:
             os.close(handle)
     return True
+
+
+def _pidfd(pid: int) -> int:
+    """Return a descriptor of a process, or -1 without pidfds or for want of descriptors.
+
+    Raises:
+        ProcessLookupError: there is no such process.
+    """
+    if not hasattr(os, "pidfd_open"):
+        return -1
+    try:
+        return os.pidfd_open(pid)
+    except ProcessLookupError:
+        raise
+    except OSError:
+        return -1
 
 
 def new_family() -> int:
@@ -135,6 +153,28 @@ def sweep(family: int) -> int:
     return len(swept)
 
 
+def reap(family: int, own: int | None) -> None:
+    """Collect the ended processes of a family that this one has adopted, as process 1 or as a subreaper.
+
+    They are known by a mark that this process never gives: what it starts itself has its own mark, or none. So no exit
+    status is taken away for which somebody waits.
+
+    Args:
+        own: the fork server that this process has launched, which marks itself; None without one.
+    """
+    with contextlib.suppress(OSError):  # no children, or no such files
+        if os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+            return  # none has ended
+        ours = _mark_of("self")
+        for task in Path("/proc/self/task").iterdir():
+            for pid in map(int, (task / "children").read_text().split()):
+                mark = _mark_of(str(pid))
+                if mark is None or mark == ours or pid == own or _state(pid) != b"Z":
+                    continue
+                if mark == OUTLIVES or mark >> _PID_BITS == family:
+                    os.waitpid(pid, os.WNOHANG)
+
+
 def _kill_marked(pid: int, mark: int) -> bool:
     try:
         return signal_if(pid, signal.SIGKILL, lambda: _mark_of(str(pid)) == mark)
@@ -167,11 +207,34 @@ def _mark_of(pid: str) -> int | None:
 
 
 def _is_alive(pid: int) -> bool:
+    return _state(pid) not in (b"Z", b"X", b"")
+
+
+def _state(pid: int) -> bytes:
     try:
         with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123
-            return file.read().rpartition(b")")[2].split()[0] not in (b"Z", b"X")
+            return file.read().rpartition(b")")[2].split()[0]
     except (OSError, IndexError):
-        return False
+        return b""
+
+
+def stopped(pid: int) -> str:
+    """Return words for a process that a signal has stopped, and that does nothing until it goes on; "" for another."""
+    if _state(pid) != b"T":
+        return ""
+    return (
+        "stopped by a signal, such as the terminal sends to a process in the background that uses it "
+        f"(`kill -CONT {pid}` continues it)"
+    )
+
+
+def starved_s(pid: int) -> float:
+    """Return how many seconds the main thread of a process has waited for a processor; 0 if the kernel does not say."""
+    try:
+        with open(f"/proc/{pid}/schedstat", "rb") as file:  # noqa: PTH123
+            return int(file.read().split()[1]) / 1e9
+    except (OSError, IndexError, ValueError):
+        return 0.0
 
 
 def wait_gone(pids: Iterable[int], timeout_s: float) -> bool:
@@ -182,11 +245,11 @@ def wait_gone(pids: Iterable[int], timeout_s: float) -> bool:
 
 def _wait_gone(pid: int, deadline: float) -> bool:
     try:
-        handle = os.pidfd_open(pid)
-    except AttributeError:  # this Python has no pidfds
-        return _is_seen_to_end(pid, deadline)
-    except OSError:
+        handle = _pidfd(pid)
+    except ProcessLookupError:
         return True
+    if handle < 0:
+        return _is_seen_to_end(pid, deadline)
     try:
         return is_readable(handle, deadline - time.monotonic())
     finally:

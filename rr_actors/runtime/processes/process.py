@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
+import resource
 import select
 import signal
 import socket
@@ -18,7 +20,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from rr_actors.base.errors import StartFailed
+from rr_actors.base.errors import StartFailed, text_of
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer
@@ -26,6 +28,8 @@ from rr_actors.runtime.processes.fork_server import ForkServer
 PRELOAD = ("rr_actors.supervision.child_main",)
 """The modules that a fork server imports before it forks."""
 
+_CHILD_FDS = 4  # of a Process: its pidfd, its status, its lifeline and its control channel
+_SPARE_FDS = 16  # for the fork server, the start of a child, a registrar
 _CODE_GRACE_S = 0.25  # the longest wait for the exit code after a death
 
 
@@ -45,6 +49,26 @@ def keep_standard_fds() -> None:
                 os.close(opened)
             else:
                 os.set_inheritable(fd, True)
+
+
+def check_descriptors(children: int, path: str) -> None:
+    """Check that this process may have the descriptors for so many child processes of the supervisor at `path`.
+
+    Raises:
+        StartFailed: it may not; the text has the sum.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if not children or soft == resource.RLIM_INFINITY:
+        return
+    open_now = len(os.listdir("/proc/self/fd"))
+    needed = open_now + _SPARE_FDS + children * _CHILD_FDS
+    if needed > soft:
+        text = (
+            f"{path}: expected at least {needed} descriptors, which its process may have open (ulimit -n), got {soft} "
+            f"(the hard limit is {hard}): {_CHILD_FDS} for each of {children} child processes, {open_now} are open, "
+            f"{_SPARE_FDS} to spare"
+        )
+        raise StartFailed(text, id=path, wanted=wanted_by(OSError(errno.EMFILE, "")))
 
 
 class Exited(NamedTuple):
@@ -166,10 +190,13 @@ class Spawner:
 
     Args:
         preload: modules that the fork server imports besides this package's, so that children need not.
+        directory: for the fork server's socket, if no directory for temporary files can be used.
     """
 
-    def __init__(self, preload: Sequence[str] = ()) -> None:
+    def __init__(self, preload: Sequence[str] = (), directory: str = "") -> None:
         self._preload = (*PRELOAD, *preload)
+        self._directory = directory
+        self._last_words = ""  # of the fork server that could not serve
         self._family = lifeline.new_family()
         self._lock = threading.Lock()
         self._server: ForkServer | None = None
@@ -192,8 +219,11 @@ class Spawner:
         try:
             return self._start(message, name, deadline)
         except (OSError, EOFError) as error:
-            why = wanted_by(error) or repr(error)
-            raise StartFailed(f"process {name!r} could not be started: {why}", id=name) from error
+            wanted = wanted_by(error)
+            if isinstance(error, EOFError | ConnectionError):  # two servers have ended in their start
+                wanted = f"fork server: it ends before it answers: {self._last_words or 'it has said nothing'}"
+            text = f"process {name!r} could not be started: {wanted or text_of(error)}"
+            raise StartFailed(text, id=name, wanted=wanted) from error
 
     def _start(self, message: bytes, name: str, deadline: float) -> Process:
         with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
@@ -213,6 +243,8 @@ class Spawner:
             on_failure.pop_all()
             try:
                 _write_all(forked.data, message, deadline)
+            except BrokenPipeError:
+                pass  # it has ended already: its last message or its exit code says why
             except OSError as error:
                 child.close()
                 text = f"process {name!r} (pid {forked.pid}) did not start: {error!r}"
@@ -225,6 +257,14 @@ class Spawner:
         Return their number. Blocks for a few ms. Programs that are meant to outlive their owner live on.
         """
         return lifeline.sweep(self._family)
+
+    def reap(self) -> None:
+        """Collect the ended descendants of children that this process has adopted. Quick; from any thread."""
+        if self._lock.acquire(blocking=False):  # else a fork server is ending: the next call is soon enough
+            try:
+                lifeline.reap(self._family, None if self._server is None else self._server.pid)
+            finally:
+                self._lock.release()
 
     def close(self) -> None:
         """End the fork server if it is this spawner's own, and the descendants that children left. All children must
@@ -256,12 +296,12 @@ class Spawner:
             if self._closed:
                 raise StartFailed("the system is stopping: no process can be started any more")
             if self._server is not None and not self._server.is_running():
-                self._server.close()
+                self._end(self._server)
                 self._server = None
             if self._server is None:
                 server = fork_server.inherited
                 if server is None or not server.is_running():
-                    server = ForkServer.launch(self._preload, self._family)
+                    server = ForkServer.launch(self._preload, self._family, self._directory)
                 self._server = server
             return self._server
 
@@ -269,7 +309,11 @@ class Spawner:
         with self._lock:
             if self._server is server:
                 self._server = None
-                server.close()
+                self._end(server)
+
+    def _end(self, server: ForkServer) -> None:
+        server.close()
+        self._last_words = server.last_words
 
 
 def signal_name(number: int) -> str:

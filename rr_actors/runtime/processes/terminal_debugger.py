@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import logging
 import os
 import pdb
 import signal
@@ -17,7 +16,9 @@ import threading
 from types import FrameType
 from typing import Any, TextIO
 
-logger = logging.getLogger("rr_actors")
+from rr_actors.base.reporting.log import Log
+
+logger = Log("rr_actors")
 
 
 class Terminal:

@@ -19,10 +19,9 @@ import dataclasses
 from collections.abc import Hashable, Sequence
 from typing import Any, Literal, NamedTuple
 
-from msgspec import Struct
 from msgspec.structs import replace
 
-from rr_actors.base.checks import invalid
+from rr_actors.base.checks import SupervisorCall, invalid
 from rr_actors.base.errors import (
     AlreadyPresent,
     AlreadyStarted,
@@ -35,15 +34,12 @@ from rr_actors.base.errors import (
     TooManyChildren,
     shown,
 )
+from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, check_significant
 from rr_actors.supervision.core.state import Call, Child, Decision, Phase, Tree, Why
 from rr_actors.supervision.core.transition import Draft
 
 # -- messages ------------------------------------------------------------------------------------------------------
-
-
-class SupervisorCall(Struct, frozen=True):
-    """A message that only a supervisor understands. Handlers of other actors never get it."""
 
 
 class Change(SupervisorCall, frozen=True):
@@ -65,16 +61,6 @@ class ChildUpdated(SupervisorCall, frozen=True):
 
     id: str
     spec: Supervisor
-
-
-class NoSupervisor(NotFound):
-    """The call went to an actor that is no supervisor."""
-
-
-def check_for_actor(message: object, actor: object) -> None:
-    """Raise NoSupervisor if a message to `actor`, which is no supervisor, is a call for one."""
-    if isinstance(message, SupervisorCall):
-        raise NoSupervisor(f"it is no supervisor, but a child of class {type(actor).__qualname__}")
 
 
 # -- changes -------------------------------------------------------------------------------------------------------
@@ -136,10 +122,10 @@ def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decisi
         return draft.done()
     new = spec.child_specs
     if tree.dynamic:
-        draft.children = {id: replace(child, spec=new[0]) for id, child in draft.children.items()}
+        draft.children = Children({id: replace(child, spec=new[0]) for id, child in draft.children.items()})
     else:
         named = {s.id: replace(draft.children.get(s.id) or Child(s.id, s), spec=s) for s in new}
-        draft.children = named | {id: child for id, child in draft.children.items() if id not in named}
+        draft.children = Children(named | {id: child for id, child in draft.children.items() if id not in named})
     draft.tree = replace(tree, spec=spec)
     draft.reply([caller])
     draft.advance()
@@ -158,7 +144,7 @@ def update_child(tree: Tree, id: str, spec: Supervisor) -> Tree:
     as_before = {name: getattr(inner, name) for name in ("restart", "shutdown_s", "significant", "placement")}
     spec = dataclasses.replace(spec, **as_before)
     kept = dataclasses.replace(child.spec, actor_class_or_manager=spec)
-    children = {**tree.children, id: replace(child, spec=kept)}
+    children = Children.of(tree.children).put(id, replace(child, spec=kept))
     static = [spec if c is inner else children[id].spec if c is child.spec else c for c in tree.spec.children]
     return replace(tree, spec=dataclasses.replace(tree.spec, children=static), children=children)
 
@@ -177,7 +163,7 @@ class Counts(NamedTuple):
 
 def which_children(tree: Tree) -> list[Child]:
     """Return all children, newest first, as OTP lists them."""
-    return list(reversed(tree.children.values()))
+    return list(tree.children.values())[::-1]
 
 
 def count_children(tree: Tree) -> Counts:
@@ -230,7 +216,7 @@ def _do(draft: Draft, call: Call) -> None:
         draft.reply([call.caller], error=error)
     elif call.kind == "start" and child is None:
         assert call.child is not None
-        draft.due(draft.put(call.child))
+        draft.due(call.child)
     elif child is None:
         draft.reply([call.caller], error=_absent(draft.tree, call.id))
     elif call.kind == "terminate":
@@ -246,7 +232,7 @@ def _do_when_settled(draft: Draft, child: Child, call: Call) -> None:
     elif standing != "stopped" or call.kind == "start":
         draft.reply([call.caller], error=_refusal(draft, child, call, standing))
     elif call.kind == "restart":
-        draft.due(draft.put(child, why=Why.MANUAL, attempts=0, starters=(call.caller,)))
+        draft.due(replace(child, why=Why.MANUAL, attempts=0, starters=(call.caller,)))
     else:
         draft.down(replace(child, why=Why.NEW), "deleted")
         draft.reply([call.caller])
@@ -298,7 +284,7 @@ def _refusal(draft: Draft, child: Child, call: Call, standing: str) -> RrError:
 
 
 def _not_found(tree: Tree, id: str) -> NotFound:
-    known = ", ".join(list(tree.children)[:10]) or "none"
+    known = ", ".join(child.id for child in Children.of(tree.children).first(10, *Phase)) or "none"
     more = ", ..." if len(tree.children) > 10 else ""
     return NotFound(f"supervisor {tree.path} has no child {shown(id)} (it has: {known}{more})", id=id)
 

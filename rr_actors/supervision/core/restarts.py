@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from rr_actors.base.errors import StartFailed, UsageError, text_of
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.supervision.core.child_calls import replay
+from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import Backoff, RestartType
 from rr_actors.supervision.core.state import (
     Child,
@@ -30,9 +31,9 @@ from rr_actors.supervision.core.state import (
 from rr_actors.supervision.core.transition import Draft
 
 PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
-"""The least wait after a start that failed for want of descriptors, memory or threads.
+"""The least wait after a start that failed for want of something outside (base/scarcity.py).
 
-More starts would make it worse. With this pause the default intensity of a supervisor, 3 in 5 s, is not exceeded."""
+More starts would make it worse. Such a failure does not count: the want ends no supervisor."""
 
 
 def needs_restart(restart: RestartType, reason: Reason) -> bool:
@@ -58,7 +59,7 @@ def decide_start(tree: Tree, now: float) -> Decision:
     if tree.mode is not Mode.NEW:
         raise UsageError(f"supervisor {tree.path}: started twice (it is {tree.mode.name.lower()})")
     draft = Draft(replace(tree, mode=Mode.STARTING), now)
-    for child in tree.children.values():
+    for child in list(tree.children.values()):
         draft.put(child, phase=Phase.DUE, why=Why.INIT)
     draft.advance()
     return draft.done()
@@ -91,7 +92,16 @@ def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool =
                 draft.down(replace(child, why=Why.RESTART), "ignored", keep=child.why is Why.MANUAL)
             else:
                 draft.report("started", child, "running")
-                draft.put(child, phase=Phase.RUNNING, why=Why.RESTART, up_at=now, starters=(), waiting=(), wanting=0)
+                draft.put(
+                    child,
+                    phase=Phase.RUNNING,
+                    why=Why.RESTART,
+                    up_at=now,
+                    starters=(),
+                    waiting=(),
+                    wanting=0,
+                    doubted=False,
+                )
             draft.reply(child.starters, id=None if ignored else id)
             replay(draft, child.waiting)
         case Child(phase=Phase.CONDEMNED) if ignored:
@@ -123,6 +133,10 @@ def decide_start_failed(
 
 
 def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: float) -> None:
+    if is_resources(reason) and not child.doubted:
+        draft.report("start_failed", child, child.state, error=reason)
+        draft.start(draft.put(child, doubted=True))
+        return
     error = draft.start_error(child, reason)
     draft.reply(child.starters, error=error)
     match child.why:
@@ -134,11 +148,30 @@ def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: flo
             draft.down(child, "start_failed", error=reason, keep=child.why is Why.MANUAL)
             replay(draft, child.waiting)
         case Why.RESTART:
-            wanted = wanted_by(reason)
-            least_s = PAUSE.delay(child.wanting, chance) if wanted else 0.0
-            child = draft.put(child, wanting=child.wanting + 1 if wanted else 0)
-            why = f"start failed for want of resources, {wanted}" if wanted else "start failed"
-            _restart(draft, child, "start_failed", f"{why}: {text_of(reason)}", chance, least_s, error=reason)
+            if wanted_by(reason):
+                _wait_for_want(draft, child, reason, chance)
+            else:
+                child = draft.put(child, wanting=0)
+                _restart(draft, child, "start_failed", f"start failed: {text_of(reason)}", chance, error=reason)
+
+
+def _wait_for_want(draft: Draft, child: Child, reason: BaseException, chance: float) -> None:
+    """Start the child or its group again after a pause, and count no restart."""
+    delay_s = PAUSE.delay(child.wanting, chance)
+    if child.spec.backoff:
+        delay_s = max(delay_s, child.spec.backoff.delay(child.attempts, chance))
+    child = draft.put(child, wanting=child.wanting + 1)
+    draft.report("start_failed", child, "restarting", delay_s=delay_s, error=reason)
+    draft.restart(child, delay_s)
+
+
+def is_resources(reason: BaseException) -> bool:
+    """Return whether a start failed because the process died while callbacks of resources ran.
+
+    Such a start is made again, and does not count: the child's registrar counts the deaths of each callback, and runs
+    none of them for a fourth time. If the next start does not say that it was so (decide_uncounted), that one counts.
+    """
+    return isinstance(reason, StartFailed) and "callback" in reason.details
 
 
 # -- ends ----------------------------------------------------------------------------------------------------------
@@ -163,6 +196,16 @@ def decide_exit(tree: Tree, id: str, run: int, exit: Exit, now: float, chance: f
             return tree, []
     draft.advance()
     return draft.done()
+
+
+def decide_uncounted(tree: Tree, id: str, run: int) -> Decision:
+    """Note that the run before this one ended in a callback of a resource: its restart does not count."""
+    child = tree.children.get(id)
+    if child is None or child.run != run:
+        return tree, []
+    counted = tuple(restart for restart in tree.restarts if (restart.id, restart.run) != (id, child.previous))
+    children = Children.of(tree.children).put(id, replace(child, doubted=False))
+    return replace(tree, restarts=counted, children=children), []
 
 
 def decide_stopped(tree: Tree, id: str, run: int, exit: Exit, now: float) -> Decision:
@@ -196,9 +239,7 @@ def _exited(draft: Draft, child: Child, exit: Exit, chance: float) -> None:
         _auto_shutdown(draft, child)
 
 
-def _restart(
-    draft: Draft, child: Child, event: Event, reason: str, chance: float, least_s: float = 0.0, **details: Any
-) -> None:
+def _restart(draft: Draft, child: Child, event: Event, reason: str, chance: float, **details: Any) -> None:
     """Count a restart of a child that is down, and start it or its group; give up if that restart is one too many."""
     count = draft.count_restart(child, reason)
     if count > draft.tree.spec.max_restarts:
@@ -208,9 +249,9 @@ def _restart(
         draft.report("gave_up", child, None if draft.forgets(child) else "stopped", error=error, restarts=count)
         draft.give_up(error)
     else:
-        delay_s = max(least_s, child.spec.backoff.delay(child.attempts, chance) if child.spec.backoff else 0.0)
+        delay_s = child.spec.backoff.delay(child.attempts, chance) if child.spec.backoff else 0.0
         draft.report(event, child, "restarting", restarts=count, delay_s=delay_s, **details)
-        draft.restart(child, delay_s)
+        draft.restart(replace(child, attempts=child.attempts + 1), delay_s)
 
 
 def _auto_shutdown(draft: Draft, child: Child) -> None:
@@ -218,8 +259,7 @@ def _auto_shutdown(draft: Draft, child: Child) -> None:
     when = draft.tree.spec.auto_shutdown
     if when == "never" or not child.spec.significant:
         return
-    others = [c for c in draft.children.values() if c.spec.significant and c.phase is not Phase.STOPPED]
-    if when == "any" or not others:
+    if when == "any" or not draft.children.any_significant():
         draft.report("auto_shutdown", child, None if draft.forgets(child) else "stopped")
         starting = draft.tree.mode is Mode.STARTING
         draft.give_up(draft.start_error(child, "it ended before its supervisor was ready") if starting else None)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, cast, get_args, get_origin
 
 from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
 from rr_actors.base.toml import FilePath, parse_child, read_supervisor
@@ -31,10 +31,13 @@ class Backoff:
     Delayed restarts count: the supervisor's max_restarts within max_seconds should leave room for the first ones.
 
     Args:
-        delay_s: seconds before the first restart, at least 0.
-        factor: growth from one wait to the next, at least 1.
-        maximum_s: the longest wait in seconds, at least delay_s.
-        jitter: 0 (none) to 1 (anything between no wait and all of it).
+        delay_s: seconds before the first restart, at least 0. Default: 0.1. Raise it for a device that needs time to
+            come back.
+        factor: growth from one wait to the next, at least 1. Default: 2.0. Set 1 for equal waits.
+        maximum_s: the longest wait in seconds, at least delay_s. Default: 30.0. Lower it if the child is needed soon;
+            raise it if each attempt costs.
+        jitter: 0 (none) to 1 (anything between no wait and all of it). Default: 0.1. Raise it if many children restart
+            together; set 0 in tests.
 
     Raises:
         InvalidSpec: naming the field.
@@ -68,20 +71,28 @@ class ChildSpec:
     """The specification of one child: how to start, restart and stop it.
 
     Args:
-        actor_class_or_manager: a class (Manager, Actor or a Pykka actor) or a Supervisor.
-        id: the child's name among its siblings. Default: the class's name, or the Supervisor's id.
-        args, kwargs: the arguments of the class.
+        actor_class_or_manager: a class (Manager, Actor or a Pykka actor) or a Supervisor. It has no default.
+        id: the child's name among its siblings. Default: "", the class's name or the Supervisor's id. Set it for a
+            second child of a class, and for every Manager: its servers are found by it.
+        args, kwargs: the arguments of the class. Default: (), {}, none. Set them if its `__init__` takes any.
         restart: "permanent": always. "transient": after abnormal ends and kills. "temporary": never, and the
-            specification is removed when the child ends.
-        shutdown_s: seconds to stop before the child is killed; "infinity"; or "brutal_kill": killed at once. Use
-            "infinity" for a ChildSpec around a Supervisor, or its whole subtree has only 5 s.
-        significant: the child's own end may end the supervisor (auto_shutdown).
-        placement: "process" (its own process) or "thread" (its supervisor's process).
-        backoff: the waiting times before restarts. None: restart at once.
-        heartbeat_s: replace a child whose event loop has not answered for that many seconds, also in its start. And
-            one that reports twice in a row that it cannot work. None: off.
-        start_timeout_s: seconds to become ready. After that the child is killed, and its start has failed. None: the
-            system's limit.
+            specification is removed when the child ends. Default: "permanent". Set "transient" for a task that has an
+            end.
+        shutdown_s: seconds to stop before the child is killed; "infinity"; or "brutal_kill": killed at once. Default:
+            5.0. Raise it for a slow on_stop. Use "infinity" for a ChildSpec around a Supervisor, or its whole subtree
+            has only 5 s.
+        significant: the child's own end may end the supervisor (auto_shutdown). Default: False. Turn it on for the
+            child whose work is the supervisor's purpose.
+        placement: "process" (its own process) or "thread" (its supervisor's process). Default: "process". Set "thread"
+            to debug, or for a light child whose crash may end its siblings.
+        backoff: the waiting times before restarts. Default: None, restart at once. Set one if what the child needs may
+            be away for long.
+        heartbeat_s: replace a child whose event loop has not answered for that many seconds, also in its start. And one
+            that reports twice in a row that it cannot work. Default: None, off. Set it if a process may hang.
+        start_timeout_s: seconds to become ready. After that the child is killed, and its start has failed. Default:
+            None, the system's limit. Raise it for a child that is slower than the others.
+        renamed_from: the id that this manager had in earlier runs. System.start() gives it what its registrar of that
+            name left on disk, once. Default: None, it has always had this id. Set it when you rename a manager.
 
     Raises:
         InvalidSpec: `.field`, `.expected`, `.got`.
@@ -98,6 +109,7 @@ class ChildSpec:
     backoff: Backoff | None = None
     heartbeat_s: float | None = None
     start_timeout_s: float | None = None
+    renamed_from: str | None = None
 
     def __post_init__(self) -> None:
         with examined("ChildSpec"):
@@ -105,6 +117,8 @@ class ChildSpec:
 
     def _check(self) -> None:
         what = cast(object, self.actor_class_or_manager)
+        if isinstance(of := get_origin(what), type):  # a generic class with its arguments: Cache[int]
+            object.__setattr__(self, "actor_class_or_manager", what := of)
         if not isinstance(what, type | Supervisor):
             raise invalid("ChildSpec", "actor_class_or_manager", "a class or a Supervisor", what)
         if cast(object, self.id) is None or self.id == "":
@@ -117,6 +131,10 @@ class ChildSpec:
             raise invalid(who, "backoff", "a Backoff or None", self.backoff)
         if self.backoff is not None and self.restart == "temporary":
             raise invalid(who, "backoff", "None with restart='temporary', which is never restarted", self.backoff)
+        if self.renamed_from is not None:
+            check_id(self.renamed_from, who, "renamed_from")
+            if self.renamed_from == self.id:
+                raise invalid(who, "renamed_from", "an earlier id", self.renamed_from)
         for name in ("heartbeat_s", "start_timeout_s"):
             if getattr(self, name) is not None:
                 check_positive(getattr(self, name), who, name)
@@ -148,16 +166,26 @@ class Supervisor:
     """The specification of a supervisor and its children. They start in this order, and stop in reverse order.
 
     Args:
-        children: ChildSpecs and Supervisors. Under simple_one_for_one exactly one: the template.
-        id: the supervisor's name among its siblings, and a part of the paths below it.
+        children: ChildSpecs and Supervisors. Under simple_one_for_one exactly one: the template. Default: (), none.
+            Name what runs from the start; start_child() adds others.
+        id: the supervisor's name among its siblings, and a part of the paths below it. Default: "root". Set it for each
+            supervisor but the first.
         strategy: the children that are restarted when one ends. "one_for_one": that child. "one_for_all": all.
-            "rest_for_one": that child and those started after it. "simple_one_for_one": that child; children are
-            added at run time from one template.
+            "rest_for_one": that child and those started after it. "simple_one_for_one": that child; children are added
+            at run time from one template. Default: "one_for_one". Set another if children need each other.
         max_restarts, max_seconds: with more than max_restarts restarts within max_seconds seconds the supervisor stops
-            its children and ends with reason "shutdown". 0 restarts: the first that is needed ends it.
-        auto_shutdown: end when a significant child ("any"), or the last one ("all"), has ended by itself.
-        max_children: with simple_one_for_one, the largest number of children. None: no limit.
-        placement, restart, shutdown_s, significant: as in ChildSpec, if the supervisor is a child itself.
+            its children and ends with reason "shutdown". 0 restarts: the first that is needed ends it. Default: 3, 5.0.
+            Raise max_restarts for many children; raise max_seconds with a Backoff.
+        auto_shutdown: end when a significant child ("any"), or the last one ("all"), has ended by itself. Default:
+            "never". Set it if nothing is left to do then.
+        max_children: with simple_one_for_one, the largest number of children. Default: None, no limit. Set it to what
+            the machine can hold.
+        restart, significant: as in ChildSpec, if the supervisor is a child itself. Default: "permanent", False. Set
+            them for a branch that may end.
+        placement: as in ChildSpec. Default: "thread", in the process of its own supervisor. Set "process" so that a
+            branch survives the crash of its siblings.
+        shutdown_s: as in ChildSpec. Default: "infinity", so that its children stop in order. Lower it if the branch may
+            be killed.
 
     Raises:
         InvalidSpec: `.field`, `.expected`, `.got`.
@@ -275,6 +303,20 @@ def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]
     if isinstance(inner, Supervisor) and inner.strategy != "simple_one_for_one":
         for below in inner.child_specs:
             yield from starting_with(below, f"{path}/{below.id}")
+
+
+def count_processes(supervisor: Supervisor) -> int:
+    """Return how many processes the supervisor starts from its own process, with those of supervisors placed there."""
+    if supervisor.strategy == "simple_one_for_one":
+        return 0
+    count = 0
+    for child in supervisor.child_specs:
+        inner = child.actor_class_or_manager
+        if child.placement == "process":
+            count += 1
+        elif isinstance(inner, Supervisor):
+            count += count_processes(inner)
+    return count
 
 
 def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, where: str) -> None:

@@ -17,7 +17,7 @@ The duties of the performer, without which the decisions are wrong:
 from __future__ import annotations
 
 import enum
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -86,10 +86,12 @@ class Child(Struct, frozen=True):
     Attributes:
         id: its name; under simple_one_for_one a generated one.
         spec: its specification. Under simple_one_for_one the template's; `extra` are this child's additional arguments.
-        run: number of its present or last start; 0 before the first.
+        run: number of its present or last start; 0 before the first. `previous`: of the start before.
         why: the purpose of its present start; RESTART once it is up, since the next start will be a restart.
         up_at: when this run became ready, monotonic seconds; None before.
         attempts: restarts since it last ran for long enough (for the backoff).
+        doubted: its last start failed while callbacks of resources ran, and did not count. The present start has to say
+            whether one of them ended the process.
         wanting: starts in a row that failed for want of resources (base/scarcity.py).
         starters, stoppers: callers that get a Reply when it is up (or has failed), or down.
         waiting: calls to be made again when its start or stop has ended.
@@ -101,9 +103,11 @@ class Child(Struct, frozen=True):
     phase: Phase = Phase.STOPPED
     why: Why = Why.INIT
     run: int = 0
+    previous: int = 0
     up_at: float | None = None
     attempts: int = 0
     wanting: int = 0
+    doubted: bool = False
     starters: tuple[Hashable, ...] = ()
     stoppers: tuple[Hashable, ...] = ()
     waiting: tuple[Call, ...] = ()
@@ -133,11 +137,12 @@ class Child(Struct, frozen=True):
 
 
 class Restart(Struct, frozen=True):
-    """A restart that counts: when (monotonic seconds), which child, why."""
+    """A restart that counts: when (monotonic seconds), which child, why, and which of its runs had ended."""
 
     at: float
     id: str
     reason: str
+    run: int = 0
 
 
 class Mode(enum.Enum):
@@ -156,7 +161,7 @@ class Tree(Struct, frozen=True):
     Attributes:
         spec: its specification as last given (strategy, intensity, auto_shutdown ...; the children are in `children`).
         path: its place in the tree, "root/inner", for messages.
-        children: by id, in start order. Not to be changed.
+        children: by id, in start order; after the first decision a `Children`.
         restarts: the restarts that count, oldest first.
         last_run, last_dynamic: the last numbers given out.
         generation: part of the ids of dynamic children (`of`).
@@ -167,7 +172,7 @@ class Tree(Struct, frozen=True):
     spec: Supervisor
     path: str
     mode: Mode = Mode.NEW
-    children: dict[str, Child] = field(default_factory=dict[str, Child])
+    children: Mapping[str, Child] = field(default_factory=dict[str, Child])
     restarts: tuple[Restart, ...] = ()
     last_run: int = 0
     last_dynamic: int = 0

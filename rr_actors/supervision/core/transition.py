@@ -12,12 +12,15 @@ Nothing remembers what to do next: `advance` derives it from the children's phas
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Hashable, Iterable
 from typing import Any
 
 from msgspec.structs import replace
 
-from rr_actors.base.errors import NotFound, RestartIntensityExceeded, RrError, StartFailed
+from rr_actors.base.errors import Described, NotFound, RestartIntensityExceeded, RrError, StartFailed, text_of
+from rr_actors.base.scarcity import wanted_by
+from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.state import (
     Action,
     Child,
@@ -45,7 +48,7 @@ class Draft:
     def __init__(self, tree: Tree, now: float = 0.0) -> None:
         self.tree = tree
         self.now = now
-        self.children = dict(tree.children)
+        self.children = Children.of(tree.children)
         self.actions: list[Action] = []
 
     def done(self) -> Decision:
@@ -67,13 +70,13 @@ class Draft:
     def put(self, child: Child, **changes: Any) -> Child:
         """Put the child with these changes in its place, and return it."""
         changed = replace(child, **changes)
-        self.children[child.id] = changed
+        self.children = self.children.put(child.id, changed)
         return changed
 
     def start(self, child: Child, delay_s: float = 0.0) -> None:
         """Start the child, as the next run."""
         self.tree = replace(self.tree, last_run=self.tree.last_run + 1)
-        child = self.put(child, phase=Phase.STARTING, run=self.tree.last_run, up_at=None)
+        child = self.put(child, phase=Phase.STARTING, run=self.tree.last_run, previous=child.run, up_at=None)
         self.actions.append(StartChild(child.id, child.run, child.start_spec, delay_s, child.why))
 
     def due(self, child: Child, delay_s: float = 0.0) -> None:
@@ -101,7 +104,7 @@ class Draft:
         forgotten = self.forgets(child) and not keep
         self.report(event, child, None if forgotten else "stopped", exit=exit, **details)
         if forgotten:
-            del self.children[child.id]
+            self.children = self.children.without(child.id)
         else:
             self.put(child, phase=Phase.STOPPED, why=Why.RESTART, starters=(), stoppers=(), waiting=())
 
@@ -117,8 +120,17 @@ class Draft:
 
     def start_error(self, child: Child, cause: BaseException | str) -> StartFailed:
         """Return the error for a start that failed or was cut short."""
-        text = str(cause) if isinstance(cause, str | RrError) else f"{type(cause).__name__}: {cause}"
-        error = StartFailed(f"child {self.tree.path}/{child.id} did not start: {text}", id=child.id)
+        text = cause if isinstance(cause, str) else text_of(cause)
+        wanted = wanted_by(cause) if isinstance(cause, BaseException) else ""
+        if isinstance(cause, Described):
+            cause = cause.error
+        if isinstance(cause, RrError):  # its text says it all
+            text = text.partition(": ")[2] or text
+        details: dict[str, Any] = {"id": child.id}
+        if wanted:
+            details["wanted"] = wanted
+            text = text if wanted in text else f"{text}: {wanted}"
+        error = StartFailed(f"child {self.tree.path}/{child.id} did not start: {text}", **details)
         error.__cause__ = cause if isinstance(cause, BaseException) else None
         return error
 
@@ -131,7 +143,7 @@ class Draft:
     def count_restart(self, child: Child, reason: str) -> int:
         """Count one more restart, and return the number of those that count now."""
         counted = within(self.tree.restarts, self.now, self.tree.spec.max_seconds)
-        self.tree = replace(self.tree, restarts=(*counted, Restart(self.now, child.id, reason)))
+        self.tree = replace(self.tree, restarts=(*counted, Restart(self.now, child.id, reason, child.run)))
         return len(self.tree.restarts)
 
     def too_many_restarts(self) -> RestartIntensityExceeded:
@@ -151,18 +163,17 @@ class Draft:
 
     def restart(self, child: Child, delay_s: float) -> None:
         """Start a child that is down, or its group, again."""
-        child = self.put(child, phase=Phase.DUE, why=Why.RESTART, attempts=child.attempts + 1, starters=())
-        self.due(child, delay_s)
+        self.due(replace(child, why=Why.RESTART, starters=()), delay_s)
         if self.tree.grouped:
             self._condemn(child.id)
 
     def _condemn(self, cause: str) -> None:
         """Take the rest of the group into the restart of `cause`: children that are up will be stopped first."""
-        ids = list(self.children)
-        if self.tree.spec.strategy == "rest_for_one":
-            ids = ids[ids.index(cause) :]
-        for child in [self.children[id] for id in ids if id != cause]:
+        rest = self.tree.spec.strategy == "rest_for_one"
+        for child in self.children.after(cause) if rest else list(self.children.values()):
             match child.phase:
+                case _ if child.id == cause:
+                    pass
                 case Phase.RUNNING:
                     self.put(child, phase=Phase.CONDEMNED)
                 case Phase.STARTING:  # not up yet: its start is repeated, for the same purpose
@@ -205,41 +216,39 @@ class Draft:
             if self.tree.grouped or self._regrouping():
                 self._regroup()
             elif self.tree.mode is Mode.STARTING:
-                self._start_next(self._of(Phase.STARTING, Why.INIT), self._of(Phase.DUE, Why.INIT))
+                self._start_next((Why.INIT,))
             if self.tree.mode is Mode.STARTING and self._ready():
                 self.tree = replace(self.tree, mode=Mode.RUNNING)
                 self.actions.append(SupervisorStarted())
-
-    def _of(self, phase: Phase, why: Why | None = None) -> list[Child]:
-        return [c for c in self.children.values() if c.phase is phase and (why is None or c.why is why)]
 
     def _regrouping(self) -> bool:
         """Return whether a group restart is in progress. An update of the strategy does not change how it ends."""
         if self.tree.dynamic:
             return False
-        begun = (Phase.CONDEMNED, Phase.RECYCLING)
-        return any(c.phase in begun or (c.phase is Phase.DUE and c.why is not Why.INIT) for c in self.children.values())
+        again = (Why.NEW, Why.MANUAL, Why.RESTART)
+        return self.children.any(Phase.DUE, whys=again) or self.children.any(Phase.CONDEMNED, Phase.RECYCLING)
 
     def _regroup(self) -> None:
-        if self._of(Phase.STOPPING) or self._of(Phase.RECYCLING):
+        if self.children.any(Phase.STOPPING, Phase.RECYCLING):
             return
-        condemned = self._of(Phase.CONDEMNED)
-        if not condemned:
-            self._start_next(self._of(Phase.STARTING), self._of(Phase.DUE))
-        elif condemned[-1].spec.restart == "temporary" and condemned[-1].why is Why.RESTART:
-            self.stop(condemned[-1])  # a temporary sibling is not started again
+        condemned = self.children.last(Phase.CONDEMNED)
+        if condemned is None:
+            self._start_next(tuple(Why))
+        elif condemned.spec.restart == "temporary" and condemned.why is Why.RESTART:
+            self.stop(condemned)  # a temporary sibling is not started again
         else:
-            self.stop(condemned[-1], Phase.RECYCLING)
+            self.stop(condemned, Phase.RECYCLING)
 
-    def _start_next(self, starting: list[Child], due: list[Child]) -> None:
-        if starting:
+    def _start_next(self, whys: tuple[Why, ...]) -> None:
+        """Start the first child that is due, for one of these purposes, if none is starting for one of them."""
+        if self.children.any(Phase.STARTING, whys=whys):
             return
         delay_s, self.tree = self.tree.delay_s, replace(self.tree, delay_s=0.0)
-        if due:
-            self.start(due[0], delay_s)
+        for due in self.children.first(1, Phase.DUE, whys=whys):
+            self.start(due, delay_s)
 
     def _stop_next(self) -> None:
-        last = next((child for child in reversed(self.children.values()) if not child.down), None)
+        last = self.children.last(Phase.STARTING, Phase.RUNNING, Phase.CONDEMNED, Phase.RECYCLING, Phase.STOPPING)
         if last is None:
             self.tree = replace(self.tree, mode=Mode.STOPPED)
             self.actions.append(ExitSupervisor("shutdown", self.tree.error))
@@ -249,7 +258,7 @@ class Draft:
     def _ready(self) -> bool:
         """Return whether the supervisor's start is complete: no first start and no restart is left; callers' may be."""
         coming = (Phase.DUE, Phase.STARTING, Phase.CONDEMNED, Phase.RECYCLING)
-        return not any(c.phase in coming and c.why in (Why.INIT, Why.RESTART) for c in self.children.values())
+        return not self.children.any(*coming, whys=(Why.INIT, Why.RESTART))
 
 
 def within(restarts: tuple[Restart, ...], now: float, max_seconds: float) -> tuple[Restart, ...]:
@@ -258,4 +267,4 @@ def within(restarts: tuple[Restart, ...], now: float, max_seconds: float) -> tup
     OTP's manual: more than `intensity` restarts within `period` seconds end the supervisor. Inclusive on both sides: a
     restart exactly max_seconds old still counts, and exactly max_restarts of them are still allowed.
     """
-    return tuple(restart for restart in restarts if now <= restart.at + max_seconds)
+    return restarts[bisect_left(restarts, now, key=lambda restart: restart.at + max_seconds) :]

@@ -7,52 +7,102 @@ gives up those that a killed application left.
 
 from __future__ import annotations
 
-import logging
+import asyncio
+import contextlib
+import functools
 import threading
+from collections import deque
+from collections.abc import Callable
 
-from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownQuery, UnknownRegistrar, shown, text_of
-from rr_actors.base.names import CLIENTS, check_name
-from rr_actors.base.values.canonical import Codec, encode
-from rr_actors.registrar.registrar import Registrar, load_bytes
-from rr_actors.system.console.console_messages import (
-    RESPONSE_LIMIT_BYTES,
-    AskActor,
-    Done,
-    Hold,
-    Holding,
-    Release,
-    Replied,
-)
-from rr_actors.system.console.console_questions import View, Viewed
+from rr_actors.base.errors import RrError, UnknownQuery, UnknownRegistrar, shown
+from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.model.rows import State
+from rr_actors.registrar.registrar import Registrar, news
+from rr_actors.system.console.console_messages import RESPONSE_LIMIT_BYTES, Heard
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
+
+
+_BATCH_BYTES = 2**20  # of the messages and responses in one answer, which is complete with the one that reaches them
+_SHORT = 10_000  # characters of a message
+
+
+class ClientsRegistrar:
+    """The registrar of one client, and the statuses that the client has not heard yet. From any thread."""
+
+    def __init__(self, owner: object, registrar: Registrar) -> None:
+        self.owner = owner
+        self.registrar = registrar
+        self._lock = threading.Lock()
+        self._unheard: deque[tuple[Heard, Callable[[], object]]] = deque()  # at most one of each query
+        self._ended = False
+        self._arrived: Callable[[], None] | None = None
+
+    async def hear(self, status: Status) -> None:
+        """Keep a status until the client has it, as the callback of each of its loads: the next of the query waits."""
+        response, released = news(self.registrar, status.query_id)
+        if status.state is not State.UPDATE or (response is not None and len(response) > RESPONSE_LIMIT_BYTES):
+            response = None
+        about = status.query_id, status.resource_id, str(status.state), status.message[:_SHORT], status.source
+        taken = asyncio.Event()
+        take = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, taken.set)
+        with self._lock:
+            if self._ended:
+                return
+            self._unheard.append((Heard(*about, status.repeated, response, released), take))
+            arrived, self._arrived = self._arrived, None
+        if arrived is not None:
+            arrived()
+        await taken.wait()
+
+    def has_unheard(self, arrived: Callable[[], None]) -> bool:
+        """Return whether statuses wait for the client; if none does, have `arrived` called once when one arrives."""
+        with self._lock:
+            self._arrived = None if self._unheard else arrived
+            return bool(self._unheard)
+
+    def take(self) -> list[Heard]:
+        """Return statuses that wait, as many as one answer has room for."""
+        taken: list[Heard] = []
+        left = _BATCH_BYTES
+        with self._lock:
+            while self._unheard and left > 0:
+                heard, take = self._unheard.popleft()
+                taken.append(heard)
+                left -= len(heard.message) + len(heard.response or b"")
+                with contextlib.suppress(RuntimeError):  # the user loop has ended: the process is stopping
+                    take()
+        return taken
+
+    def end(self) -> None:
+        """Drop the statuses that wait, and all later ones, as the client has gone."""
+        with self._lock:
+            self._ended = True
+        while self.take():
+            pass
 
 
 class ClientRegistrars:
-    """The clients' registrars of one system. In workers."""
+    """The clients' registrars of one system. In workers, except has_statuses()."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._open: dict[str, tuple[object, Registrar]] = {}
+        self._open: dict[str, ClientsRegistrar] = {}
 
-    def open(self, view: View, name: str, owner: object) -> Done:
-        """Open a registrar for a connection.
-
-        Raises:
-            InvalidName, NameTaken: the name is not valid, or another client has it.
-        """
-        full = check_name(CLIENTS + check_name(name, "registrar name"), "registrar name")
-        registrar = view.open_registrar(full)
+    def add(self, owner: object, registrar: Registrar) -> None:
+        """Keep the registrar that was opened for a connection, until the connection ends."""
         with self._lock:
-            self._open[full] = owner, registrar
-        return Done(f"opened registrar {full}", {"registrar": full})
+            self._open[registrar.name] = ClientsRegistrar(owner, registrar)
 
     def close(self, owner: object) -> None:
         """Close the registrars of a connection that has ended, and release what they hold."""
         with self._lock:
-            mine = [name for name, (other, _) in self._open.items() if other is owner]
-            closing = [self._open.pop(name)[1] for name in mine]
-        for registrar in closing:
+            mine = [name for name, client in self._open.items() if client.owner is owner]
+            closing = [self._open.pop(name) for name in mine]
+        for client in closing:
+            client.end()
+            registrar = client.registrar
             try:
                 registrar.close()
                 logger.info("registrar %s: closed, as its client has gone", registrar.name)
@@ -61,65 +111,30 @@ class ClientRegistrars:
                     "registrar %s: its client has gone, and not all that it held is released", registrar.name
                 )
 
-    def hold(self, command: Hold) -> Holding:
-        """Load a resource for a client.
-
-        Raises:
-            RrError: as Registrar.load(), or the response is too long.
-        """
-        registrar = self._of(command.registrar)
-        query, response = load_bytes(registrar, command.server, command.request, command.timeout_s)
-        if len(response) > RESPONSE_LIMIT_BYTES:
-            registrar.unload(query.id, timeout_s=command.timeout_s)
-            text = f"a response of {len(response)} bytes is over a client's limit of {RESPONSE_LIMIT_BYTES}"
-            raise NotSerializable(f"{command.server}: {text}; give the name of a file, say", path="response")
-        return Holding(query.id, query.resource_id, response)
-
-    def release(self, command: Release) -> Done:
-        """Release a query of a client's registrar.
-
-        Raises:
-            RrError: as Registrar.unload().
-        """
-        self._of(command.registrar).unload(command.query_id, timeout_s=command.timeout_s)
-        return Done(f"released {command.query_id}")
+    def has_statuses(self, registrar: str, owner: object, arrived: Callable[[], None]) -> bool:
+        """Return whether AwaitStatuses has an answer; if not, have `arrived` called, from any thread, once it has."""
+        with self._lock:
+            client = self._open.get(registrar)
+        return client is None or client.owner is not owner or client.has_unheard(arrived)
 
     def release_unheard(self, registrar: str, query_id: str) -> None:
         """Release a query of a client that left before it kept the query."""
         try:
-            self._of(registrar).unload(query_id)
+            self.named(registrar).registrar.unload(query_id)
         except (UnknownQuery, UnknownRegistrar):
             logger.debug("query %s: released by its client or with its registrar", query_id)
         except RrError:
             logger.exception("query %s: its client has gone, and it is not released", query_id)
 
-    def _of(self, name: str) -> Registrar:
+    def named(self, name: str, owner: object = None) -> ClientsRegistrar:
+        """Return a client's registrar; with `owner`, only if this connection has opened it.
+
+        Raises:
+            UnknownRegistrar: no client has opened it, or the client has gone.
+        """
         with self._lock:
-            entry = self._open.get(name)
-        if entry is None:
-            raise UnknownRegistrar(
-                f"registrar {shown(name)}: no client has opened it, or its client has gone", registrar=name
-            )
-        return entry[1]
-
-
-def ask(system: Viewed, command: AskActor) -> Replied:
-    """Ask an actor of the system, and return its answer.
-
-    Raises:
-        RrError: there is no such actor, it does not answer, its handler raised, or its answer is no plain data.
-    """
-    message = _plain.decode(command.message, command.actor, "message")
-    reply = system.ref(command.actor).ask(message, block=False)
-    try:
-        error = reply.exception(command.timeout_s)
-    except TimeoutError as late:
-        reply.cancel()
-        text = f"{command.actor}: it has not answered within {command.timeout_s:g} s; a later answer reaches nobody"
-        raise Unavailable(text) from late
-    if error is not None and not isinstance(error, RrError):  # raised by the actor's handler
-        raise RrError(f"{command.actor}: {text_of(error)}") from error
-    return Replied(encode(reply.get(), f"answer of {command.actor}"))
-
-
-_plain = Codec(None, "message")
+            client = self._open.get(name)
+        if client is None or owner not in (None, client.owner):
+            text = f"registrar {shown(name)}: no client has opened it, or its client has gone"
+            raise UnknownRegistrar(text, registrar=name)
+        return client

@@ -7,36 +7,47 @@ application's process hold its queries. Each registrar has a connection of its o
 from __future__ import annotations
 
 import asyncio
-import logging
+import inspect
 import os
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future
+import weakref
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from concurrent.futures import FIRST_EXCEPTION, wait
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
-from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownQuery
-from rr_actors.base.names import parse_server_id
+from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownQuery, UsageError
+from rr_actors.base.names import ServerId, parse_server_id
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode
-from rr_actors.registrar.arguments import state_path
+from rr_actors.registrar.arguments import LoadOptions, Parent, checked_callback, checked_priority, state_path, target_id
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries, note_request
 from rr_actors.registrar.pages import QueryRow
-from rr_actors.runtime.time_limits import time_limit
-from rr_actors.system.console.console_client import Connections, NotRunning, find_console
-from rr_actors.system.console.console_messages import (
-    TIMEOUT_LIMIT_S,
-    VALUE_LIMIT_BYTES,
-    AskActor,
-    Done,
-    Find,
-    Found,
-    Hold,
-    Holding,
-    OpenRegistrar,
-    Release,
-    Replied,
+from rr_actors.registrar.queries import (
+    Holder,
+    Query,
+    Response,
+    StatusCallback,
+    end,
+    hear,
+    loaded_directly,
+    read_as,
+    was_given,
 )
+from rr_actors.registrar.registrar import Consumer
+from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, RemoteLoads, RemoteUnloads
+from rr_actors.runtime.callback_errors import described, log_raised
+from rr_actors.runtime.time_limits import time_limit
+from rr_actors.system.console.console_client import Connections, ConsoleClient, find_console
+from rr_actors.system.console.console_commands import AskActor, GivePriority, Hold, OpenRegistrar, Release
+from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES, Heard
+from rr_actors.system.console.console_questions import Find
 
-logger = logging.getLogger("rr_actors")
+T = TypeVar("T")
+
+logger = Log("rr_actors")
 
 _ANSWER_S = 60.0  # for a request that has no time limit of its own
 _GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
@@ -85,7 +96,7 @@ class Client:
         """
         limit_s = _limit(timeout_s)
         command = AskActor(actor, _encoded(message, f"message to {actor}"), limit_s)
-        return Codec(None, "answer").show(self._connections.ask(command, Replied, limit_s + _GRACE_S).answer)
+        return Codec(None, "answer").show(self._connections.ask(command, limit_s + _GRACE_S).answer)
 
     def close(self) -> None:
         """Close all registrars and connections. Their queries are released soon after. A second close does nothing."""
@@ -101,8 +112,226 @@ class Client:
         return f"<Client of {self.system} (pid {self.pid}) in {self.state_dir}>"
 
 
-class ClientRegistrar:
-    """A client's registrar: it loads, holds and releases. From any thread; a context manager closes it at the end.
+class _Given(bytes):
+    """The canonical bytes of a request, with the request as the caller gave it."""
+
+    value: Any
+
+
+NOT_FOR_CLIENTS = {
+    "force": "only the application takes a resource away from its holders",
+    "parent": "a client serves nothing, so no resource of it can need another",
+}
+"""The options of a registrar's calls that a client may not use, and why. It has no methods that serve or look."""
+
+
+class _ClientCalls(RemoteCalls):
+    """The calls of a client's registrar: requests to the system's console, of plain data, never pickles."""
+
+    def __init__(self, connections: Connections, name: str, views: _ClientViews) -> None:
+        super().__init__(name)
+        self.connections = connections
+        self.views = views
+
+    def send(self, reply: Reply[Any], method: str, *args: Any, **options: Any) -> None:
+        """Have a thread make the call."""
+        in_thread(reply, lambda: self.ask(method, *args, **options))
+
+    def ask(self, method: str, *args: Any, **options: Any) -> Any:
+        """Release queries: one, those at a server, or all. In the calling thread."""
+        _refuse(self.name, "force", options.get("force", False))
+        limit_s = _limit(options["timeout_s"])
+        query_id, server = ("", *args, "")[:2] if method == "unload_client" else ("".join(args), "")
+        self.connections.ask(Release(self.name, query_id, server, limit_s), limit_s + _GRACE_S)
+        self.views.forget(query_id, server)
+
+
+class _ClientLoads(RemoteLoads):
+    """The loads of a client's registrar. Each call in flight has a thread and a connection."""
+
+    def __init__(self, calls: _ClientCalls, holder: Holder) -> None:
+        super().__init__(calls, holder)
+        self._client = calls
+
+    def wait(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
+        """Load a resource in the calling thread."""
+        self.check(options)
+        return self._load(target, request, options)
+
+    def send_load(
+        self, reply: Reply[Query], target: ServerId, request: bytes, parent: str, options: LoadOptions
+    ) -> None:
+        """Have a thread load."""
+        in_thread(reply, lambda: self._load(target, request, options))
+
+    def send_all(
+        self, reply: Reply[Queries], requests: Sequence[LoadWanted], parent: str, options: LoadOptions
+    ) -> None:
+        """Have threads load, and release what is held if one load fails."""
+        in_thread(reply, lambda: self._load_all(requests, options))
+
+    def own(self, query: Query, options: LoadOptions) -> Query:
+        """Return the query, which is of this process."""
+        return query
+
+    def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
+        client, limit_s = self._client, _limit(options.timeout_s)
+        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority)
+        query: ClientQuery | None = None
+        try:
+            with client.connections.lent() as connection:  # if this ends before keep(), the system releases the query
+                held = connection.ask(command, limit_s + _GRACE_S)
+                query = ClientQuery(held.query_id, target, request, "", client.name, self.holder, _shown_types)
+                if options.codec is not None:
+                    read_as(query, options.codec)
+                loaded_directly(query, held.resource_id, held.response, held.state)
+                was_given(query, getattr(request, "value", None))
+                _ = query.response  # an error of its type is one of the load
+                client.views.add(query, options)
+                connection.keep()
+            return query
+        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
+            if query is not None:
+                threading.Thread(target=self.release, args=(query,), name="rr-undo").start()
+            raise
+
+    def _load_all(self, requests: Sequence[LoadWanted], options: LoadOptions) -> Queries:
+        sent: list[Reply[Query]] = []
+        try:
+            for target, request, _ in requests:
+                sent.append(Reply())
+                self.send_load(sent[-1], target, request, "", options)
+            wait(sent, return_when=FIRST_EXCEPTION)
+            for place, one in enumerate(sent):
+                if one.done() and isinstance(error := one.exception(), RrError):
+                    note_request(error, requests, place)
+                    raise error
+            return Queries(one.get() for one in sent)
+        except BaseException:
+            for one in reversed(sent):
+                if one.done() and one.exception() is None:
+                    self.release(one.get())
+                else:
+                    one.add_done_callback(self.release_later)
+            raise
+
+
+def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
+    """Have a new thread make a call, and set the reply. The application's executor may be full of other calls."""
+
+    def make() -> None:
+        try:
+            reply.set(call())
+        except BaseException as error:  # it is for the thread that reads the reply
+            fail(reply, error)
+
+    threading.Thread(target=make, name="rr-client", daemon=True).start()
+
+
+_EARLY = 1000
+
+
+class _ClientViews:
+    """The queries that a client's registrar holds, and the status callbacks. One thread passes the statuses on.
+
+    Args:
+        is_open: returns whether the registrar is open. When it is not, no callback begins any more.
+    """
+
+    def __init__(self, is_open: Callable[[], bool]) -> None:
+        self._is_open = is_open
+        self._lock = threading.Lock()
+        self._held: dict[str, tuple[ClientQuery, StatusCallback | None]] = {}
+        self._on_server: dict[str, list[StatusCallback]] = {}
+        self._early: dict[str, list[Heard]] = {}  # of loads whose answers have not been read yet
+
+    def add(self, query: ClientQuery, options: LoadOptions) -> None:
+        """Have statuses reach a query and its callback."""
+        own = None if options.on_status is None else described(options.on_status, "load: on_status")
+        if own is not None and options.loop is not None:
+            own = options.loop.bring(self._while_held(query.id, own))
+        with self._lock:
+            self._held[query.id] = query, own
+            early = self._early.pop(query.id, [])
+        for heard in early:
+            self.hear(heard)
+
+    def add_callback(self, server: str, callback: StatusCallback) -> None:
+        """Have the callback called for the queries at a server."""
+        with self._lock:
+            self._on_server.setdefault(server, []).append(callback)
+
+    def forget(self, query_id: str, server: str) -> None:
+        """Forget a query that is released; or all at a server; or all."""
+        with self._lock:
+            held = [query for query, _ in self._held.values()]
+            gone = [one for one in held if query_id in ("", one.id) and server in ("", one.server_id)]
+            for query in gone:
+                del self._held[query.id]
+        for query in gone:
+            end(query)
+
+    def hear(self, heard: Heard) -> None:
+        """Pass a status on to its query, and to the callbacks."""
+        with self._lock:
+            held = self._held.get(heard.query_id)
+            if held is None:
+                self._early.setdefault(heard.query_id, []).append(heard)
+                if len(self._early) > _EARLY:  # the oldest is of a query that was released meanwhile
+                    del self._early[next(iter(self._early))]
+                return
+            query, own = held
+            callbacks = [*([own] if own is not None else []), *self._on_server.get(query.server_id, ())]
+        place = {"resource_id": heard.resource_id, "query_id": heard.query_id, "source": heard.source}
+        status = Status(heard.state, heard.message, **place, repeated=heard.repeated)
+        hear(query, status, heard.response, released=heard.released)
+        for callback in callbacks:
+            if not self._hears(query.id):
+                return
+            try:
+                if inspect.isawaitable(answer := callback(status)):
+                    asyncio.run(_await(answer))
+            except Exception as error:
+                log_raised(logger, error, "a status callback for %s raised", query.server_id)
+
+    def _hears(self, query_id: str) -> bool:
+        return query_id in self._held and self._is_open()
+
+    def _while_held(self, query_id: str, callback: StatusCallback) -> Callable[[Status], Coroutine[Any, Any, None]]:
+        async def begin(status: Status) -> None:
+            if self._hears(query_id):
+                await callback(status)
+
+        return begin
+
+
+def _listen(lifeline: ConsoleClient, name: str, views_of: Callable[[], _ClientViews | None]) -> None:
+    """Pass on the statuses of a registrar, until it is closed or nobody has it any more. In a thread of its own."""
+    try:
+        while True:
+            statuses = lifeline.wait_statuses(name)
+            views = views_of()
+            if views is None:
+                return
+            for heard in statuses:
+                views.hear(heard)
+            del views  # while it waits, the registrar may be collected
+    except RrError as error:  # NotRunning: the registrar is closed, or the system has ended
+        logger.debug("registrar %s hears no more statuses: %s", name, error)
+    if (views := views_of()) is not None:
+        views.forget("", "")
+
+
+async def _await(answer: Awaitable[object]) -> None:
+    await answer
+
+
+class ClientRegistrar(Consumer):
+    """A client's registrar: it loads, holds and releases, as Registrar does. A context manager closes it at the end.
+
+    Call it from any thread. A thread of the client runs the status callbacks, one after the other. A load without a
+    time limit takes a day at most. Its calls raise two more errors than those of Registrar. NotRunning: the system has
+    ended, or the client is closed. NotSerializable: a request is over 900,000 bytes, or a response over 4 MiB.
 
     Attributes:
         name: the registrar's name in the system, "client.NAME".
@@ -112,61 +341,53 @@ class ClientRegistrar:
         self._connections = connections
         self._lifeline = connections.open()
         try:
-            done = self._lifeline.ask(OpenRegistrar(name), Done)
+            done = self._lifeline.ask(OpenRegistrar(name))
         except BaseException:
             self._lifeline.close()
             raise
-        self.name: str = done.facts["registrar"]
+        self._name: str = done.facts["registrar"]
+        self._views = _ClientViews(self._lifeline.is_open)
+        calls = _ClientCalls(connections, self._name, self._views)
+        self._client_loads = _ClientLoads(calls, self)
+        self._unload_ways = RemoteUnloads(calls)
+        weakref.finalize(self, self._lifeline.close)  # else the thread would keep it open for ever
+        listens = self._lifeline, self._name, weakref.ref(self._views)
+        threading.Thread(target=_listen, args=listens, name="rr-statuses", daemon=True).start()
 
-    def load(
-        self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
-    ) -> ClientQuery:
-        """Load a resource, or share it if another query holds it already, and return a query of it.
+    @property
+    def _load_ways(self) -> _ClientLoads:
+        return self._client_loads
 
-        Args:
-            server: "registrar/server".
-            request: a value of the server's request type.
-            response_type: the type to read the response as. None: classes in it are read as dicts.
-            timeout_s: seconds that the load may take; None: a day.
+    @property
+    def name(self) -> str:
+        """The registrar's name in the system, "client.NAME"."""
+        return self._name
 
-        Raises:
-            LoadError: as Registrar.load().
-            NotSerializable: the request is no plain data, or longer than 900,000 bytes; or the response than 4 MiB.
-            NotRunning: the system has ended, or this client is closed.
-        """
-        limit_s, target = _limit(timeout_s), str(parse_server_id(server))
-        command = Hold(self.name, target, _encoded(request, "request"), limit_s)
-        codec = Codec(response_type, f"{target}: response")
-        query: ClientQuery | None = None
-        try:
-            with self._connections.lent() as client:  # if this ends before keep(), the system releases the query
-                held = client.ask(command, Holding, limit_s + _GRACE_S)
-                data = held.response
-                response = codec.show(data) if response_type is None else codec.decode(data, target, "response")
-                query = ClientQuery(self, held.query_id, held.resource_id, target, request, response)
-                client.keep()
-            return query
-        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
-            if query is not None:
-                _release_later(query)
-            raise
+    def _target(self, server: object) -> ServerId:
+        return parse_server_id(server)
 
-    async def load_async(
-        self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
-    ) -> ClientQuery:
-        """Load as load() does, from any event loop. If cancelled, release the query when the load has ended."""
-        return await _awaited(lambda: self.load(server, request, response_type=response_type, timeout_s=timeout_s))
+    def _holder(self, parent: Parent | None) -> tuple[Consumer, str]:
+        _refuse(self._name, "parent", parent is not None)
+        return self, ""
 
-    def unload(self, query_or_id: ClientQuery | str, *, timeout_s: float | None = 30.0) -> None:
-        """Release a query.
+    def _group(self, requests: Sequence[LoadWanted], parent: str, options: LoadOptions) -> GroupWays:
+        return RemoteGroup(self._client_loads, requests, parent, options)
 
-        Raises:
-            UnknownQuery: the query is not held.
-            UnloadFailed: it was the last query, and the unload callback raised. The query is still held.
-            NotRunning: the system has ended.
-        """
-        limit_s = _limit(timeout_s)
-        self._connections.ask(Release(self.name, _id_of(query_or_id), limit_s), Done, limit_s + _GRACE_S)
+    def _check_open(self) -> None:
+        """Do nothing: a call of a closed client raises NotRunning."""
+
+    def _may_block(self) -> bool:
+        return True
+
+    @staticmethod
+    def _encode(value: Any) -> bytes:
+        given = _Given(_encoded(value, "request"))
+        given.value = value
+        return given
+
+    def on_status(self, server: str, callback: StatusCallback) -> None:
+        """Call `callback(status)` for every query that this registrar holds at that server, now and later."""
+        self._views.add_callback(str(self._target(server)), checked_callback(callback))
 
     def queries(self) -> list[QueryRow]:
         """Return the queries that the registrar holds, each with the state of its last status.
@@ -181,7 +402,7 @@ class ClientRegistrar:
             raise Unavailable(f"{self.name}: its queries are not known: {'; '.join(found.notes)}")
         return found.rows
 
-    def fetch_state(self, query_or_id: ClientQuery | str) -> str:
+    def fetch_state(self, query_or_id: Query | str) -> str:
         """Ask the system for the state of the last status of a query: "OK", "WARNING" ...
 
         Raises:
@@ -189,13 +410,33 @@ class ClientRegistrar:
             NotRunning: the system has ended.
             Unavailable: the registrar does not answer.
         """
-        id = _id_of(query_or_id)
-        found = self._connections.ask(Find(id, self.name), Found)
+        return self._row(target_id(query_or_id)).state
+
+    def fetch_priority(self, query_or_id: Query | str) -> int | None:
+        """Ask the system for the priority of a query; None: on standby.
+
+        Raises:
+            UnknownQuery, NotRunning, Unavailable: as for fetch_state().
+        """
+        return self._row(target_id(query_or_id)).priority
+
+    def set_priority(self, query_or_id: Query | str, priority: int | None) -> None:
+        """Give a query of this registrar a priority, as `query.priority = 5` does.
+
+        Raises:
+            UsageError: as for Registrar.set_priority().
+            UnknownQuery, NotRunning, Unavailable: as for fetch_state().
+        """
+        given = checked_priority(priority, "set_priority")
+        self._connections.ask(GivePriority(self._row(target_id(query_or_id)).id, given))
+
+    def _row(self, id: str) -> QueryRow:
+        found = self._connections.ask(Find(id, self.name))
         for row in found.queries:
-            if row.id == id:
-                return row.state
+            if row.id == id and row.hold != "owed":
+                return row
         if found.notes:
-            raise Unavailable(f"query {id}: its state is not known: {'; '.join(found.notes)}")
+            raise Unavailable(f"query {id}: nothing is known of it: {'; '.join(found.notes)}")
         raise UnknownQuery(f"query {id}: {self.name} does not hold it any more", query_id=id)
 
     def close(self) -> None:
@@ -212,41 +453,37 @@ class ClientRegistrar:
         return f"<ClientRegistrar {self.name}>"
 
 
-class ClientQuery:
-    """A client's hold on one resource. As a context manager it is released at the end.
+class ClientQuery(Query[Response]):
+    """A client's hold on one resource: a Query. As a context manager it is released at the end.
 
-    Attributes:
-        id, resource_id: as those of a Query.
-        server_id: "registrar/server".
-        request, response: the request, and the response that the load returned.
+    Statuses reach it a moment later than a query of the application. A class in a response of which no type is known
+    is read as a dict.
     """
 
-    def __init__(
-        self, holder: ClientRegistrar, id: str, resource_id: str, server_id: str, request: Any, response: Any
-    ) -> None:
-        self._holder = holder
-        self.id = id
-        self.resource_id = resource_id
-        self.server_id = server_id
-        self.request = request
-        self.response = response
+    __slots__ = ()
 
-    def fetch_state(self) -> str:
-        """Ask the system for the state of the query's last status, as ClientRegistrar.fetch_state() does."""
-        return self._holder.fetch_state(self)
-
-    def unload(self, *, timeout_s: float | None = 30.0) -> None:
-        """Release the query, as ClientRegistrar.unload() does."""
-        self._holder.unload(self, timeout_s=timeout_s)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.unload()
+    def _may_be_gone(self) -> bool:
+        """Return True: that the provider has taken the resource away may be known in the system first."""
+        return True
 
     def __repr__(self) -> str:
-        return f"<ClientQuery {self.id} of {self._holder.name} on {self.server_id}>"
+        return f"<ClientQuery {self.id} of {self.origin} on {self.server_id}>"
+
+
+class _ShownPlain(Codec):
+    """Decodes as far as the types are known here."""
+
+    def decode(self, raw: bytes, server: str = "", what: str = "request") -> Any:
+        """Return the value of these bytes; a class that is not known is read as a dict."""
+        return _any.show(raw)
+
+
+_any = Codec(None, "response")
+_plain = _ShownPlain(None, "response")
+
+
+def _shown_types(_server_id: str) -> tuple[Codec, Codec]:
+    return _plain, _plain
 
 
 def connect(state_dir: str | os.PathLike[str] | None = None) -> Client:
@@ -278,42 +515,6 @@ def _encoded(value: Any, what: str) -> bytes:
     return data
 
 
-def _id_of(query_or_id: ClientQuery | str) -> str:
-    return query_or_id if isinstance(query_or_id, str) else query_or_id.id
-
-
-async def _awaited(load: Callable[[], ClientQuery]) -> ClientQuery:
-    """Await a load that a thread makes; if cancelled, release its query later, even if the loop has ended by then."""
-    loaded: Future[ClientQuery] = Future()
-
-    def make() -> None:
-        try:
-            loaded.set_result(load())
-        except BaseException as error:
-            loaded.set_exception(error)
-
-    try:
-        asyncio.get_running_loop().run_in_executor(None, make)
-        return await asyncio.shield(asyncio.wrap_future(loaded))
-    except BaseException:  # cancelled, or KeyboardInterrupt: the caller never gets the query
-        loaded.add_done_callback(_undo)
-        raise
-
-
-def _undo(loaded: Future[ClientQuery]) -> None:
-    if loaded.exception() is None:
-        _release_later(loaded.result())
-
-
-def _release_later(query: ClientQuery) -> None:
-    """Release a query in a thread of its own: the caller was interrupted, or its loop and threads may be ending."""
-    threading.Thread(target=_release, args=(query,), name="rr-undo").start()
-
-
-def _release(query: ClientQuery) -> None:
-    try:
-        query.unload()
-    except (NotRunning, UnknownQuery):
-        logger.debug("%r: the system has released it, or has ended, or its client is closed", query)
-    except RrError:
-        logger.exception("%r: its load was cancelled, and it is not released", query)
+def _refuse(name: str, option: str, is_used: bool) -> None:
+    if is_used:
+        raise UsageError(f"registrar {name!r}: {option}: {NOT_FOR_CLIENTS[option]}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import socket
 import sys
 import threading
@@ -17,43 +18,26 @@ from typing import Any, Self, TypeVar
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, Unavailable, UsageError
-from rr_actors.registrar.model.messages import error_of
-from rr_actors.system.console.console_messages import (
-    ANSWER_LIMIT_BYTES,
-    PAGE_LIMIT,
-    REQUEST_LIMIT_BYTES,
-    SOCKET,
-    VERSION,
-    Answer,
-    BeginRecording,
-    Children,
-    Entries,
-    Events,
-    Follow,
-    Following,
-    Hello,
-    Holding,
-    Keep,
+from rr_actors.base.errors import ConfigError, NotRunning, Unavailable, UsageError
+from rr_actors.base.values.failure import error_of
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_commands import AwaitStatuses
+from rr_actors.system.console.console_protocol import ANSWERS, answer_of, decoder_of
+from rr_actors.system.console.console_questions import (
     ListChildren,
+    Listing,
     ListQueries,
     ListRegistrars,
     ListResources,
-    Missed,
-    PageRequest,
-    Queries,
-    Refused,
-    Registrars,
-    Request,
-    Resources,
-    Welcome,
+    ListUsages,
 )
+from rr_actors.system.console.console_view import Verb
 from rr_actors.system.console.running_systems import consoles_in, running_systems
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_at
 
 _A = TypeVar("_A")
-_Page = TypeVar("_Page", Children, Registrars, Resources, Queries)
+_Page = TypeVar("_Page", c.Children, c.Registrars, c.Resources, c.Queries, c.Usages)
 _GREETING_S = 5.0
 _RETRY_S = 0.01
 _IDLE = 8  # connections that are kept for the next call
@@ -67,6 +51,7 @@ class ConsoleClient:
     Args:
         run_dir: the directory of the console's socket, as find_console() returns it.
         timeout_s: seconds that an answer may take.
+        client: the same for all connections of a client; "": this is its only one.
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
@@ -78,21 +63,21 @@ class ConsoleClient:
         Unavailable: the console is another user's, or speaks another version.
     """
 
-    def __init__(self, run_dir: Path, *, timeout_s: float = 60.0) -> None:
+    def __init__(self, run_dir: Path, *, timeout_s: float = 60.0, client: str = "") -> None:
         self.run_dir = run_dir
         self.timeout_s = timeout_s
         self._socket = _connected(run_dir)
-        self._frames = FrameReader(msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
-        self._answers: deque[Answer] = deque()
+        self._frames = FrameReader(decoder_of(ANSWERS), c.ANSWER_LIMIT_BYTES)
+        self._answers: deque[c.Message] = deque()
         self.is_broken = False
         try:
-            self.welcome = self.ask(Hello(VERSION), Welcome, _GREETING_S)
+            self.welcome = self._asked(c.Hello(c.VERSION, client), c.Welcome, _GREETING_S)
         except BaseException:
             self.close()
             raise
 
-    def ask(self, request: Request, expected: type[_A], timeout_s: float | None = None) -> _A:
-        """Send a request and return its answer, which is of the type `expected`.
+    def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
+        """Send a question or a command, and return its answer.
 
         Args:
             timeout_s: seconds that the answer may take; None: the client's own limit.
@@ -102,80 +87,101 @@ class ConsoleClient:
             NotRunning: the system has ended.
             Unavailable: no answer came in time; the system may carry out the request all the same.
         """
+        return self._asked(request, answer_of(type(request)), timeout_s)
+
+    def _asked(self, request: c.Message, expected: type[_A], timeout_s: float | None) -> _A:
         self.is_broken = True
         self._send(request)
         answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
-        self.is_broken = isinstance(answer, Holding | Refused)
+        self.is_broken = isinstance(answer, c.Holding | c.Refused)
         return _checked(answer, expected)
+
+    def wait_statuses(self, registrar: str) -> list[c.Heard]:
+        """Wait without limit for statuses of the queries of the registrar that this connection has opened."""
+        self._send(AwaitStatuses(registrar))
+        return _checked(self._receive(None), c.Statuses).statuses
 
     def keep(self) -> None:
         """Say that the query of the last Holding has arrived; otherwise the end of the connection releases it."""
-        self._send(Keep())
+        self._send(c.Keep())
         self.is_broken = False
 
-    def children(self) -> Children:
+    def children(self) -> c.Children:
         """Return all children of the tree, read page by page."""
-        return self._all(ListChildren(), Children)
+        return self._all(ListChildren())
 
-    def registrars(self) -> Registrars:
+    def registrars(self) -> c.Registrars:
         """Return all registrars, read page by page."""
-        return self._all(ListRegistrars(), Registrars)
+        return self._all(ListRegistrars())
 
-    def resources(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> Resources:
+    def resources(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> c.Resources:
         """Return the resources of a registrar, or of all, that ListResources(match) finds; at most `limit`."""
-        return self._all(ListResources(match, registrar=registrar), Resources, limit)
+        return self._all(ListResources(match, registrar=registrar), limit)
 
-    def queries(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> Queries:
+    def usages(self, registrar: str = "", match: str = "") -> c.Usages:
+        """Return what the resources use that ListUsages(match) finds, of a registrar, or of all."""
+        return self._all(ListUsages(match, registrar=registrar))
+
+    def queries(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> c.Queries:
         """Return the queries that a registrar holds, or all, that ListQueries(match) finds; at most `limit`."""
-        return self._all(ListQueries(match, registrar=registrar), Queries, limit)
+        return self._all(ListQueries(match, registrar=registrar), limit)
 
-    def _all(self, request: PageRequest, expected: type[_Page], limit: int = sys.maxsize) -> _Page:
+    def _all(self, request: Listing[_Page], limit: int = sys.maxsize) -> _Page:
         """Return the rows of all pages, at most `limit`, with the notes of all pages."""
-        rows: list[Any] = []
-        notes: dict[str, None] = {}
-        while True:
-            left = max(1, min(limit - len(rows), PAGE_LIMIT))
-            page = self.ask(msgspec.structs.replace(request, offset=len(rows), limit=left), expected)
-            rows += page.rows
-            if isinstance(page, Resources | Queries):
-                notes.update(dict.fromkeys(page.notes))
-            if not page.rows or len(rows) >= min(page.total, limit):
-                more = {"notes": list(notes)} if notes else {}
-                return msgspec.structs.replace(page, rows=rows[:limit], **more)
+        pages = list(read_pages(self.ask, request, limit))
+        rows: list[Any] = [row for page in pages for row in page.rows]
+        notes = dict.fromkeys(note for page in pages for note in getattr(page, "notes", ()))
+        more = {"notes": list(notes)} if notes else {}
+        return msgspec.structs.replace(pages[-1], rows=rows[:limit], **more)
 
-    def follow(self, follow: Follow) -> Iterator[Events | Missed]:
+    def follow(self, follow: c.Follow, tick_s: float | None = None) -> Iterator[c.Events | c.Missed]:
         """Yield the events from now on, until the system ends. The connection has no other use after that.
 
-        A Missed has the number of events that this reader was too slow for, and the first page of the tree now.
+        After `tick_s` without events it yields an Events without any. A Missed has the number of events that this
+        reader was too slow for, and the first page of the tree now.
 
         Raises:
             RrError: the system refused the request.
         """
-        return self._parts(follow)
+        return self._parts(follow, tick_s)
 
-    def record(self) -> Iterator[Entries]:
+    def record(self) -> Iterator[c.Entries]:
         """Yield the recorded entries from now on, as follow() does. `dropped` has those that this reader missed, too.
 
         Raises:
             RrError: the system refused the request.
         """
-        parts = self._parts(BeginRecording())
-        return (Entries([], part.count) if isinstance(part, Missed) else part for part in parts)
+        parts = self._parts(c.BeginRecording())
+        return (c.Entries([], part.count) if isinstance(part, c.Missed) else part for part in parts)
 
-    def _parts(self, request: Follow | BeginRecording) -> Iterator[Any]:
+    def _parts(self, request: c.Follow | c.BeginRecording, tick_s: float | None = None) -> Iterator[Any]:
         self._send(request)
-        _checked(self._receive(self.timeout_s), Following)
-        return self._fed()
+        _checked(self._receive(self.timeout_s), c.Following)
+        return self._fed(tick_s)
 
-    def _fed(self) -> Iterator[Any]:
+    def _fed(self, tick_s: float | None) -> Iterator[Any]:
+        poll = select.poll()
+        poll.register(self._socket, select.POLLIN)
         while True:
+            if tick_s is not None and not self._answers and not poll.poll(tick_s * 1000):
+                yield c.Events([])
+                continue
             try:
                 answer = self._receive(None)
             except NotRunning:
                 return
-            if isinstance(answer, Refused):
+            if isinstance(answer, c.Refused):
                 raise error_of(answer.failure)
             yield answer
+
+    def is_open(self) -> bool:
+        """Return whether neither side has closed the connection; the thread that waits for answers asks between two."""
+        try:
+            return bool(self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
+        except BlockingIOError:
+            return True
+        except OSError:  # closed here
+            return False
 
     def close(self) -> None:
         """Close the connection; a call that waits in another thread raises NotRunning. A second close does nothing."""
@@ -193,8 +199,8 @@ class ConsoleClient:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _send(self, request: Request) -> None:
-        frame = framed(request, REQUEST_LIMIT_BYTES, "the longest request of a console")
+    def _send(self, request: c.Message) -> None:
+        frame = framed(request, c.REQUEST_LIMIT_BYTES, "the longest request of a console")
         try:
             self._socket.settimeout(self.timeout_s)
             self._socket.sendall(frame)
@@ -203,7 +209,7 @@ class ConsoleClient:
         except OSError:
             return  # the console has refused the connection: its answer is read next
 
-    def _receive(self, timeout_s: float | None) -> Answer:
+    def _receive(self, timeout_s: float | None) -> c.Message:
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while not self._answers:
             try:
@@ -224,12 +230,22 @@ class ConsoleClient:
         return f"the system in {self.run_dir.parent.parent}"
 
 
-class NotRunning(Unavailable):
-    """No running system was reached, or the system has ended."""
+def read_pages(
+    ask: Callable[[Listing[_Page]], _Page], request: Listing[_Page], limit: int = sys.maxsize
+) -> Iterator[_Page]:
+    """Ask for one page after another, and yield them, until there are `limit` rows or no more."""
+    count = 0
+    while True:
+        left = max(1, min(limit - count, c.PAGE_LIMIT))
+        page = ask(msgspec.structs.replace(request, offset=count, limit=left))
+        yield page
+        count += len(page.rows)
+        if not page.rows or count >= min(page.total, limit):
+            return
 
 
-def _checked(answer: Answer, expected: type[_A]) -> _A:
-    if isinstance(answer, Refused):
+def _checked(answer: c.Message, expected: type[_A]) -> _A:
+    if isinstance(answer, c.Refused):
         raise error_of(answer.failure)
     if not isinstance(answer, expected):
         raise Unavailable(f"console: expected {expected.__name__}, got {type(answer).__name__}")
@@ -242,7 +258,7 @@ def _connected(run_dir: Path) -> socket.socket:
     try:
         while True:
             try:
-                connected = sockets.connect(SOCKET)
+                connected = sockets.connect(c.SOCKET)
                 break
             except BlockingIOError as error:  # too many connections wait to be accepted
                 if time.monotonic() > deadline:
@@ -250,12 +266,12 @@ def _connected(run_dir: Path) -> socket.socket:
                 time.sleep(_RETRY_S)
             except (OSError, ConfigError) as error:
                 why = getattr(error, "strerror", None) or error
-                raise NotRunning(f"{run_dir / SOCKET}: no system listens there ({why})") from error
+                raise NotRunning(f"{run_dir / c.SOCKET}: no system listens there ({why})") from error
     finally:
         sockets.close()
     if not (peer := peer_at(connected)).trusted:
         connected.close()
-        raise Unavailable(f"{run_dir / SOCKET}: expected a system of user {os.geteuid()}, got one of user {peer.uid}")
+        raise Unavailable(f"{run_dir / c.SOCKET}: expected a system of user {os.geteuid()}, got one of user {peer.uid}")
     return connected
 
 
@@ -270,6 +286,7 @@ class Connections:
     def __init__(self, find: Callable[[], Path], timeout_s: float) -> None:
         self._find = find
         self._timeout_s = timeout_s
+        self._name = os.urandom(8).hex()
         self._closed = ""
         self._lock = threading.Lock()
         self._idle: list[ConsoleClient] = []
@@ -284,7 +301,7 @@ class Connections:
             Unavailable: the system is another user's, or speaks another version.
         """
         if not self._closed:
-            client = ConsoleClient(self._find(), timeout_s=self._timeout_s)
+            client = ConsoleClient(self._find(), timeout_s=self._timeout_s, client=self._name)
             with self._lock:
                 if not self._closed:
                     self._all.add(client)
@@ -313,8 +330,8 @@ class Connections:
         finally:
             self._give_back(client)
 
-    def ask(self, request: Request, expected: type[_A], timeout_s: float | None = None) -> _A:
-        """Send a request and return its answer.
+    def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
+        """Send a question or a command, and return its answer.
 
         Raises:
             RrError: the system refused the request, or could not carry it out.
@@ -322,7 +339,7 @@ class Connections:
             Unavailable: no answer came in time; the system may carry out the request all the same.
         """
         with self.lent() as client:
-            return client.ask(request, expected, timeout_s)
+            return client.ask(request, timeout_s)
 
     def close(self, why: str) -> None:
         """Close all connections. Calls in flight and later ones raise NotRunning. A second close does nothing."""

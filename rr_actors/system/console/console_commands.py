@@ -1,246 +1,213 @@
-"""Commands of a console: they change something. The answer is a sentence that says what was done. In a worker."""
+"""Commands of a console: they change something. The answer is a sentence that says what was done."""
 
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from rr_actors.base.errors import ActorUnavailable, NotFound, UnknownQuery, UsageError, shown
-from rr_actors.base.names import parse_server_id
+from rr_actors.base.errors import (
+    ActorUnavailable,
+    NotFound,
+    NotSerializable,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UsageError,
+    few,
+    shown,
+    text_of,
+)
+from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id, short_ids
+from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.pages import QueryRow, ResourceRow
-from rr_actors.registrar.registrar import Registrar
+from rr_actors.registrar.queries import response_bytes
+from rr_actors.registrar.registrar import load_bytes
 from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.runtime.processes.process import signal_name
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
-from rr_actors.system.console.client_registrars import ClientRegistrars, ask
-from rr_actors.system.console.console_messages import (
-    RESPONSE_LIMIT_BYTES,
-    Answer,
-    AskActor,
-    Command,
-    Done,
-    Hold,
-    Kill,
-    Load,
-    OpenRegistrar,
-    Release,
-    Restart,
-    SendStatus,
-    ShutDown,
-    StartChild,
-    Terminate,
-    Unload,
-)
-from rr_actors.system.console.console_questions import View
-from rr_actors.wire.name_service import Status as Presence
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_view import REGISTRAR, Caller, Command, View
 
-REGISTRAR = "console"
-"""The registrar of the system that holds the resources that a console loads and keeps. The first such load opens it."""
+# -- resources -------------------------------------------------------------------------------------------------------
 
 
-class Commands:
-    """The commands of the consoles of one system. From workers.
+class Load(Command[c.Done], frozen=True):
+    """Load a resource.
 
-    Args:
-        shut_down: stops the system, in a thread of its own.
+    Attributes:
+        server: "registrar/server".
+        request: the request as JSON.
+        holder: the registrar that holds the resource; "": the console's own registrar.
+        keep: hold the resource after the answer. Otherwise it is released at once.
+        dry_run: change nothing; the answer says what would be done.
     """
 
-    def __init__(self, view: View, shut_down: Callable[[], None]) -> None:
-        self._view = view
-        self._shut_down = shut_down
-        self._opening = threading.Lock()
-        self.clients = ClientRegistrars()
+    server: c.Text
+    request: c.Long
+    holder: c.Text = ""
+    keep: bool = False
+    timeout_s: c.Seconds = 30.0
+    dry_run: bool = False
+    priority: c.Priority = 0
 
-    def carry_out(self, command: Command, is_gone: Callable[[], bool], connection: object) -> Answer:
-        """Carry out a command, and return an answer that says what was done.
-
-        Args:
-            is_gone: returns whether the client has left.
-            connection: the client's connection; a registrar that is opened for the client lives as long.
-
-        Raises:
-            RrError: the command cannot be carried out; nothing was changed, or the error says what was.
-        """
-        match command:
-            case Load():
-                return self._load(command, is_gone)
-            case Unload():
-                return self._unload(command)
-            case SendStatus():
-                return self._send_status(command)
-            case Kill():
-                return self._kill(command)
-            case Terminate():
-                return self._terminate(command)
-            case Restart():
-                return self._restart(command)
-            case StartChild():
-                return self._start(command)
-            case ShutDown():
-                return self._stop(command)
-            case OpenRegistrar():
-                return self.clients.open(self._view, command.name, connection)
-            case Hold():
-                return self.clients.hold(command)
-            case Release():
-                return self.clients.release(command)
-            case AskActor():
-                return ask(self._view.system, command)
-
-    # -- resources ---------------------------------------------------------------------------------------------------
-
-    def _load(self, command: Load, is_gone: Callable[[], bool]) -> Done:
-        value = _json(command.request)
-        server = parse_server_id(command.server)
-        holder = command.holder or REGISTRAR
-        if command.holder:
-            self._view.registrar(holder)
-        facts: dict[str, Any] = {"server": str(server), "holder": holder, "kept": command.keep}
-        if command.dry_run:
-            servers = self._view.registrar(server.registrar).servers()
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        value = _json(self.request)
+        server = parse_server_id(self.server)
+        holder = self.holder or REGISTRAR
+        if self.holder:
+            view.registrar(holder)
+        facts: dict[str, Any] = {"server": str(server), "holder": holder, "kept": self.keep}
+        if self.dry_run:
+            servers = view.registrar(server.registrar).servers()
             if str(server) not in servers:
                 there = ", ".join(servers) or "none"
                 raise NotFound(f"{server}: registrar {server.registrar!r} has no such server (it has: {there})")
-            return Done(f"would load {server} {command.request}, held by {holder}", facts)
-        query = self._holder(command.holder).load(str(server), value, timeout_s=command.timeout_s)
+            return c.Done(f"would load {server} {self.request}, held by {holder}", facts)
+        query = view.holder(self.holder).load(str(server), value, timeout_s=self.timeout_s, priority=self.priority)
         facts |= {"query_id": query.id, "resource_id": query.resource_id, "response": _plain(query.response)}
-        if command.keep and not is_gone():
-            return Done(f"loaded {server}: {holder} holds it as query {query.id}", facts)
-        query.unload(timeout_s=command.timeout_s)
-        return Done(f"loaded {server} and released it again", facts | {"kept": False})
+        if self.keep and not caller.is_gone:
+            return c.Done(f"loaded {server}: {holder} holds it as query {short_id(query.id)}", facts)
+        query.unload(timeout_s=self.timeout_s)
+        return c.Done(f"loaded {server} and released it again", facts | {"kept": False})
 
-    def _holder(self, name: str) -> Registrar:
-        if not name:
-            with self._opening:
-                if self._view.node.status_of(REGISTRAR) in (None, Presence.GONE, Presence.DORMANT):
-                    return self._view.open_registrar(REGISTRAR)
-        return self._view.system.registrar(name or REGISTRAR)
 
-    def _unload(self, command: Unload) -> Done:
-        found = self._view.find(command.id)
-        if command.force:
-            resource = _only_resource(command.id, found.resources)
-            text = f"{resource.server} {resource.request} (resource {resource.id}) away from {_count(resource)}"
-            if command.dry_run:
-                return Done(f"would take {text}", {"resource_id": resource.id})
-            registrar = self._view.registrar(resource.server.partition("/")[0])
-            registrar.unload(resource.id, force=True, timeout_s=command.timeout_s)
-            return Done(f"took {text}", {"resource_id": resource.id})
-        query = self._only_query(command.id, found.queries, found.resources)
-        text = f"query {query.id} of {query.origin} on {query.server} {query.request}"
+class GivePriority(Command[c.Done], frozen=True):
+    """Give a query of any holder a priority. `id` may be the beginning or end of an id."""
+
+    id: c.Text
+    priority: c.Priority
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        found = view.find(self.id)
+        query = _only_query(self.id, found.queries, found.resources, "name one of these")
+        said = "standby" if self.priority is None else f"priority {self.priority}"
+        text = f"{said} to query {short_id(query.id)} of {query.origin} on {query.name}"
+        facts = {"query_id": query.id, "holder": query.origin, "server": query.server, "priority": self.priority}
+        if self.dry_run:
+            return c.Done(f"would give {text}", facts)
+        view.registrar(query.origin).set_priority(query.id, self.priority)
+        return c.Done(f"gave {text}", facts)
+
+
+class Unload(Command[c.Done], frozen=True):
+    """Release a query of any holder; with `force` take a resource away from all its holders.
+
+    `id` may be the beginning or end of an id, or the name of a resource with one holder.
+    """
+
+    id: c.Text
+    force: bool = False
+    timeout_s: c.Seconds = 30.0
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        if self.force and "/" in self.id and " " not in self.id:
+            return _clear(view, self.id, self.dry_run)
+        found = view.find(self.id)
+        if self.force:
+            resource = _only_resource(self.id, found.resources)
+            text = f"{resource.name} ({short_id(resource.id)}) away from {_count(resource)}"
+            if self.dry_run:
+                return c.Done(f"would take {text}", {"resource_id": resource.id})
+            registrar = view.registrar(resource.server.partition("/")[0])
+            registrar.unload(resource.id, force=True, timeout_s=self.timeout_s)
+            return c.Done(f"took {text}", {"resource_id": resource.id})
+        if " " in self.id and len(found.resources) == 1 and found.resources[0].holder_count == 1:
+            found = view.find(found.resources[0].holders[0].query_id)
+        query = _only_query(self.id, found.queries, found.resources)
+        text = f"query {short_id(query.id)} of {query.origin} on {query.name}"
         facts = {"query_id": query.id, "holder": query.origin, "server": query.server}
-        if command.dry_run:
-            return Done(f"would release {text}", facts)
-        self._view.registrar(query.origin).unload(query.id, timeout_s=command.timeout_s)
-        return Done(f"released {text}", facts)
+        if self.dry_run:
+            return c.Done(f"would release {text}", facts)
+        view.registrar(query.origin).unload(query.id, timeout_s=self.timeout_s)
+        return c.Done(f"released {text}", facts)
 
-    def _only_query(self, id: str, queries: list[QueryRow], resources: list[ResourceRow]) -> QueryRow:
-        held = [row for row in queries if row.hold == "held"]
-        if len(held) == 1:
-            return held[0]
-        if len(held) > 1:
-            several = ", ".join(f"{row.id} of {row.origin}" for row in held)
-            raise UsageError(f"{shown(id)}: several queries begin so: {several}; give more of the id")
-        if resources:
-            holders = ", ".join(f"{holder.query_id} of {holder.origin}" for holder in resources[0].holders) or "none"
-            raise UnknownQuery(
-                f"{shown(id)}: it is a resource, and its queries are: {holders}; release one of these, or take the "
-                "resource away from all of them (--force)",
-                query_id=id,
-            )
-        raise UnknownQuery(f"{shown(id)}: nobody holds a query of this id", query_id=id)
 
-    def _send_status(self, command: SendStatus) -> Done:
-        resource = _only_resource(command.id, self._view.find(command.id, command.registrar).resources)
-        said = f"{command.state}: {command.message}" if command.message else command.state
-        text = f"{resource.server} {resource.request} (resource {resource.id}): {said}"
-        facts = {"resource_id": resource.id, "server": resource.server, "state": command.state}
-        if command.dry_run:
-            return Done(f"would tell {_count(resource)} of {text}", facts)
-        registrar = self._view.registrar(resource.server.partition("/")[0])
-        registrar.send_status(resource.id, Status(command.state, command.message))
-        return Done(f"told {_count(resource)} of {text}", facts)
+def _clear(view: View, server: str, dry_run: bool) -> c.Done:
+    """Remove all resources of a server that is not registered."""
+    name, _, local = server.partition("/")
+    registrar = view.registrar(name)
+    if server in registrar.servers():
+        raise UsageError(f"{server}: the server is registered: unload its resources one by one, by their ids")
+    text = f"all resources of {server}, which is not registered"
+    if not dry_run:
+        registrar.unregister_server(local)
+    return c.Done(f"would remove {text}" if dry_run else f"removed {text}", {"server": server})
 
-    # -- the tree ----------------------------------------------------------------------------------------------------
 
-    def _kill(self, command: Kill) -> Done:
-        path, supervisor, child = self._child(command.child)
-        if child.pid is None:
-            raise ActorUnavailable(f"{path}: it is {child.state}, and has no process to be killed", id=path)
-        above, _, id = supervisor.path.rpartition("/")
-        if child.pid == (SupervisorRef(above).which_child(id).pid if above else os.getpid()):
-            raise UsageError(f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead")
-        name = signal_name(command.signal)
-        facts = {"path": path, "pid": child.pid, "signal": name}
-        if command.dry_run:
-            return Done(f"would send {name} to {path} (pid {child.pid})", facts)
-        try:
-            sent = signal_if(child.pid, command.signal, lambda: supervisor.which_child(child.id).pid == child.pid)
-        except OSError as error:
-            raise ActorUnavailable(f"{path}: {name} was not sent to {child.pid}: {error.strerror}", id=path) from error
-        if not sent:
-            raise ActorUnavailable(f"{path}: its process {child.pid} has ended", id=path)
-        return Done(f"sent {name} to {path} (pid {child.pid})", facts)
+_RELEASED = "release one of these, or take the resource away from all of them (--force)"
 
-    def _terminate(self, command: Terminate) -> Done:
-        path, supervisor, child = self._child(command.child)
-        facts = {"path": path, "was": child.state}
-        if command.dry_run:
-            return Done(f"would stop {path}, which is {child.state}", facts)
-        supervisor.terminate_child(child.id)
-        return Done(f"stopped {path}" if child.state != "stopped" else f"{path} was stopped already", facts)
 
-    def _restart(self, command: Restart) -> Done:
-        path, supervisor, child = self._child(command.child)
-        spec = supervisor.get_childspec(child.id)
-        if spec.restart == "temporary" or supervisor.describe()["strategy"] == "simple_one_for_one":
-            raise UsageError(f"{path}: its supervisor forgets it when it stops; terminate it, and start a new one")
-        facts = {"path": path, "was": child.state}
-        if command.dry_run:
-            return Done(f"would start {path} again, which is {child.state}", facts)
-        if child.state != "stopped":
-            supervisor.terminate_child(child.id)
-        supervisor.restart_child(child.id)
-        return Done(f"started {path} again", facts | {"pid": supervisor.which_child(child.id).pid})
+def _only_query(id: str, queries: list[QueryRow], resources: list[ResourceRow], instead: str = _RELEASED) -> QueryRow:
+    held = [row for row in queries if row.hold == "held"]
+    if len(held) == 1:
+        return held[0]
+    if len(held) > 1:
+        ids = short_ids(row.id for row in held)
+        several = few(f"{ids[row.id]} of {row.origin}" for row in held)
+        raise UsageError(f"{shown(id)}: several queries have this in their ids: {several}; give more of the id")
+    if resources:
+        ids = short_ids(holder.query_id for holder in resources[0].holders)
+        holders = few(f"{ids[holder.query_id]} of {holder.origin}" for holder in resources[0].holders) or "none"
+        text = f"{shown(id)}: it is a resource, and its queries are: {holders}; {instead}"
+        raise UnknownQuery(text, query_id=id)
+    raise UnknownQuery(f"{shown(id)}: nobody holds a query of this id", query_id=id)
 
-    def _start(self, command: StartChild) -> Done:
-        spec = child_from_toml(command.spec.encode(), command.file)
-        supervisor = self._view.system.supervisor(command.supervisor or None)
-        path = f"{supervisor.path}/{spec.id}"
-        what = "supervisor" if isinstance(spec, Supervisor) else "worker"
-        if command.dry_run:
-            return Done(f"would start the {what} {path}", {"path": path})
-        ref = supervisor.start_child(spec)
-        if ref is None:
-            return Done(f"{path}: its on_start said IGNORE, so it does not run", {"path": path, "pid": None})
-        return Done(f"started the {what} {path}", {"path": path, "pid": ref.pid})
 
-    def _stop(self, command: ShutDown) -> Done:
-        name = self._view.system.name
-        if command.dry_run:
-            return Done(f"would stop system {name}", {"system": name})
-        self._shut_down()
-        return Done(f"system {name} is stopping", {"system": name})
+class SendStatus(Command[c.Done], frozen=True):
+    """Send a status of a resource in its owner's name. `id` may also be a part of its id, its name, or a query's id."""
 
-    def _child(self, given: str) -> tuple[str, SupervisorRef, Child]:
-        path = self._view.path_of(given)
-        above, _, id = path.rpartition("/")
-        if not above:
-            raise UsageError(f"{path}: it is the root supervisor; to end it, shut the system down")
-        supervisor = SupervisorRef(above)
-        return path, supervisor, supervisor.which_child(id)
+    id: c.Text
+    state: Literal["OK", "UPDATE", "WARNING", "ERROR", "FATAL"]
+    message: c.Long = ""
+    registrar: c.Text = ""
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        resource = _only_resource(self.id, view.find(self.id, self.registrar).resources)
+        said = f"{self.state}: {self.message}" if self.message else self.state
+        text = f"{resource.name} ({short_id(resource.id)}): {said}"
+        facts = {"resource_id": resource.id, "server": resource.server, "state": self.state}
+        if self.dry_run:
+            return c.Done(f"would tell {_count(resource)} of {text}", facts)
+        registrar = view.registrar(resource.server.partition("/")[0])
+        registrar.send_status(resource.id, Status(self.state, self.message))
+        return c.Done(f"told {_count(resource)} of {text}", facts)
+
+
+class Revoke(Command[c.Done], frozen=True):
+    """Take a resource away from its holders in its owner's name, the highest first, and wait until it is unloaded.
+
+    `id` may also be a part of its id, its name, or a query's id.
+    """
+
+    id: c.Text
+    why: c.Long
+    grace_s: c.Seconds = 5.0
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        resource = _only_resource(self.id, view.find(self.id).resources)
+        text = f"{resource.name} ({short_id(resource.id)}) from {_count(resource)}"
+        facts = {"resource_id": resource.id, "server": resource.server}
+        if self.dry_run:
+            return c.Done(f"would revoke {text}", facts)
+        registrar = view.registrar(resource.server.partition("/")[0])
+        registrar.revoke(resource.id, self.why, grace_s=self.grace_s)
+        return c.Done(f"revoked {text}", facts)
 
 
 def _only_resource(id: str, resources: list[ResourceRow]) -> ResourceRow:
     if len(resources) > 1:
-        several = ", ".join(f"{row.id} of {row.server}" for row in resources)
-        raise UsageError(f"{shown(id)}: several resources begin so: {several}; give more of the id")
+        ids = short_ids(row.id for row in resources)
+        several = few(f"{ids[row.id]} ({row.name})" for row in resources)
+        raise UsageError(f"{shown(id)}: several resources have this in their ids: {several}; give more of the id")
     if not resources:
         raise UnknownQuery(f"{shown(id)}: no registrar serves a resource of this id", query_id=id)
     return resources[0]
@@ -262,7 +229,208 @@ def _plain(value: Any) -> Any:
     """Return a value in the form that JSON gives it, or its text if JSON or an answer cannot hold it."""
     try:
         plain = msgspec.json.decode(msgspec.json.encode(value, enc_hook=repr))
-        fits = len(msgspec.msgpack.encode(plain)) <= RESPONSE_LIMIT_BYTES
+        fits = len(msgspec.msgpack.encode(plain)) <= c.RESPONSE_LIMIT_BYTES
     except Exception:  # a user's value: keys that are no text, numbers that are too long
         return shown(value)
     return plain if fits else shown(value)
+
+
+# -- the tree --------------------------------------------------------------------------------------------------------
+
+
+class Kill(Command[c.Done], frozen=True):
+    """Send a signal to the process of a child, given by its path or, if only one has it, its id."""
+
+    child: c.Text
+    signal: Annotated[int, msgspec.Meta(ge=1, le=64)] = 9
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        path, supervisor, child = _child(view, self.child)
+        if child.pid is None:
+            raise ActorUnavailable(f"{path}: it is {child.state}, and has no process to be killed", id=path)
+        above, _, id = supervisor.path.rpartition("/")
+        if child.pid == (SupervisorRef(above).which_child(id).pid if above else os.getpid()):
+            raise UsageError(f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead")
+        name = signal_name(self.signal)
+        facts = {"path": path, "pid": child.pid, "signal": name}
+        if self.dry_run:
+            return c.Done(f"would send {name} to {path} (pid {child.pid})", facts)
+        try:
+            sent = signal_if(child.pid, self.signal, lambda: supervisor.which_child(child.id).pid == child.pid)
+        except OSError as error:
+            raise ActorUnavailable(f"{path}: {name} was not sent to {child.pid}: {error.strerror}", id=path) from error
+        if not sent:
+            raise ActorUnavailable(f"{path}: its process {child.pid} has ended", id=path)
+        return c.Done(f"sent {name} to {path} (pid {child.pid})", facts)
+
+
+class Terminate(Command[c.Done], frozen=True):
+    """Stop a child, as its supervisor does; its specification stays, unless it is temporary."""
+
+    child: c.Text
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        path, supervisor, child = _child(view, self.child)
+        facts = {"path": path, "was": child.state}
+        if self.dry_run:
+            return c.Done(f"would stop {path}, which is {child.state}", facts)
+        supervisor.terminate_child(child.id)
+        return c.Done(f"stopped {path}" if child.state != "stopped" else f"{path} was stopped already", facts)
+
+
+class Restart(Command[c.Done], frozen=True):
+    """Stop a child if it runs, and start it."""
+
+    child: c.Text
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        path, supervisor, child = _child(view, self.child)
+        spec = supervisor.get_childspec(child.id)
+        if spec.restart == "temporary" or supervisor.describe()["strategy"] == "simple_one_for_one":
+            raise UsageError(f"{path}: its supervisor forgets it when it stops; terminate it, and start a new one")
+        facts = {"path": path, "was": child.state}
+        if self.dry_run:
+            return c.Done(f"would start {path} again, which is {child.state}", facts)
+        if child.state != "stopped":
+            supervisor.terminate_child(child.id)
+        supervisor.restart_child(child.id)
+        return c.Done(f"started {path} again", facts | {"pid": supervisor.which_child(child.id).pid})
+
+
+class StartChild(Command[c.Done], frozen=True):
+    """Add a child to the supervisor at a path ("": the root), from a TOML text as Supervisor.from_toml reads it."""
+
+    spec: c.Long
+    supervisor: c.Text = ""
+    file: c.Text = "the specification"
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        spec = child_from_toml(self.spec.encode(), self.file)
+        supervisor = view.system.supervisor(self.supervisor or None)
+        path = f"{supervisor.path}/{spec.id}"
+        what = "supervisor" if isinstance(spec, Supervisor) else "worker"
+        if self.dry_run:
+            return c.Done(f"would start the {what} {path}", {"path": path})
+        ref = supervisor.start_child(spec)
+        if ref is None:
+            return c.Done(f"{path}: its on_start said IGNORE, so it does not run", {"path": path, "pid": None})
+        return c.Done(f"started the {what} {path}", {"path": path, "pid": ref.pid})
+
+
+class ShutDown(Command[c.Done], frozen=True):
+    """Stop the whole system, in order, as System.stop() does."""
+
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        name = view.system.name
+        if self.dry_run:
+            return c.Done(f"would stop system {name}", {"system": name})
+        view.shut_down()
+        return c.Done(f"system {name} is stopping", {"system": name})
+
+
+def _child(view: View, given: str) -> tuple[str, SupervisorRef, Child]:
+    path = view.path_of(given)
+    above, _, id = path.rpartition("/")
+    if not above:
+        raise UsageError(f"{path}: it is the root supervisor; to end it, shut the system down")
+    supervisor = SupervisorRef(above)
+    return path, supervisor, supervisor.which_child(id)
+
+
+# -- clients ----------------------------------------------------------------------------------------------------------
+
+
+class OpenRegistrar(Command[c.Done], frozen=True):
+    """Open a registrar for a client. When this connection ends, it is closed, and its queries are released.
+
+    In the system it is called "client.NAME"; Done's facts have this name as `registrar`.
+    """
+
+    name: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        name = check_name(CLIENTS + check_name(self.name, "registrar name"), "registrar name")
+        view.clients.add(caller, view.open_registrar(name))
+        return c.Done(f"opened registrar {name}", {"registrar": name})
+
+
+class Hold(Command[c.Holding], frozen=True):
+    """Load a resource with a client's registrar, by a request's canonical bytes.
+
+    If the connection ends, or makes another request, after the answer and before its Keep, the query is released.
+    """
+
+    registrar: c.Text
+    server: c.Text
+    request: c.Value
+    timeout_s: c.Seconds = 30.0
+    priority: c.Priority = 0
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Holding:
+        client = view.clients.named(self.registrar)
+        registrar, options = client.registrar, LoadOptions(on_status=client.hear, priority=self.priority, own=True)
+        query = load_bytes(registrar, self.server, self.request, "", options, timeout_s=self.timeout_s)
+        response = response_bytes(query)
+        if len(response) > c.RESPONSE_LIMIT_BYTES:
+            registrar.unload(query.id, timeout_s=self.timeout_s)
+            text = f"a response of {len(response)} bytes is over a client's limit of {c.RESPONSE_LIMIT_BYTES}"
+            raise NotSerializable(f"{self.server}: {text}; give the name of a file, say", path="response")
+        return c.Holding(query.id, query.resource_id, response, query.state)
+
+
+class Release(Command[c.Done], frozen=True):
+    """Release a query of a client's registrar, or all its queries at a server; or all, if it names neither."""
+
+    registrar: c.Text
+    query_id: c.Text = ""
+    server: c.Text = ""
+    timeout_s: c.Seconds = 30.0
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        registrar = view.clients.named(self.registrar).registrar
+        if self.query_id:
+            registrar.unload(self.query_id, timeout_s=self.timeout_s)
+        elif self.server:
+            registrar.unload_client(self.server, timeout_s=self.timeout_s)
+        else:
+            registrar.unload_all(timeout_s=self.timeout_s)
+        return c.Done(f"released {self.query_id or self.server or 'all'}")
+
+
+class AwaitStatuses(Command[c.Statuses], frozen=True):
+    """Wait for statuses of the queries of the registrar that was opened by this connection. The answer has no limit."""
+
+    registrar: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Statuses:
+        return c.Statuses(view.clients.named(self.registrar, caller).take())
+
+
+class AskActor(Command[c.Replied], frozen=True):
+    """Ask an actor of the tree, by its path or id; the message is plain data, as canonical bytes."""
+
+    actor: c.Text
+    message: c.Value
+    timeout_s: c.Seconds = 30.0
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Replied:
+        message = _message.decode(self.message, self.actor, "message")
+        reply = view.system.ref(self.actor).ask(message, block=False)
+        try:
+            error = reply.exception(self.timeout_s)
+        except TimeoutError as late:
+            reply.cancel()
+            text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
+            raise Unavailable(text) from late
+        if error is not None and not isinstance(error, RrError):  # raised by the actor's handler
+            raise RrError(f"{self.actor}: {text_of(error)}") from error
+        return c.Replied(encode(reply.get(), f"answer of {self.actor}"))
+
+
+_message = Codec(None, "message")

@@ -15,8 +15,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import NotSerializable, shown
-from rr_actors.registrar.model.messages import readable
+from rr_actors.base.errors import NotSerializable, readable, shown
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_messages import (
     ANSWER_LIMIT_BYTES,

@@ -8,51 +8,34 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import logging
 import os
 import select
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-import msgspec
-
 from rr_actors.base.errors import ConfigError, MailboxFull, RrError, Unavailable, UsageError
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
-from rr_actors.registrar.model.messages import failure_of
-from rr_actors.system.console.console_commands import Commands
+from rr_actors.base.values.failure import failure_of
+from rr_actors.registrar.engine.node import Node
+from rr_actors.supervision.event_history import TreeLog
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_commands import AwaitStatuses, Hold, OpenRegistrar
 from rr_actors.system.console.console_feed import Feed, Reader
-from rr_actors.system.console.console_messages import (
-    ANSWER_LIMIT_BYTES,
-    REQUEST_LIMIT_BYTES,
-    SOCKET,
-    VERSION,
-    BeginRecording,
-    Command,
-    Follow,
-    Following,
-    Hello,
-    Hold,
-    Holding,
-    Keep,
-    Missed,
-    OpenRegistrar,
-    Refused,
-    Request,
-    Welcome,
-)
-from rr_actors.system.console.console_questions import View, Viewed
-from rr_actors.system.console.running_systems import Entry
+from rr_actors.system.console.console_protocol import REQUESTS, decoder_of
+from rr_actors.system.console.console_view import Caller, Command, Verb, View, Viewed
+from rr_actors.system.console.running_systems import ListedSystem
 from rr_actors.system.event_subscribers import Subscribers
-from rr_actors.system.hosting.node import Node
 from rr_actors.system.recording.recordings import Recordings
 from rr_actors.wire.frames import FrameReader, framed
-from rr_actors.wire.unix_sockets import SocketDir, peer_of
+from rr_actors.wire.unix_sockets import Refusals, SocketDir, peer_of
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
-CONNECTIONS_LIMIT = 128
-"""The most consoles that may be connected; further ones are refused."""
+CONNECTIONS_LIMIT = 256
+"""The most connections of one client, and the most that have not said Hello yet; further ones are refused."""
 FRAME_S = 5.0
 """Seconds that a client may take for its first message, and for the rest of a message that it has begun."""
 STALLED_S = 30.0
@@ -67,6 +50,7 @@ class Console:
 
     Args:
         subscribers, recordings: the system's; the console's feed uses them.
+        log: the log of the system's tree.
         shut_down: stops the system, in a thread of its own.
     """
 
@@ -76,20 +60,23 @@ class Console:
         node: Node,
         subscribers: Subscribers,
         recordings: Recordings,
+        log: TreeLog,
         shut_down: Callable[[], None],
     ) -> None:
         self.node = node
-        self.decoder: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
-        self.view = View(system, node)
-        self.commands = Commands(self.view, shut_down)
+        self.decoder = decoder_of(REQUESTS)
+        self.view = View(system, node, log, shut_down)
         self.feed = Feed(subscribers, recordings)
-        self.welcome = Welcome(VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
+        self.welcome = c.Welcome(c.VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()
+        self.clients: Counter[object] = Counter()  # the connections of each; of "", those that have not said Hello yet
+        self.clients_limit = node.info.config.clients_limit
+        self.refusals = Refusals(logger)
         self.stopping = False  # then commands are refused; the feed goes on
         self._sockets = SocketDir(Path(node.info.run_dir))
         self._server: asyncio.AbstractServer | None = None
         self._making: asyncio.Task[None] | None = None
-        self._entry = Entry(Path(node.info.run_dir))
+        self._entry = ListedSystem(Path(node.info.run_dir))
         self._entering: asyncio.Future[None] | None = None
 
     async def open(self) -> None:
@@ -107,7 +94,7 @@ class Console:
             logger.warning("system %s: it is found by its state directory alone: %s", self.node.info.name, error)
 
     async def _serve(self) -> None:
-        listener = self._sockets.bind(SOCKET)
+        listener = self._sockets.bind(c.SOCKET)
         loop = asyncio.get_running_loop()
         made = await loop.create_unix_server(lambda: Connection(self), sock=listener, start_serving=False)
         lost, self._server = self._server, made
@@ -117,8 +104,18 @@ class Console:
 
     def _keep(self) -> None:
         """Make the socket again if its file was removed."""
-        if self._server is not None and not self._sockets.has(SOCKET):
+        if self._server is not None and not self._sockets.has(c.SOCKET):
             self._making = asyncio.get_running_loop().create_task(self._serve())
+
+    def counted(self, client: object, change: int) -> None:
+        """Count a connection of a client that has come or gone."""
+        self.clients[client] += change
+        if not self.clients[client]:
+            del self.clients[client]
+
+    def leave_to_parent(self) -> None:
+        """Give up, in a forked child, the lock that says that the parent lives."""
+        self._entry.forget()
 
     async def close(self) -> None:
         """Stop listening, and close every connection. Try each step. A second close does nothing."""
@@ -133,9 +130,10 @@ class Console:
                 removing = self.node.dispatcher.workers.run(self._entry.remove)
                 await steps.take_async("taking it out of the list of running systems", removing)
         steps.take("ending the feed", self.feed.close)
+        self.refusals.close()
         if server is not None:
             steps.take("closing the console's socket", server.close)
-            steps.take("removing the console's socket", self._sockets.unlink, SOCKET)
+            steps.take("removing the console's socket", self._sockets.unlink, c.SOCKET)
         for connection in list(self.connections):
             steps.take("closing a console's connection", connection.end)
         steps.take("closing the directory of sockets", self._sockets.close)
@@ -143,32 +141,30 @@ class Console:
         await asyncio.sleep(0)
         steps.end("the console is not closed altogether")
 
-    def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> tuple[bytes, str]:
+    def answered(self, request: c.Message, caller: Caller) -> tuple[bytes, str]:
         """Return the frame that answers a request, and the id of the query that it loaded for a client. In a worker."""
+        name = type(request).__name__
         try:
-            if isinstance(request, Hello | Follow | BeginRecording | Keep):
-                raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
-            if not isinstance(request, Command):
-                answer = self.view.answer(request)
-            elif self.stopping:
+            if not isinstance(request, Verb):
+                raise UsageError(f"{name}: this connection has said Hello already")
+            if self.stopping and isinstance(request, Command):
                 raise Unavailable(f"system {self.node.info.name!r} is stopping")
-            else:
-                answer = self.commands.carry_out(request, is_gone, connection)
-            frame = framed(answer, ANSWER_LIMIT_BYTES, "the longest answer of a console")
-            return frame, answer.query_id if isinstance(answer, Holding) else ""
+            answer = cast("Verb[c.Message]", request).carry_out(self.view, caller)
+            frame = framed(answer, c.ANSWER_LIMIT_BYTES, "the longest answer of a console")
+            return frame, answer.query_id if isinstance(answer, c.Holding) else ""
         except Exception as error:
             if not isinstance(error, RrError):
-                logger.exception("console: %s failed", type(request).__name__)
+                logger.exception("console: %s failed", name)
             return refusal(error), ""
 
     def missed(self, count: int, seq: int) -> bytes:
         """Return the frame for a reader that was too slow. In a worker."""
-        return framed(Missed(count, seq, self.view.children()), ANSWER_LIMIT_BYTES)
+        return framed(c.Missed(count, seq, self.view.children()), c.ANSWER_LIMIT_BYTES)
 
 
 def refusal(error: BaseException) -> bytes:
     """Return the frame that says that a request has failed, and why."""
-    return framed(Refused(failure_of(error)), ANSWER_LIMIT_BYTES)
+    return framed(c.Refused(failure_of(error)), c.ANSWER_LIMIT_BYTES)
 
 
 class Connection(asyncio.Protocol):
@@ -176,9 +172,9 @@ class Connection(asyncio.Protocol):
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._frames = FrameReader(console.decoder, REQUEST_LIMIT_BYTES)
+        self._frames = FrameReader(console.decoder, c.REQUEST_LIMIT_BYTES)
         self._transport: asyncio.Transport
-        self._requests: list[Request] = []
+        self._requests: list[c.Message] = []
         self._timer: asyncio.TimerHandle | None = None
         self._greeted = False
         self._busy = False
@@ -187,7 +183,13 @@ class Connection(asyncio.Protocol):
         self._looks = False  # whether the loop will look for the client
         self._reader: Reader | None = None
         self._has_registrars = False
+        self._client: object = ""
         self._unheard: tuple[str, ...] = ()  # the registrar and query of the last answer, until Keep
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether the client has left, or is being left."""
+        return self._ended
 
     # -- called by asyncio -------------------------------------------------------------------------------------------
 
@@ -196,13 +198,14 @@ class Connection(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         peer = peer_of(transport)
         if not peer.trusted:
-            logger.warning("console: refused %s, of user %s", peer, peer.uid)
+            self._console.refusals.note(f"console: refused {peer}, of user {peer.uid}")
             self._transport.abort()
             self._ended = True
-        elif len(self._console.connections) >= CONNECTIONS_LIMIT:
-            self._leave(Unavailable(f"{CONNECTIONS_LIMIT} consoles are connected already: close one"))
+        elif self._console.clients[""] >= CONNECTIONS_LIMIT:
+            self._leave(Unavailable(f"{CONNECTIONS_LIMIT} consoles are connected already that have not said Hello yet"))
         else:
             self._console.connections.add(self)
+            self._console.clients[""] += 1
             self._set_timer(FRAME_S)
 
     def data_received(self, data: bytes) -> None:
@@ -266,17 +269,19 @@ class Connection(asyncio.Protocol):
         self._ended = True
         self._stop_timer()
         self._requests.clear()
-        self._console.connections.discard(self)
+        if self in self._console.connections:
+            self._console.connections.remove(self)
+            self._console.counted(self._client, -1)
         if self._reader is not None:
             self._console.feed.remove(self._reader)
         self._release_unheard()
         if self._has_registrars:
-            self._clean_up(self._console.commands.clients.close, self)
+            self._clean_up(self._console.view.clients.close, self)
 
     def _release_unheard(self) -> None:
         unheard, self._unheard = self._unheard, ()
         if unheard:
-            self._clean_up(self._console.commands.clients.release_unheard, *unheard)
+            self._clean_up(self._console.view.clients.release_unheard, *unheard)
 
     def _clean_up(self, fn: Callable[..., None], *args: Any) -> None:
         """Have a worker release what the client has left, after an opening that may still be in progress."""
@@ -293,7 +298,7 @@ class Connection(asyncio.Protocol):
         """Begin with the next request, if the last one is answered and the client has read the answer."""
         if self._ended or self._busy or self._blocked:
             return
-        while self._greeted and self._requests and isinstance(self._requests[0], Keep):
+        while self._greeted and self._requests and isinstance(self._requests[0], c.Keep):
             self._unheard = ()
             del self._requests[0]
         if not self._requests:
@@ -308,27 +313,42 @@ class Connection(asyncio.Protocol):
         request = self._requests.pop(0)
         if not self._greeted:
             self._greet(request)
-        elif isinstance(request, Follow | BeginRecording):
+        elif isinstance(request, c.Follow | c.BeginRecording):
             self._follow(request)
         else:
             self._begin(request)
 
-    def _greet(self, request: Request) -> None:
-        if not isinstance(request, Hello) or request.version != VERSION:
-            said = f"version {request.version}" if isinstance(request, Hello) else type(request).__name__
+    def _greet(self, request: c.Message) -> None:
+        if not isinstance(request, c.Hello) or request.version != c.VERSION:
+            said = f"version {request.version}" if isinstance(request, c.Hello) else type(request).__name__
             self._leave(
-                Unavailable(f"console: expected Hello of version {VERSION}, got {said}: use the same rr_actors")
+                Unavailable(f"console: expected Hello of version {c.VERSION}, got {said}: use the same rr_actors")
             )
             return
+        clients, limit = self._console.clients, self._console.clients_limit
+        client = request.client or self
+        if client not in clients and len(clients) - ("" in clients) >= limit:
+            self._leave(Unavailable(f"{limit} clients are connected already: close one, or raise clients_limit"))
+            return
+        if clients[client] >= CONNECTIONS_LIMIT:
+            self._leave(Unavailable(f"this client has {CONNECTIONS_LIMIT} connections already, one for each call"))
+            return
+        self._console.counted("", -1)
+        self._console.counted(client, 1)
+        self._client = client
         self._greeted = True
-        self._transport.write(framed(self._console.welcome, ANSWER_LIMIT_BYTES))
+        self._transport.write(framed(self._console.welcome, c.ANSWER_LIMIT_BYTES))
         self._next()
 
-    def _begin(self, request: Request) -> None:
+    def _begin(self, request: c.Message) -> None:
         self._busy = True
         self._release_unheard()
+        if isinstance(request, AwaitStatuses) and not self._console.view.clients.has_statuses(
+            request.registrar, self, functools.partial(self._begin_again, request)
+        ):
+            return
         workers = self._console.node.dispatcher.workers
-        answer = self._console.answered, request, lambda: self._ended, self
+        answer = self._console.answered, request, self
         try:
             if isinstance(request, OpenRegistrar):
                 self._has_registrars = True
@@ -338,7 +358,11 @@ class Connection(asyncio.Protocol):
         except Unavailable as error:
             self._answered(request, (refusal(error), ""), None)
 
-    def _answered(self, request: Request, answer: tuple[bytes, str] | None, error: BaseException | None) -> None:
+    def _begin_again(self, request: AwaitStatuses) -> None:
+        """Answer a request for statuses, as one has arrived. From any thread."""
+        self._console.node.dispatcher.call(lambda: None if self._ended else self._begin(request))
+
+    def _answered(self, request: c.Message, answer: tuple[bytes, str] | None, error: BaseException | None) -> None:
         self._busy = False
         frame, query_id = answer or (refusal(error or Unavailable("it was not answered")), "")
         self._unheard = (request.registrar, query_id) if query_id and isinstance(request, Hold) else ()
@@ -350,14 +374,15 @@ class Connection(asyncio.Protocol):
 
     # -- the feed ----------------------------------------------------------------------------------------------------
 
-    def _follow(self, follow: Follow | BeginRecording) -> None:
+    def _follow(self, follow: c.Follow | c.BeginRecording) -> None:
         if self._requests or self._frames.is_waiting:
             self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
             return
         feed = self._console.feed
         self._reader = Reader(follow, self._transport.write, self._tell_missed)
-        self._transport.write(framed(Following(0 if self._reader.records else feed.seq), ANSWER_LIMIT_BYTES))
+        self._transport.write(framed(c.Following(0 if self._reader.records else feed.seq), c.ANSWER_LIMIT_BYTES))
         feed.add(self._reader)
+        self._transport.resume_reading()  # it was paused if the request had waited for an answer
 
     def _tell_missed(self) -> None:
         assert self._reader is not None

@@ -1,13 +1,17 @@
 """Running systems: a private list of this user's systems, so that one is found without its state directory.
 
 An entry is a symbolic link to the directory of a console's socket; its name begins with the pid of the system's
-process. The list is in XDG_RUNTIME_DIR or, without that, in a directory of mode 0700 below the temporary files. A
-system that starts removes the entries of killed ones.
+process. The list is in XDG_RUNTIME_DIR or, without that, in a directory of mode 0700 below the temporary files.
+
+A system that starts removes the entries of killed ones. A system lives if it holds the lock beside its entry, or if its
+console answers. Its pid and its directory say nothing: containers may share the list, and neither processes nor files.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import io
 import os
 import re
 from collections.abc import Iterator
@@ -22,13 +26,14 @@ _NAME = re.compile(r"(\d{1,10})-[0-9a-f]{8}")
 _INCARNATION = re.compile(r"[0-9a-f]{8}")
 
 
-class Entry:
+class ListedSystem:
     """The entry of a running system in the list; make() creates it."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
         self._name = f"{os.getpid()}-{os.urandom(4).hex()}"
         self._place: tuple[str, str] | None = None
+        self._lock: io.FileIO | None = None
 
     def make(self) -> None:
         """Put the entry into the list; raise ConfigError if no directory can keep the list."""
@@ -36,14 +41,16 @@ class Entry:
         for place in _places():
             try:
                 with _opened(place, make=True) as folder:
-                    for name in folder.names():
-                        match = _NAME.fullmatch(name)
-                        if match is not None and not Path("/proc", match[1]).exists():  # its process is gone
-                            folder.discard(name)
+                    for name in filter(_NAME.fullmatch, folder.names()):
+                        if not _lives(folder, name):
+                            _discard(folder, name)
+                    self._lock = lock = folder.open(_lock_of(self._name), os.O_RDWR | os.O_CREAT)
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     os.symlink(self._run_dir, self._name, dir_fd=folder.fd)
                 self._place = place
                 return
             except OSError as error:
+                self.forget()
                 failure = failure or error
         problem = "no directory" if failure is None else f"{failure.filename}: {failure.strerror}"
         raise ConfigError(f"no private list of running systems can be kept: {problem}; set XDG_RUNTIME_DIR")
@@ -52,7 +59,34 @@ class Entry:
         """Take the entry out of the list. A second call does nothing."""
         if self._place is not None:
             with contextlib.suppress(OSError), _opened(self._place) as folder:
-                folder.discard(self._name)
+                _discard(folder, self._name)
+        self.forget()
+
+    def forget(self) -> None:
+        """Close the lock. A forked child must not keep its parent's."""
+        if self._lock is not None:
+            self._lock.close()
+
+
+def _lock_of(name: str) -> str:
+    return f".{name}.lock"
+
+
+def _discard(folder: Folder, name: str) -> None:
+    for each in (name, _lock_of(name)):
+        folder.discard(each)
+
+
+def _lives(folder: Folder, name: str) -> bool:
+    """Return whether the system of an entry runs: it holds the entry's lock, or its console answers."""
+    with contextlib.suppress(OSError), folder.open(_lock_of(name), os.O_RDWR) as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    with contextlib.suppress(OSError):
+        return _answers(Path(os.readlink(name, dir_fd=folder.fd)))
+    return False
 
 
 def running_systems() -> list[Path]:

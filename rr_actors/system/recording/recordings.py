@@ -7,7 +7,6 @@ at its place. If the recording process was killed, its file can be read to the l
 from __future__ import annotations
 
 import functools
-import logging
 import os
 import threading
 import time
@@ -18,16 +17,16 @@ from typing import Any, Self
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, UsageError, shown, text_of
+from rr_actors.base.errors import ConfigError, UsageError, readable, shown, text_of
+from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
-from rr_actors.registrar.model.messages import readable
+from rr_actors.registrar.links.recorder import RECORDED, entries_of
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.queries import Query, ResourceInfo
-from rr_actors.system.hosting.recorder import RECORDED, entries_of
 from rr_actors.system.recording.figures import Counters
 from rr_actors.system.recording.traces import Trace, trace_of
 
-logger = logging.getLogger("rr_actors")
+logger = Log("rr_actors")
 
 VERSION = 1
 LIMIT = 100_000
@@ -120,7 +119,7 @@ class Recordings:
                 logger.error("what a process has recorded cannot be read: %s", error)
                 return
         else:
-            entries = [_entry_of(event)]
+            entries = [entry_of(event)]
         numbered = [msgspec.structs.replace(entry, seq=seq) for seq, entry in enumerate(entries, self.seq + 1)]
         self.seq += len(numbered)
         self._counters.take(numbered)
@@ -128,7 +127,7 @@ class Recordings:
             sink(numbered, dropped)
 
 
-def _entry_of(event: dict[str, Any]) -> Entry:
+def entry_of(event: dict[str, Any]) -> Entry:
     """Return the entry of an event of the tree or of a resource."""
     facts = {key: value for key, value in event.items() if key not in ("event", "at")}
     at = event.get("at")

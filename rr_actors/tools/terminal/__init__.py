@@ -1,1 +1,1 @@
-"""The live terminal of `rr-actors top`: its link to the system, the rows of each pane, and the application."""
+"""The live terminal of `rr-actors top`: its link to the system, rows, the lines of events, and the application."""

@@ -8,7 +8,8 @@ from typing import TypeVar
 
 from rr_actors.base.errors import RrError
 from rr_actors.system.console.console_client import Connections, NotRunning, find_console
-from rr_actors.system.console.console_messages import Events, Follow, Missed, Request, Welcome
+from rr_actors.system.console.console_messages import Events, Follow, Missed, Welcome
+from rr_actors.system.console.console_view import Verb
 
 _A = TypeVar("_A")
 _LONGEST_S = 100.0  # for a command: longer than any of them may take
@@ -32,15 +33,15 @@ class ConsoleLink:
         with self._connections.lent() as client:
             self.state_dir = client.welcome.state_dir
 
-    def ask(self, request: Request, expected: type[_A], timeout_s: float | None = None) -> _A:
-        """Send a request and return its answer.
+    def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
+        """Send a question or a command, and return its answer.
 
         Raises:
             RrError: the system refused the request, or could not carry it out.
             NotRunning: the system has ended, or the link is closed.
             Unavailable: the system has not answered in time; it may still carry the request out.
         """
-        return self._connections.ask(request, expected, timeout_s)
+        return self._connections.ask(request, timeout_s)
 
     def follow(self, found: Callable[[Welcome], None], hear: Callable[[Events | Missed], None]) -> str:
         """Call `found` when the system is reached, then `hear` with its events; return why that has ended.

@@ -7,9 +7,10 @@ shows, one question at a time; the slower the system answers, the less often.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import sys
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import ClassVar, TypeVar
@@ -23,16 +24,22 @@ from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal
 from textual.message import Message
+from textual.screen import ModalScreen
 from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import Footer, Input, Static
 
-from rr_actors.base.errors import RrError, Unavailable
+from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.names import short_id
+from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import NotRunning
-from rr_actors.tools.explanations import event_line, missed_line
+from rr_actors.system.console.console_questions import ListHistory
+from rr_actors.system.console.console_view import Command
 from rr_actors.tools.terminal.console_link import ConsoleLink
+from rr_actors.tools.terminal.event_lines import EventLines, event_of, missed_line
 from rr_actors.tools.terminal.terminal_rows import (
+    Happenings,
     Listed,
     Neighbours,
     Nothing,
@@ -40,10 +47,10 @@ from rr_actors.tools.terminal.terminal_rows import (
     Row,
     Rows,
     Served,
-    Tree,
     Window,
     refused,
 )
+from rr_actors.tools.terminal.terminal_tables import AllResources, Tree
 
 _T = TypeVar("_T")
 _THREADS = 16  # for the panes, the feed, and commands that wait
@@ -57,7 +64,6 @@ _SHARE = 10
 _LONGEST_S = 5.0
 """The longest such wait, in seconds: a system that hung may answer quickly again."""
 _AGAIN_S = 0.5
-_EVENTS_KEPT = 500
 
 
 def watch(state_dir: str | os.PathLike[str] | None = None) -> None:
@@ -65,8 +71,10 @@ def watch(state_dir: str | os.PathLike[str] | None = None) -> None:
 
     Raises:
         NotRunning: no system runs in the directory, or none at all.
-        UsageError: several systems run, and no state directory was given.
+        UsageError: several systems run, and no state directory was given; or this process has no terminal.
     """
+    if not all(stream.isatty() for stream in (sys.stdin, sys.stdout, sys.stderr)):
+        raise UsageError("top: expected a terminal, got none: rr-actors ps, events and resources need no terminal")
     Terminal(ConsoleLink(state_dir)).run()
 
 
@@ -78,8 +86,8 @@ class Pane(Widget, can_focus=True):
     """
 
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("up", "move(-1)", show=False),
-        Binding("down", "move(1)", show=False),
+        Binding("up,k", "move(-1)", show=False),
+        Binding("down,j", "move(1)", show=False),
         Binding("pageup", "page(-1)", show=False),
         Binding("pagedown", "page(1)", show=False),
         Binding("home", "move(-1_000_000_000)", show=False),
@@ -134,7 +142,7 @@ class Pane(Widget, can_focus=True):
         self.rows, self.match = rows, match
         self._listed, self._offset = Listed(0, []), 0
         self.cursor = cursor
-        self._top = max(0, cursor - self.size.height // 2)
+        self._top = max(0, cursor - self._room // 2)
         self.ask()
 
     def ask(self) -> None:
@@ -168,7 +176,7 @@ class Pane(Widget, can_focus=True):
 
     def on_click(self, event: events.Click) -> None:
         """Move the cursor to the row that was clicked."""
-        self._go(self._top + event.get_content_offset_capture(self).y)
+        self._go(self._top + event.get_content_offset_capture(self).y - bool(self._listed.heads))
 
     def action_move(self, by: int) -> None:
         """Move the cursor by so many rows."""
@@ -176,7 +184,7 @@ class Pane(Widget, can_focus=True):
 
     def action_page(self, by: int) -> None:
         """Move the cursor by a screen."""
-        self._go(self.cursor + by * max(1, self.size.height - 1))
+        self._go(self.cursor + by * max(1, self._room - 1))
 
     def action_open(self) -> None:
         """Open the row under the cursor."""
@@ -185,7 +193,7 @@ class Pane(Widget, can_focus=True):
 
     def _go(self, to: int) -> None:
         before = self.cursor, self._top
-        height = max(1, self.size.height)
+        height = max(1, self._room)
         self.cursor = max(0, min(to, self._listed.total - 1))
         self._top = max(min(self._top, self.cursor), self.cursor - height + 1, 0)
         if (self.cursor, self._top) != before:
@@ -232,6 +240,11 @@ class Pane(Widget, can_focus=True):
             self.post_message(self.Chosen(self, self.row))
         self._draw()
 
+    @property
+    def _room(self) -> int:
+        """The number of rows that have room below the heads."""
+        return self.size.height - bool(self._listed.heads)
+
     def _known(self, number: int) -> Row | None:
         at = number - self._offset
         return self._listed.rows[at] if 0 <= at < len(self._listed.rows) else None
@@ -248,35 +261,55 @@ class Pane(Widget, can_focus=True):
 
     def render_line(self, y: int) -> Strip:
         """Draw a line, as Textual asks for it."""
-        number, width = self._top + y, self.size.width
-        base = self.rich_style
+        width, heads, base = self.size.width, self._listed.heads, self.rich_style
+        if heads and y == 0:
+            return Strip([Segment(heads.rjust(width), base + Style(bold=True))]).adjust_cell_length(width, base)
+        number = self._top + y - bool(heads)
         if number >= self._listed.total:
             return Strip.blank(width, base)
         row = self._known(number) or Row("", "…", style="dim")
         style = base + Style.parse(row.style)
         if number == self.cursor:
             style += Style(reverse=True, bold=self.has_focus)
-        note = _fitted(_plain(row.note), width // 2)
-        room = width - cell_len(note) - (1 if note else 0)
+        columns = _plain(row.columns)
+        width_left = width - cell_len(columns)
+        note = _fitted(_plain(row.note), width_left // 2)
+        room = width_left - cell_len(note) - (1 if note else 0)
         text = Strip([Segment(_fitted(_plain(row.text), room), style)]).adjust_cell_length(
-            width - cell_len(note), style
+            width_left - cell_len(note), style
         )
-        return Strip([*text, Segment(note, style)]).adjust_cell_length(width, style)
+        return Strip([*text, Segment(note, style), Segment(columns, style)]).adjust_cell_length(width, style)
 
 
-class EventsPane(Widget):
-    """The newest events, as lines."""
+_KEYS = """\
+ 1  2  3     the tree; all resources; the events alone
+ z           the pane alone, and back
+ s           sorts the left list by the next column, the most first
+ arrows j k  move; page up, page down, home and end, too
+ Tab  Enter  the next pane; open: holders, parts
+ Esc         back: ends a filter, a list that was opened, a pane alone
+ /           filters the pane as you type; Enter keeps the filter
+             in the events also event:KIND, child:ID and server:NAME
 
-    def __init__(self, lines: deque[str]) -> None:
-        super().__init__(id="events")
-        self._lines = lines
-        self.border_title = "events"
+ K           kills the chosen child, after a question: y is yes
+ t  r        stops the chosen child; starts it again
+ u           unloads the query of the chosen row
+ U           takes the chosen resource away from all its holders
+ q           leaves
 
-    def render_line(self, y: int) -> Strip:
-        """Draw a line, as Textual asks for it."""
-        newest = list(self._lines.copy())[-self.size.height :]
-        text = _fitted(_plain(newest[y]), self.size.width) if y < len(newest) else ""
-        return Strip([Segment(text, self.rich_style)]).adjust_cell_length(self.size.width, self.rich_style)
+ CPU is that since the last look. Of several children in one process the first
+ one has it. Columns appear where there is room for them: z makes room."""
+
+
+class Keys(ModalScreen[None]):
+    """The help: what each key does. Any of Esc, ?, q closes it."""
+
+    CSS = "Keys { align: center middle; } #keys { width: 80; height: auto; border: round $accent; }"
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,question_mark,q", "dismiss", "back", key_display="esc")]
+
+    def compose(self) -> ComposeResult:
+        """Put the text on the screen."""
+        yield Static(_KEYS, id="keys", markup=False)
 
 
 class Terminal(App[None]):
@@ -298,21 +331,30 @@ class Terminal(App[None]):
     Pane:focus { border-top: heavy $accent; }
     #tree { width: 2fr; margin-right: 1; }
     #chosen { width: 3fr; }
-    #events { border-top: solid $foreground 40%; height: 6; }
+    #events { height: 25%; }
+    #events.alone { height: 1fr; }
+    #tree.alone { margin-right: 0; }
     #filter { height: 1; border: none; padding: 0; display: none; }
     #status { height: auto; max-height: 3; }
     #status.bad { color: $text-error; text-style: bold; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("k", "kill", "kill"),
-        Binding("t", "terminate", "terminate"),
+        Binding("K", "kill", "kill"),
+        Binding("y", "confirm", show=False),
+        Binding("t", "terminate", "stop"),
         Binding("r", "restart", "restart"),
         Binding("u", "unload", "unload"),
-        Binding("U", "take_away", "from all"),
+        Binding("U", "take_away", "all"),
         Binding(
             "slash", "filter", "filter", key_display="/", priority=True
         ),  # the characters typed after it are never commands
         Binding("escape", "leave", "back", key_display="esc"),
+        Binding("1", "list_tree", show=False),
+        Binding("2", "list_resources", show=False),
+        Binding("3", "show_events", show=False),
+        Binding("z", "zoom", show=False),
+        Binding("s", "sort", show=False),
+        Binding("question_mark", "help", "help", key_display="?"),
         Binding("q", "quit", "quit"),
     ]
 
@@ -328,11 +370,14 @@ class Terminal(App[None]):
         self.animation_level = "none"
         self._link = link
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
-        self._lines: deque[str] = deque(maxlen=_EVENTS_KEPT)
+        self._happened = EventLines()
         # Kept, not looked up on the screen: an answer may arrive when the user leaves and the screen is empty.
-        self.left = Pane("tree", Tree(), self._look)
+        self._tree, self._resources = Tree(), AllResources()  # as they were sorted last
+        self.left = Pane("tree", self._tree, self._look)
         self.right = Pane("chosen", Nothing(), self._look)
-        self.events = EventsPane(self._lines)
+        self.events = Pane("events", Happenings(self._happened), self._look)
+        self._sides = Horizontal(id="panes")
+        self._alone: Pane | None = None
         self._headline = Static(id="title", markup=False)
         self._field = Input(id="filter", placeholder="only rows with this text; Enter keeps the filter, Esc ends it")
         self._status_line = Static(id="status", markup=False)
@@ -340,6 +385,8 @@ class Terminal(App[None]):
         self._shown = 0
         self._said = ""
         self._is_bad = False
+        self._to_kill = ""
+        self._question = ""
         self._lost = ""
         self._silence = ""
         self._welcome: c.Welcome | None = None
@@ -351,7 +398,7 @@ class Terminal(App[None]):
     def compose(self) -> ComposeResult:
         """Put the panes on the screen."""
         yield self._headline
-        with Horizontal(id="panes"):
+        with self._sides:
             yield self.left
             yield self.right
         yield self.events
@@ -387,7 +434,7 @@ class Terminal(App[None]):
         is_news = self._heard != self._shown
         if is_news:
             self._shown = self._heard
-            self.events.refresh()
+            self.events.ask()
         if not self._lost:
             self.left.ask_again(is_news)
             self.right.ask_again(is_news)
@@ -403,9 +450,11 @@ class Terminal(App[None]):
             self._show(Past(row.child.path))
         elif row.registrar:
             self._show(Served(row.registrar))
+        elif row.resource:
+            self._show(Neighbours(row.resource, row.name))
 
     def _show(self, rows: Rows) -> None:
-        """Show the child or registrar under the tree's cursor, unless it or a list opened from it is shown already."""
+        """Show the thing under the left cursor, unless it or a list opened from it is shown already."""
         if rows not in (self.right.rows, *(before[0] for before in self._before)):
             self._before.clear()
             self.right.show(rows)
@@ -413,13 +462,60 @@ class Terminal(App[None]):
     @on(Pane.Opened)
     def _open(self, message: Pane.Opened) -> None:
         if message.pane is self.left:
+            self._give_screen_to(None)
             self.screen.set_focus(self.right)
         elif message.row.resource:
             self._before.append((self.right.rows, self.right.match, self.right.cursor))
-            self.right.show(Neighbours(message.row.resource))
+            self.right.show(Neighbours(message.row.resource, message.row.name))
+
+    def action_list_tree(self) -> None:
+        """Show the tree on the left."""
+        self._list(self._tree)
+
+    def action_list_resources(self) -> None:
+        """Show all resources on the left."""
+        self._list(self._resources)
+
+    def _list(self, rows: Tree | AllResources) -> None:
+        if self._alone is not self.left:
+            self._give_screen_to(None)
+        self.left.show(rows)
+        self.screen.set_focus(self.left)
+
+    def action_sort(self) -> None:
+        """Sort the list on the left by its next column."""
+        rows = self.left.rows
+        if isinstance(rows, Tree):
+            self._tree = rows = rows.by_next()
+        elif isinstance(rows, AllResources):
+            self._resources = rows = rows.by_next()
+        self.left.show(rows, self.left.match)
+
+    def action_show_events(self) -> None:
+        """Give the whole screen to the events."""
+        self._give_screen_to(self.events)
+        self.screen.set_focus(self.events)
+
+    def action_zoom(self) -> None:
+        """Give the whole screen to the pane that has the focus, or end that."""
+        self._give_screen_to(None if self._alone is not None else self._focused_pane())
+
+    def _give_screen_to(self, alone: Pane | None) -> None:
+        self._alone = alone
+        for pane in (self.left, self.right, self.events):
+            pane.display = alone in (None, pane)
+            pane.set_class(pane is alone, "alone")
+        self._sides.display = alone is not self.events
+
+    def action_help(self) -> None:
+        """Show what each key does."""
+        self.push_screen(Keys())
 
     def action_leave(self) -> None:
-        """Go back: leave the filter, or else the opened list, or else go to the tree."""
+        """Go back: answer a question with no, or leave the filter, the opened list or the pane alone, or go left."""
+        if self._question and self._question == self.status:
+            self._say(f"{self._to_kill} was not killed")
+            return
         pane = self._focused_pane()
         if self._filtered is not None:
             self._close_filter()
@@ -427,6 +523,8 @@ class Terminal(App[None]):
             pane.show(pane.rows)
         elif pane is self.right and self._before:
             self.right.show(*self._before.pop())
+        elif self._alone is not None:
+            self._give_screen_to(None)
         else:
             self.screen.set_focus(self.left)
 
@@ -458,56 +556,68 @@ class Terminal(App[None]):
     def _focused_pane(self) -> Pane:
         if self._filtered is not None:
             return self._filtered
-        return self.right if self.right.has_focus else self.left
+        return next((pane for pane in (self.right, self.events) if pane.has_focus), self.left)
 
     # -- what is done ------------------------------------------------------------------------------------------------
 
     def action_kill(self) -> None:
-        """Kill the process of the chosen child."""
-        self._to_child("kill", c.Kill)
+        """Ask whether to kill the process of the chosen child."""
+        if (path := self._chosen_child("kill")) is not None:
+            self._say(f"kill {path}? y: yes, Esc: no")
+            self._to_kill, self._question = path, self._said
+
+    def action_confirm(self) -> None:
+        """Kill the child that the status line asks about; do nothing if the status line shows no question."""
+        if self._question and self._question == self.status:
+            self._question = ""
+            self._begin(f"kill {self._to_kill}", commands.Kill(self._to_kill))
 
     def action_terminate(self) -> None:
         """Stop the chosen child."""
-        self._to_child("terminate", c.Terminate)
+        self._to_child("terminate", commands.Terminate)
 
     def action_restart(self) -> None:
         """Start the chosen child again."""
-        self._to_child("restart", c.Restart)
+        self._to_child("restart", commands.Restart)
 
-    def _to_child(self, verb: str, command: Callable[[str], c.Command]) -> None:
+    def _to_child(self, verb: str, command: Callable[[str], Command[c.Done]]) -> None:
+        if (path := self._chosen_child(verb)) is not None:
+            self._begin(f"{verb} {path}", command(path))
+
+    def _chosen_child(self, verb: str) -> str | None:
         row = self.left.row
         if row is None or row.child is None:
             self._say(f"{verb}: choose a child in the tree", bad=True)
-            return
-        self._begin(f"{verb} {row.child.path}", command(row.child.path))
+            return None
+        return row.child.path
 
     def action_unload(self) -> None:
         """Release the query of the chosen row."""
-        row = self.right.row if self.right.has_focus else None
+        row = self._focused_pane().row
         if row is None or not (row.query or row.resource):
             self._say("unload: choose a resource or a holder on the right (Tab goes there)", bad=True)
         elif not row.query:
             self._say("unload: it has not one holder: Enter shows them; U takes it away from all", bad=True)
         else:
-            self._begin(f"unload query {row.query}", c.Unload(row.query))
+            self._begin(f"unload query {short_id(row.query)}", commands.Unload(row.query))
 
     def action_take_away(self) -> None:
         """Take the chosen resource away from all its holders."""
-        row = self.right.row if self.right.has_focus else None
-        shown = self.right.rows
+        row, shown = self._focused_pane().row, self._focused_pane().rows
         id = shown.id if isinstance(shown, Neighbours) else row.resource if row and row.key == row.resource else ""
         if row is None or not id:
             self._say("unload from all: choose a resource on the right (Tab goes there)", bad=True)
         else:
-            self._begin(f"unload resource {id} from all", c.Unload(id, force=True))
+            name = shown.name if isinstance(shown, Neighbours) else row.name
+            self._begin(f"unload {name or short_id(id)} from all", commands.Unload(id, force=True))
 
-    def _begin(self, what: str, command: c.Command) -> None:
+    def _begin(self, what: str, command: Command[c.Done]) -> None:
         self._say(f"{what} …")
         self.run_worker(self._carry_out(what, command), group="commands")
 
-    async def _carry_out(self, what: str, command: c.Command) -> None:
+    async def _carry_out(self, what: str, command: Command[c.Done]) -> None:
         try:
-            done = await self._in_thread(self._link.ask, command, c.Done)
+            done = await self._in_thread(self._link.ask, command)
         except RrError as error:
             self._say(f"{what}: {error}", bad=True)
         else:
@@ -533,20 +643,26 @@ class Terminal(App[None]):
     def _lose(self, problem: str) -> None:
         if not self._lost:
             self._lost = problem
-            self._lines.append(f"{time.strftime('%H:%M:%S')}  {problem}")
+            self._happened.note(problem, time.time())
             self._heard += 1
             self._show_status()
 
     def _reached(self, welcome: c.Welcome) -> None:
-        """Post the message that the system was reached. In a thread."""
+        """Post the message that the system was reached, and take what has happened before. In a thread."""
+        if self._welcome is None:
+            with contextlib.suppress(RrError):
+                for record in self._link.ask(ListHistory(), _LOOK_S * _SHARE).records:
+                    self._happened.take(event_of(record))
+                self._heard += 1
         self.post_message(self.Found(welcome))
 
     def _hear(self, part: c.Events | c.Missed) -> None:
         """Keep the lines of events, for which the screen looks when it can. In a thread."""
         if isinstance(part, c.Missed):
-            self._lines.append(missed_line(part))
+            self._happened.note(missed_line(part), time.time())
         else:
-            self._lines.extend(event_line(event) for event in part.events)
+            for event in part.events:
+                self._happened.take(event)
         self._heard += 1
 
     @on(Found)

@@ -6,15 +6,27 @@ import textwrap
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol, TypeVar
 
 from rr_actors.base.errors import RrError, UnknownQuery
+from rr_actors.base.names import named, short_id
 from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
 from rr_actors.system.console import console_messages as c
-from rr_actors.tools.explanations import ago, record_line, since
+from rr_actors.system.console import console_questions as questions
+from rr_actors.system.console.console_client import read_pages
+from rr_actors.system.console.console_view import Verb
+from rr_actors.system.recording.event_texts import ago
+from rr_actors.tools.explanations import name_of_resource, since
 from rr_actors.tools.process_usage import usage_of
+from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_of
 
-_LOOK_S = 10.0  # for the answer to a question
+WORST = (
+    "FATAL", "ERROR", "unload_failed", "WARNING", "loading", "resuming", "queued", "unloading", "pausing", "paused",
+    "UPDATE", "OK",
+)  # fmt: skip
+"""The states of resources, the worst first."""
+LOOK_S = 10.0  # for the answer to a question
 _HISTORY = 100  # records
 _A = TypeVar("_A")
 
@@ -22,8 +34,8 @@ _A = TypeVar("_A")
 class Asks(Protocol):
     """An object that answers questions to the system: a ConsoleLink."""
 
-    def ask(self, request: c.Request, expected: type[_A], timeout_s: float | None = None) -> _A:
-        """Send a request, and return its answer."""
+    def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
+        """Send a question or a command, and return its answer."""
         ...
 
 
@@ -34,9 +46,11 @@ class Row:
     Attributes:
         key: the id of the thing that it shows; the cursor stays on the row of the same key.
         text, note: at the left and the right of the line.
+        columns: cells of fixed widths, at the right of the note.
         style: Rich's words for its colour.
         child, registrar, resource: the thing that Enter opens; None or "" for none.
         query: the query that `unload` releases on this row.
+        name: the name of the resource that Enter opens.
     """
 
     key: str
@@ -47,6 +61,8 @@ class Row:
     registrar: str = ""
     resource: str = ""
     query: str = ""
+    name: str = ""
+    columns: str = ""
 
 
 @dataclass(frozen=True)
@@ -61,11 +77,12 @@ class Window:
 
 @dataclass(frozen=True)
 class Listed:
-    """The rows of a window, the number of all rows, and the registrars that could not be asked."""
+    """The rows of a window, the number of all rows, the registrars that could not be asked, and the columns' heads."""
 
     total: int
     rows: list[Row]
     notes: list[str] = field(default_factory=list[str])
+    heads: str = ""
 
 
 class Rows(Protocol):
@@ -100,29 +117,6 @@ class Nothing:
 
 
 @dataclass(frozen=True)
-class Tree:
-    """The supervisor tree, and after it the registrars."""
-
-    @property
-    def title(self) -> str:
-        """The word "tree"."""
-        return "tree"
-
-    def list(self, link: Asks, window: Window) -> Listed:
-        """Ask the system for the children and registrars of a window."""
-
-        def children(offset: int, limit: int) -> Listed:
-            page = link.ask(c.ListChildren(window.match, offset, limit), c.Children, _LOOK_S)
-            return Listed(page.total, [_child(row, bool(window.match)) for row in page.rows])
-
-        def registrars(offset: int, limit: int) -> Listed:
-            page = link.ask(c.ListRegistrars(window.match, offset, limit), c.Registrars, _LOOK_S)
-            return Listed(page.total, [_registrar(row) for row in page.rows])
-
-        return _joined(window, children, registrars)
-
-
-@dataclass(frozen=True)
 class Served:
     """The resources that a registrar serves, and after them the queries that it holds at others."""
 
@@ -137,14 +131,14 @@ class Served:
         """Ask the system for the resources and queries of a window."""
 
         def resources(offset: int, limit: int) -> Listed:
-            page = link.ask(c.ListResources(window.match, offset, limit, self.name), c.Resources, _LOOK_S)
+            page = link.ask(questions.ListResources(window.match, offset, limit, self.name), LOOK_S)
             return Listed(page.total, [_resource(row) for row in page.rows], page.notes)
 
         def queries(offset: int, limit: int) -> Listed:
-            page = link.ask(c.ListQueries(window.match, offset, limit, self.name), c.Queries, _LOOK_S)
+            page = link.ask(questions.ListQueries(window.match, offset, limit, self.name), LOOK_S)
             return Listed(page.total, [_query(row) for row in page.rows], page.notes)
 
-        return _joined(window, resources, queries)
+        return joined(window, resources, queries)
 
 
 @dataclass(frozen=True)
@@ -160,11 +154,11 @@ class Past:
 
     def list(self, link: Asks, window: Window) -> Listed:
         """Ask the system for the child's state and history."""
-        records = link.ask(c.ListHistory(self.path, _HISTORY), c.Happenings, _LOOK_S).records
+        records = link.ask(questions.ListHistory(self.path, _HISTORY), LOOK_S).records
         rows = [row for place in _places(link, self.path) for row in _wrapped(_as_it_is(place), window.width, "bold")]
         for record in reversed(records):
-            style = "red" if record.reason in ("abnormal", "killed") or record.event == "start_failed" else ""
-            rows += _wrapped(record_line(record, self.path), window.width, style)
+            line = EventLine.of(event_of(record), self.path)
+            rows += _wrapped(str(line), window.width, style_of(line))
             rows += [Row("", f"    {line}", style="dim") for line in record.traceback.rstrip().splitlines()]
         return _cut(rows, window)
 
@@ -174,11 +168,12 @@ class Neighbours:
     """A resource: its state, its holders, and the parts on which it depends."""
 
     id: str
+    name: str = field(default="", compare=False)
 
     @property
     def title(self) -> str:
-        """The beginning of the resource's id."""
-        return f"resource {self.id[:12]}: holders and parts"
+        """The resource's name."""
+        return f"{self.name or short_id(self.id)}: holders and parts"
 
     def list(self, link: Asks, window: Window) -> Listed:
         """Ask the system for the resource and its parts.
@@ -186,25 +181,49 @@ class Neighbours:
         Raises:
             UnknownQuery: the resource is unloaded.
         """
-        found = [row for row in link.ask(c.Find(self.id), c.Found, _LOOK_S).resources if row.id == self.id]
+        found = [row for row in link.ask(questions.Find(self.id), LOOK_S).resources if row.id == self.id]
         if not found:
-            raise UnknownQuery(f"resource {self.id}: it is unloaded", query_id=self.id)
+            raise UnknownQuery(f"{self.name or f'resource {short_id(self.id)}'}: it is unloaded", query_id=self.id)
         resource = found[0]
-        rows = [*_wrapped(f"{resource.server} {resource.request}", window.width, "bold"), *_how(resource, window.width)]
+        rows = [*_wrapped(resource.name, window.width, "bold"), *_how(resource, window.width)]
+        rows.append(Row("", f"id {short_id(resource.id)}", style="dim"))
         rows.append(Row("", f"held by {resource.holder_count}:" if resource.holder_count else "nobody holds it"))
-        rows += [_holder(holder) for holder in resource.holders]
+        rows += [_holder(link, holder) for holder in resource.holders]
         if resource.holder_count > len(resource.holders):
             rows.append(Row("", f"  and by {resource.holder_count - len(resource.holders)} more"))
         if resource.part_count:
             rows.append(Row("", f"depends on {resource.part_count}:"))
         for part in resource.parts:
-            queries = [row for row in link.ask(c.Find(part), c.Found, _LOOK_S).queries if row.id == part]
-            rows += [
-                Row(row.id, f"  {row.server} {row.request}", row.hold, resource=row.resource_id) for row in queries
-            ]
+            queries = [row for row in link.ask(questions.Find(part), LOOK_S).queries if row.id == part]
+            rows += [Row(row.id, f"  {row.name}", row.hold, resource=row.resource_id, name=row.name) for row in queries]
         if resource.part_count > len(resource.parts):
             rows.append(Row("", f"  and on {resource.part_count - len(resource.parts)} more"))
         return _cut(rows, window)
+
+
+@dataclass(frozen=True)
+class Happenings:
+    """The newest events, newest first. The filter is what EventFilter.parse() reads."""
+
+    known: EventLines = field(compare=False)
+
+    @property
+    def title(self) -> str:
+        """The word "events"."""
+        return "events"
+
+    def list(self, link: Asks, window: Window) -> Listed:
+        """Return the lines of a window, without asking."""
+        lines = self.known.lines(EventFilter.parse(window.match))[::-1]
+        shown = lines[window.offset : window.offset + window.limit]
+        return Listed(len(lines), [Row("", str(line), style=style_of(line)) for line in shown])
+
+
+def style_of(line: EventLine) -> str:
+    """Return Rich's words for the colour of a line: that of its status, or red for a bad end."""
+    if line.kind in _BAD or line.how.startswith(("killed", "abnormal")):
+        return "red"
+    return STATE_STYLES.get(line.how.partition(" ")[0], "")
 
 
 def refused(error: RrError, window: Window) -> Listed:
@@ -213,7 +232,7 @@ def refused(error: RrError, window: Window) -> Listed:
     return Listed(len(rows), rows[window.offset : window.offset + window.limit])
 
 
-def _joined(window: Window, *lists: Callable[[int, int], Listed]) -> Listed:
+def joined(window: Window, *lists: Callable[[int, int], Listed]) -> Listed:
     """Return a window on several lists in a row. Each is asked only for its part, and for its number of rows."""
     total, rows, notes = 0, list[Row](), list[str]()
     for ask in lists:
@@ -238,13 +257,8 @@ def _wrapped(text: str, width: int, style: str = "") -> list[Row]:
 
 def _places(link: Asks, path: str) -> list[c.ChildRow]:
     """Return the child of this path, or none if it was forgotten. The system also lists paths that contain it."""
-    seen = 0
-    while True:
-        page = link.ask(c.ListChildren(path, seen), c.Children, _LOOK_S)
-        seen += len(page.rows)
-        found = [row for row in page.rows if row.path == path]
-        if found or not page.rows or seen >= page.total:
-            return found
+    pages = read_pages(partial(link.ask, timeout_s=LOOK_S), questions.ListChildren(path))
+    return next(([row] for page in pages for row in page.rows if row.path == path), list[c.ChildRow]())
 
 
 def _as_it_is(row: c.ChildRow) -> str:
@@ -266,44 +280,39 @@ def _age(id: str) -> str:
     return "" if at is None else ago(max(0.0, time.time() - at))
 
 
-_CHILD_STYLES = {"running": "", "stopped": "dim", "starting": "yellow", "restarting": "yellow", "unavailable": "red"}
-_STATE_STYLES = {"WARNING": "yellow", "ERROR": "red", "FATAL": "red"}
-
-
-def _child(row: c.ChildRow, as_path: bool) -> Row:
-    name = row.path if as_path else "  " * row.depth + row.path.rpartition("/")[2]
-    restarts = f"{row.restarts}x" if row.restarts else ""
-    note = " ".join(filter(None, (row.state if row.state != "running" else "", restarts)))
-    return Row(f"child {row.path}", name, note, _CHILD_STYLES.get(row.state, ""), child=row)
-
-
-def _registrar(row: c.RegistrarRow) -> Row:
-    note = row.status if row.status != "up" else f"{len(row.servers)} server{'' if len(row.servers) == 1 else 's'}"
-    style = "cyan" if row.status == "up" else "dim"
-    return Row(f"registrar {row.name}", f"@{row.name}", row.error or note, style, registrar=row.name)
+_BAD = frozenset(("load_failed", "unload_failed", "pause_failed", "start_failed", "gave_up", "dead_letter"))
+STATE_STYLES = {"WARNING": "yellow", "ERROR": "red", "FATAL": "red"}
 
 
 def _resource(row: ResourceRow) -> Row:
     state = row.condition
     held = row.holders[0].origin if row.holder_count == 1 else f"{row.holder_count} holders"
     only = row.holders[0].query_id if row.holder_count == 1 else ""
-    text = f"{row.server.partition('/')[2]} {row.request}"
-    note = f"{'' if state == 'OK' else state + ' '}{held}"
-    return Row(row.id, text, note, _STATE_STYLES.get(state, ""), resource=row.id, query=only)
+    text = named(row.server.partition("/")[2], row.request)
+    note = f"{'' if state == 'OK' else state + ' '}{held}{_priority(row.priority) if row.holder_count else ''}"
+    return Row(row.id, text, note, STATE_STYLES.get(state, ""), resource=row.id, query=only, name=row.name)
 
 
 def _query(row: QueryRow) -> Row:
     note = "" if row.hold == "held" else row.hold
-    return Row(row.id, f"-> {row.server} {row.request}", note, resource=row.resource_id, query=row.id)
+    return Row(row.id, f"-> {row.name}", note, resource=row.resource_id, query=row.id, name=row.name)
 
 
-def _holder(holder: Holder) -> Row:
-    text = f"  {holder.origin}, for {f'resource {holder.parent[:12]}' if holder.parent else 'itself'}"
-    return Row(holder.query_id, text, _age(holder.query_id), resource=holder.parent, query=holder.query_id)
+def _holder(link: Asks, holder: Holder) -> Row:
+    name = name_of_resource(partial(link.ask, timeout_s=LOOK_S), holder.parent, holder.origin) if holder.parent else ""
+    text = f"  {holder.origin}, for {name or 'itself'}"
+    text += _priority(holder.priority)
+    if holder.unheard:
+        text = f"{text}, {holder.unheard} unheard"
+    return Row(holder.query_id, text, _age(holder.query_id), resource=holder.parent, query=holder.query_id, name=name)
+
+
+def _priority(priority: int | None) -> str:
+    return ", standby" if priority is None else f", priority {priority}" if priority else ""
 
 
 def _how(resource: ResourceRow, width: int) -> list[Row]:
     state = resource.condition
     said = f"{state}: {resource.message}" if resource.message else state
     age = _age(resource.id)
-    return _wrapped(f"{said}{f', for {age}' if age else ''}", width, _STATE_STYLES.get(state, ""))
+    return _wrapped(f"{said}{f', for {age}' if age else ''}", width, STATE_STYLES.get(state, ""))

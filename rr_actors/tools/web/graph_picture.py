@@ -1,18 +1,24 @@
-"""The picture of dependencies between resources, or if these are too many between registrars: a chart for ECharts.
+"""The picture of dependencies between resources, or if these are too many between servers: a chart for ECharts.
 
-Registrars are boxes. A holder is left of the resource that it holds, so a status travels from right to left.
+A server is one node with its resources counted, in the colour of the worst; a server that is opened has nodes for its
+first resources, the worst ones first. Registrars are boxes. A holder is left of the resource that it holds, so a status
+travels from right to left.
 """
 
 from __future__ import annotations
 
 import html
 import itertools
-from collections.abc import Collection, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from rr_actors.base.names import named
 from rr_actors.registrar.pages import ResourceRow
+from rr_actors.system.console.console_questions import Find, ListResources
 from rr_actors.tools.graphs import edges_of
-from rr_actors.tools.web.watch import GROUPED_FROM, Moment
+from rr_actors.tools.terminal.terminal_rows import WORST
+from rr_actors.tools.web.watch import Moment
 
 Chart = dict[str, Any]
 Edge = tuple[str, str]
@@ -23,11 +29,19 @@ _STATES = {  # the colour, sign and shape of each state
     "WARNING": ("#ef8f00", "! ", "triangle"),
     "ERROR": ("#c62828", "✖ ", "diamond"),
     "FATAL": ("#7f0000", "✖✖ ", "rect"),
+    "unload_failed": ("#c62828", "✖ ", "diamond"),
 }
+SERVER = "#"
+"""A node of this beginning is a server, "#cameras/camera"."""
 _BUSY = ("#78909c", "… ", "emptyCircle")
 _STACK = 16  # resources above one another in a box
+_TALL = 4  # of them have the height of a server, whose text has a line for each state and stands below it
 _LABELS = 60  # up to so many nodes always have labels; of more nodes, a label appears under the mouse
 _TEXT = 34
+_OPENED = 40  # resources of a server
+_NEIGHBOURS = 100
+_LOOK_S = 20.0
+_Ask = Callable[[Any, float], Any]
 
 
 def edges_in(moment: Moment) -> list[Edge]:
@@ -66,15 +80,21 @@ def travels(told: Iterable[tuple[str, float]], moment: Moment, step_s: float) ->
     return begins
 
 
-def chart(moment: Moment, chosen: str = "", told: Collection[str] = ()) -> Chart:
+def chart(
+    moment: Moment,
+    chosen: str = "",
+    told: Collection[str] = (),
+    opened: Mapping[str, Sequence[ResourceRow]] | None = None,
+) -> Chart:
     """Return ECharts' options for the picture of a moment.
 
     Args:
         chosen: the id of the resource whose holders and parts light up; "" for none.
         told: the nodes that a status has just reached, which stand out.
+        opened: the resources that are drawn of a server, where the moment has servers alone.
     """
-    if moment.total > GROUPED_FROM:
-        return _drawn(*_grouped(moment), set(), ())
+    if moment.servers:
+        return _drawn(*_collapsed(moment, opened or {}), set(), ())
     boxes: dict[str, list[str]] = {}
     labels: dict[str, tuple[str, str]] = {}  # text and state
     for row in moment.resources:
@@ -88,15 +108,56 @@ def chart(moment: Moment, chosen: str = "", told: Collection[str] = ()) -> Chart
     return _drawn(boxes, labels, edges, around(chosen, edges), told)
 
 
-def _grouped(moment: Moment) -> tuple[dict[str, list[str]], dict[str, tuple[str, str]], list[Edge]]:
-    """Return a node for each registrar, with its number of resources, and the edges between them."""
-    labels = {
-        f"@{row.name}": (f"{row.name}: {row.counts.get('resources', 0)} resources", "OK" if row.status == "up" else "")
-        for row in moment.registrars
-    }
-    home = {row.id: f"@{row.server.partition('/')[0]}" for row in moment.resources}
-    edges = {(home.get(above, above), home[below]) for above, below in edges_in(moment) if below in home}
-    return {name[1:]: [name] for name in labels}, labels, sorted(edge for edge in edges if edge[0] in labels)
+def _collapsed(
+    moment: Moment, opened: Mapping[str, Sequence[ResourceRow]]
+) -> tuple[dict[str, list[str]], dict[str, tuple[str, str]], list[Edge]]:
+    """Return the nodes of servers, and of the resources of those that are opened, with the edges between them."""
+    boxes: dict[str, list[str]] = {}
+    labels: dict[str, tuple[str, str]] = {}
+    nodes: dict[str, list[str]] = {}  # of a server, or of a registrar that holds for itself
+    for one in moment.servers:
+        registrar, _, local = one.server.partition("/")
+        rows = opened.get(one.server, ())
+        rest = Counter(one.states) - Counter(row.condition for row in rows)
+        labels |= {row.id: (_label(row), row.condition) for row in rows}
+        nodes[one.server] = [row.id for row in rows]
+        if not local:
+            nodes[one.server].append(f"@{registrar}")
+            labels[f"@{registrar}"] = f"@{registrar}", "OK"
+        elif rest or not rows:
+            nodes[one.server].append(SERVER + one.server)
+            labels[SERVER + one.server] = _counted(local, rest, "more" if rows else "")
+        boxes.setdefault(registrar, []).extend(nodes[one.server])
+    for row in moment.registrars:
+        if row.status != "up" and row.name not in boxes:
+            boxes[row.name] = [f"@{row.name}"]
+            labels[f"@{row.name}"] = f"@{row.name}: {row.status}", ""
+    drawn = {row.id: row for rows in opened.values() for row in rows}
+    edges: dict[Edge, None] = {}
+    for one in moment.servers:
+        for below in one.holds:
+            between = itertools.product(nodes[one.server], nodes.get(below, ()))
+            edges |= dict.fromkeys(edge for edge in between if _may_hold(*edge, drawn))
+    return boxes, labels, list(edges)
+
+
+def _may_hold(above: str, below: str, drawn: Mapping[str, ResourceRow]) -> bool:
+    """Return whether an edge between two nodes is right, as far as the rows of opened servers say it."""
+    if below not in drawn:
+        return above not in drawn or drawn[above].part_count > 0
+    holders = drawn[below].holders
+    if above in drawn:
+        return any(holder.parent == above for holder in holders)
+    origin = above.strip("@#").partition("/")[0]
+    return any(holder.origin == origin and bool(holder.parent) != above.startswith("@") for holder in holders)
+
+
+def _counted(name: str, states: Mapping[str, int], more: str) -> tuple[str, str]:
+    """Return the text and the state of a server: lines such as "camera", "400", "3 ERROR", and the worst state."""
+    there = [state for state in WORST if states.get(state)]
+    bad = [f"{states[state]:,} {state}" for state in there if state != "OK"]
+    total = " ".join(filter(None, (f"{sum(states.values()):,}", more)))
+    return "\n".join([name, total, *bad]), there[0] if there else "OK"
 
 
 def _drawn(
@@ -136,16 +197,19 @@ def _node(
     name: str, place: tuple[float, float], text: str, state: str, shown: bool, lit: set[str], told: Collection[str]
 ) -> Chart:
     colour, sign, shape = _STATES.get(state, _BUSY)
-    if name.startswith("@"):
+    if name.startswith(("@", SERVER)):
         shape = "roundRect"
     is_dark = bool(lit) and name not in lit
     reached = name in told
     node: Chart = {"name": name, "value": list(place), "symbol": shape, "symbolSize": 26 if reached else 15}
     node["itemStyle"] = {"color": colour, "opacity": 0.15 if is_dark else 1}
     node["itemStyle"] |= {"borderColor": "#ffab00", "borderWidth": 6} if reached else {}
-    node["label"] = {"show": shown or name in lit or reached, "position": "right", "formatter": sign + text}
+    where: Chart = {"position": "right"}
+    if name.startswith(SERVER):
+        where = {"position": [0, 18], "align": "left", "verticalAlign": "top", "lineHeight": 14}
+    node["label"] = {"show": shown or name in lit or reached, "formatter": sign + text} | where
     node["label"] |= {"color": "#b0bec5" if is_dark else "#1c2529", "fontWeight": "bold" if reached else "normal"}
-    node["tooltip"] = {"formatter": html.escape(f"{text}: {state}", quote=False)}
+    node["tooltip"] = {"formatter": html.escape(f"{text}: {state}".replace("\n", ", "), quote=False)}
     return node
 
 
@@ -183,11 +247,15 @@ def _places(
     for column in columns:
         top, widest = 0.0, 1.0
         for box in column:
-            names = boxes[box]
-            wide = -(-len(names) // _STACK)
-            high = min(len(names), _STACK)
-            for number, name in enumerate(names):
-                places[name] = left + 0.15 + number // _STACK, top + 1.2 + number % _STACK
+            row = high = wide = 0
+            for name in boxes[box]:
+                tall = _TALL if name.startswith(SERVER) else 1
+                if row and row + tall > _STACK:
+                    row, wide = 0, wide + 1
+                places[name] = left + 0.15 + wide, top + 1.2 + row
+                row += tall
+                high = max(high, row)
+            wide += 1
             areas[box] = left, top, left + wide - 0.1, top + high + 0.9
             top += high + 1.4
             widest = max(widest, wide)
@@ -211,5 +279,51 @@ def _columns(boxes: list[str], edges: set[Edge]) -> list[list[str]]:
 
 
 def _label(row: ResourceRow) -> str:
-    text = f"{row.server.partition('/')[2]} {row.request}"
-    return text if len(text) <= _TEXT else text[: _TEXT - 1] + "…"
+    return named(row.server.partition("/")[2], row.request, _TEXT)
+
+
+# -- the rows of a picture where all resources are too many ------------------------------------------------------------
+
+
+def rows_of_server(ask: _Ask, server: str, states: Mapping[str, int]) -> list[ResourceRow]:
+    """Return the first 40 resources of a server, the worst ones first.
+
+    Args:
+        states: how many of its resources are in each state.
+
+    Raises:
+        RrError: the system did not answer.
+    """
+    found: dict[str, ResourceRow] = {}
+    for match in [state for state in WORST if states.get(state) and state != "OK"] + [server]:
+        page = ask(ListResources(match, registrar=server.partition("/")[0]), _LOOK_S)
+        found = {row.id: row for row in page.rows if row.server == server} | found
+    return sorted(found.values(), key=_badness)[:_OPENED]
+
+
+def _badness(row: ResourceRow) -> int:
+    return WORST.index(row.condition)
+
+
+def neighbours_of(ask: _Ask, id: str) -> list[ResourceRow]:
+    """Return a resource with all that hold it and all that it depends on, direct or not: the first 100.
+
+    Raises:
+        RrError: the system did not answer.
+    """
+    found = {row.id: row for row in ask(Find(id), _LOOK_S).resources if row.id == id}
+    for beside in (_above, _below):
+        new = list(found.values())[:1]
+        while new and len(found) < _NEIGHBOURS:
+            asked = [row for one in new for question in beside(one) for row in ask(question, _LOOK_S).resources]
+            new = [row for row in asked if row.id not in found]
+            found |= {row.id: row for row in new}
+    return list(found.values())[:_NEIGHBOURS]
+
+
+def _above(row: ResourceRow) -> Iterator[Find]:
+    return (Find(holder.parent, holder.origin) for holder in row.holders if holder.parent)
+
+
+def _below(row: ResourceRow) -> Iterator[Find]:
+    return (Find(part) for part in row.parts)

@@ -10,7 +10,6 @@ from functools import partial
 
 from nicegui import app, ui
 
-from rr_actors.tools.explanations import event_line
 from rr_actors.tools.web import graph_picture
 from rr_actors.tools.web.lab_runs import AT_ONCE, Experiment, Place, Run, experiments
 from rr_actors.tools.web.tree_picture import TreePicture
@@ -57,11 +56,13 @@ class LabPage:
                 self._title = ui.label("").classes("text-h6")
                 self._about = ui.label("Each button starts a real system of a few processes, for half a minute or so.")
                 self._look_for = ui.label("").classes("text-bold")
-                with ui.row().classes("w-full no-wrap items-stretch"):
-                    with ui.element("div").classes("rr-panel").style("flex: 4; min-height: 320px"):
+                with ui.element("div").classes("rr-split"):
+                    with ui.element("div").classes("rr-panel rr-holds-tree").style("flex: 4; min-height: 320px"):
                         self._tree = TreePicture(lambda path: None)
                     with ui.element("div").classes("rr-panel").style("flex: 4") as self._graph_panel:
-                        self._graph = ui.echart(graph_picture.chart(Moment(0))).style("height: 320px")
+                        self._graph = (
+                            ui.echart(graph_picture.chart(Moment(0))).classes("rr-graph").style("height: 320px")
+                        )
                     with ui.element("div").classes("rr-panel").style("flex: 3"):
                         self._said = ui.label("").classes("rr-rows").props('role="log" aria-label="what it prints"')
                         self._events = ui.label("").classes("rr-events rr-note")
@@ -89,8 +90,8 @@ class LabPage:
         if watch is None or (running, watch.version) == self._drawn:
             return
         self._drawn = running, watch.version
-        self._tree.show(watch.now.children)
+        self._tree.show(watch.now)
         self._graph_panel.set_visibility(bool(watch.now.registrars))
         self._graph.options.clear()
         self._graph.options.update(graph_picture.chart(watch.now))
-        self._events.text = "\n".join(event_line(event) for event in list(watch.events.copy())[-_LINES:])
+        self._events.text = "\n".join(map(str, watch.lines.lines()[-_LINES:]))

@@ -13,8 +13,10 @@ from typing import Any, cast
 from nicegui import app, ui
 
 from rr_actors.base.errors import RrError
+from rr_actors.base.names import short_ids
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console import console_questions as questions
 from rr_actors.tools.web.watch import Watch
 
 _PATH = "/rows/resources"
@@ -22,7 +24,7 @@ _BLOCK = 100  # rows that are asked for at once
 _REFRESH_S = 1.0
 _LOOK_S = 20.0
 _COLUMNS = (
-    ("server", 2), ("request", 4), ("state", 1.3), ("message", 2), ("holders", 1), ("held_by", 2), ("id", 2),
+    ("resource", 5), ("state", 1.3), ("message", 2), ("priority", 1), ("holders", 1), ("held_by", 2), ("short_id", 1.3),
 )  # fmt: skip
 _SOURCE = f"""{{
   getRows: (wanted) => {{
@@ -47,7 +49,13 @@ class ResourceTable:
         search = ui.input("search in id, server, request and status", on_change=lambda event: self._find(event.value))
         search.props("dense outlined clearable debounce=200").classes("w-full")
         columns = [
-            {"field": name, "headerName": name.replace("_", " "), "flex": width, "tooltipField": name}
+            {
+                "field": name,
+                "headerName": name.replace("_", " "),
+                "flex": width,
+                "minWidth": 55 + 25 * width,
+                "tooltipField": name,
+            }
             for name, width in _COLUMNS
         ]
         options: dict[str, Any] = {
@@ -60,7 +68,7 @@ class ResourceTable:
             ":getRowId": "(row) => row.data.id",
             ":datasource": _SOURCE,
         }
-        self._grid = ui.aggrid(options, auto_size_columns=False).classes("w-full").style("height: 260px")
+        self._grid = ui.aggrid(options, auto_size_columns=False).classes("w-full").style("height: max(260px, 36vh)")
 
         async def selected() -> None:  # the event does not say which row is chosen
             answer = self._grid.run_grid_method("getSelectedRows", timeout=_LOOK_S)
@@ -87,15 +95,16 @@ def add_rows(watch: Watch) -> None:
     @app.get(_PATH)
     def _(match: str = "", offset: int = 0, limit: int = _BLOCK) -> dict[str, Any]:
         """Return a page of rows. As it is no coroutine, it runs in a thread."""
-        request = c.ListResources(match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)))
+        request = questions.ListResources(match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)))
         try:
-            page = watch.link.ask(request, c.Resources, _LOOK_S)
+            page = watch.link.ask(request, _LOOK_S)
         except RrError as error:
             return {"total": 0, "rows": [], "problem": str(error)}
-        return {"total": page.total, "rows": [_cells(row) for row in page.rows], "problem": "; ".join(page.notes)}
+        ids = short_ids(row.id for row in page.rows)
+        rows = [_cells(row) | {"short_id": ids[row.id]} for row in page.rows]
+        return {"total": page.total, "rows": rows, "problem": "; ".join(page.notes)}
 
 
 def _cells(row: ResourceRow) -> dict[str, Any]:
-    held_by = ", ".join(dict.fromkeys(holder.origin for holder in row.holders))
-    cells = {"id": row.id, "server": row.server, "request": row.request, "state": row.condition}
-    return cells | {"message": row.message, "holders": row.holder_count, "held_by": held_by}
+    cells = {"id": row.id, "resource": row.name, "state": row.condition, "message": row.message}
+    return cells | {"priority": row.needed, "holders": row.holder_count, "held_by": row.held_by}

@@ -28,7 +28,6 @@ _LIMIT = 20_000  # entries of a page's recording
 _LISTED = 30
 _AROUND_S = 1.0
 _CRASHES = ("exited", "restarted", "start_failed", "gave_up", "stopped", "started")
-_NONE = "sequenceDiagram\n    participant nothing as press record, and choose what has happened"
 
 
 class Recorder:
@@ -125,20 +124,22 @@ class SequencePage(Page):
 
     def build(self) -> None:
         """Put the buttons, the list and the diagram on the page."""
-        with ui.row().classes("w-full no-wrap items-stretch"):
-            with ui.element("div").classes("rr-panel").style("flex: 2; max-height: 62vh"):
+        with ui.element("div").classes("rr-split"):
+            with ui.element("div").classes("rr-panel").style("flex: 2"):
                 with ui.row().classes("gap-2"):
                     ui.button("record", on_click=self._record).props("dense no-caps")
                     ui.button("stop recording", on_click=self._end).props("dense no-caps outline")
                 self._state = ui.label("nothing is recorded").classes("rr-note")
                 self._list = ui.column().classes("rr-rows gap-0")
-            with ui.element("div").classes("rr-panel").style("flex: 5; max-height: 62vh"):
+            with ui.element("div").classes("rr-panel").style("flex: 5"):
                 with ui.row().classes("gap-2"):
                     ui.button("copy text", on_click=lambda: ui.clipboard.write(self._text.value or "")).props(
                         "dense no-caps outline"
                     )
                     ui.button("save SVG", on_click=self._save).props("dense no-caps outline")
-                self._picture = ui.mermaid(_NONE).classes("rr-sequence")
+                self._hint = ui.label("Press record, and choose what has happened: its messages appear here.")
+                self._picture = ui.mermaid("").classes("rr-sequence")
+                self._picture.set_visibility(False)
                 self._text = ui.textarea("Mermaid text").props("readonly outlined autogrow").classes("w-full rr-rows")
 
     def draw(self, moment: Moment) -> None:
@@ -169,12 +170,15 @@ class SequencePage(Page):
         await asyncio.to_thread(self._recorder.stop)
 
     async def _choose(self, entry: Entry) -> None:
-        try:
-            text = await asyncio.to_thread(self._recorder.diagram, entry)
-        except RrError as error:
-            ui.notify(str(error), type="negative")
-            return
+        with ui.context.client:  # not in the button's place: the list may be drawn anew before the diagram is made
+            try:
+                text = await asyncio.to_thread(self._recorder.diagram, entry)
+            except RrError as error:
+                ui.notify(str(error), type="negative")
+                return
         self._text.value = text
+        self._hint.set_visibility(False)
+        self._picture.set_visibility(True)
         self._picture.content = text
 
     def _save(self) -> None:

@@ -3,16 +3,16 @@ const SIGNS = { running: "●", starting: "◔", restarting: "↻", stopped: "�
 
 const Branch = {
   name: "rr-branch",
-  props: ["node", "chosen", "focus"],
+  props: ["node", "chosen", "focus", "unknown"],
   emits: ["pick"],
   template: `
     <li role="none">
-      <button type="button" role="treeitem" class="rr-node" :class="['rr-' + node.state, { 'rr-chosen': node.path === chosen }]"
+      <button type="button" role="treeitem" class="rr-node" :class="[unknown ? 'rr-unknown' : 'rr-' + node.state, { 'rr-chosen': node.path === chosen }]"
         :data-path="node.path" :aria-selected="node.path === chosen" :aria-label="label"
         :tabindex="node.path === focus ? 0 : -1" :title="node.error || node.type" @click="$emit('pick', node.path)">
         <span class="rr-id"><span class="rr-sign" aria-hidden="true">{{ sign }}</span> {{ node.id }}</span>
         <span v-if="node.restarts" class="rr-count" :key="node.restarts">↻{{ node.restarts }}</span>
-        <span class="rr-fact">{{ node.state }}{{ node.pid ? ' · ' + node.pid : '' }}</span>
+        <span class="rr-fact">{{ unknown || node.state }}{{ node.pid && !unknown ? ' · ' + node.pid : '' }}</span>
         <span v-if="node.strategy" class="rr-fact">{{ node.strategy }}</span>
         <span v-if="node.type === 'supervisor'" class="rr-window" :title="windowText">
           <i v-for="n in slots" :key="n" :class="{ full: n <= node.recent, over: n > node.most }"></i>
@@ -20,28 +20,29 @@ const Branch = {
         </span>
       </button>
       <ul v-if="node.children.length" role="group">
-        <rr-branch v-for="child in node.children" :key="child.path" :node="child" :chosen="chosen" :focus="focus"
+        <rr-branch v-for="child in node.children" :key="child.path" :node="child" :chosen="chosen" :focus="focus" :unknown="unknown"
           @pick="$emit('pick', $event)"></rr-branch>
       </ul>
     </li>`,
   computed: {
-    sign() { return SIGNS[this.node.state] || "?"; },
+    sign() { return (!this.unknown && SIGNS[this.node.state]) || "?"; },
     slots() { return Math.min(12, Math.max(this.node.most, this.node.recent)); },
     windowText() { return `${this.node.recent} restarts in the window, ${this.node.most} allowed`; },
     label() {
       const restarts = this.node.restarts ? `, restarted ${this.node.restarts} times` : "";
       const window = this.node.type === "supervisor" ? `, ${this.windowText}` : "";
-      return `${this.node.path}, ${this.node.state}${restarts}${window}`;
+      return `${this.node.path}, ${this.unknown || this.node.state}${restarts}${window}`;
     },
   },
 };
 
 export default {
   components: { "rr-branch": Branch },
-  props: { rows: Array, chosen: String },
+  props: { rows: Array, chosen: String, unknown: String },
   template: `
     <ul role="tree" class="rr-tree" aria-label="supervisor tree" @keydown="move">
-      <rr-branch v-for="root in roots" :key="root.path" :node="root" :chosen="chosen" :focus="focus" @pick="pick"></rr-branch>
+      <rr-branch v-for="root in roots" :key="root.path" :node="root" :chosen="chosen" :focus="focus" :unknown="unknown"
+        @pick="pick"></rr-branch>
     </ul>`,
   data() { return { at: "" }; },
   computed: {

@@ -2,38 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable
 from typing import Any
 
 from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from rr_actors.system.console.console_messages import ChildRow
+from rr_actors.tools.web.watch import Moment
 
 CSS = """
+:root { color-scheme: light dark;
+  --rr-edge: light-dark(#b0bec5, #47545c); --rr-outline: light-dark(#78909c, #7f929c);
+  --rr-paper: light-dark(#fff, #1d2327); --rr-text: light-dark(#1c2529, #e4eaed);
+  --rr-focus: light-dark(#1565c0, #7db9f5); --rr-fact: light-dark(#455a64, #a9b8c0);
+  --rr-count: light-dark(#b23c00, #ff9a6b); --rr-good: light-dark(#2e7d32, #5fc46a);
+  --rr-warm: light-dark(#ef8f00, #f2a93c); --rr-warm-paper: light-dark(#fff3d6, #4a3713);
+  --rr-still: light-dark(#757575, #98a2a8); --rr-still-paper: light-dark(#e6e6e6, #33393d);
+  --rr-bad: light-dark(#c62828, #ff8078); --rr-bad-paper: light-dark(#ffdede, #4d2020);
+  --rr-unknown-paper: light-dark(#eceff1, #2a3136); --rr-halo: light-dark(#90caf9, #2f6fa3);
+  --rr-dim: light-dark(#607d8b, #9fb0b9); --rr-amber: light-dark(#a15c00, #f2b53c); }
 .rr-tree, .rr-tree ul { list-style: none; margin: 0; padding: 0; }
 .rr-tree li { display: flex; align-items: flex-start; position: relative; padding: 2px 0; }
-.rr-tree ul { margin-left: 14px; padding-left: 18px; border-left: 2px solid #b0bec5; }
+.rr-tree ul { margin-left: 14px; padding-left: 18px; border-left: 2px solid var(--rr-edge); }
 .rr-tree ul > li::before { content: ""; position: absolute; left: -18px; top: 19px; width: 16px;
-  border-top: 2px solid #b0bec5; }
+  border-top: 2px solid var(--rr-edge); }
 .rr-tree ul::before { content: ""; position: absolute; margin-left: -33px; margin-top: 19px; width: 15px;
-  border-top: 2px solid #b0bec5; }
+  border-top: 2px solid var(--rr-edge); }
 .rr-node { display: grid; grid-template-columns: 1fr auto; gap: 0 8px; text-align: left; min-width: 132px;
-  padding: 3px 9px; border: 2px solid #78909c; border-radius: 7px; background: #fff; color: #1c2529; font-size: 13px;
+  padding: 3px 9px; border: 2px solid var(--rr-outline); border-radius: 7px; background: var(--rr-paper);
+  color: var(--rr-text); font-size: 13px;
   line-height: 1.3; cursor: pointer; transition: background 0.3s, border-color 0.3s; }
-.rr-node:focus-visible { outline: 3px solid #1565c0; outline-offset: 1px; }
+.rr-node:focus-visible { outline: 3px solid var(--rr-focus); outline-offset: 1px; }
 .rr-id { font-weight: 600; white-space: nowrap; }
-.rr-fact, .rr-window { grid-column: 1 / -1; font-size: 11px; color: #455a64; white-space: nowrap; }
-.rr-count { font-weight: 600; color: #b23c00; animation: rr-pop 0.6s; }
-.rr-running { border-color: #2e7d32; } .rr-running .rr-sign { color: #2e7d32; }
-.rr-starting, .rr-restarting { border-color: #ef8f00; background: #fff3d6; border-style: dashed; }
-.rr-stopped { border-color: #757575; background: #e6e6e6; }
-.rr-unavailable { border-color: #c62828; background: #ffdede; border-style: double; border-width: 4px; }
-.rr-chosen { box-shadow: 0 0 0 3px #90caf9; }
-.rr-window i { display: inline-block; width: 9px; height: 9px; margin-right: 2px; border: 1px solid #78909c;
+.rr-fact, .rr-window { grid-column: 1 / -1; font-size: 11px; color: var(--rr-fact); white-space: nowrap; }
+.rr-count { font-weight: 600; color: var(--rr-count); animation: rr-pop 0.6s; }
+.rr-running { border-color: var(--rr-good); } .rr-running .rr-sign { color: var(--rr-good); }
+.rr-starting, .rr-restarting { border-color: var(--rr-warm); background: var(--rr-warm-paper); border-style: dashed; }
+.rr-stopped { border-color: var(--rr-still); background: var(--rr-still-paper); }
+.rr-unavailable { border-color: var(--rr-bad); background: var(--rr-bad-paper); border-style: double;
+  border-width: 4px; }
+.rr-unknown { border-color: var(--rr-still); background: var(--rr-unknown-paper); border-style: dotted; }
+.rr-unknown .rr-sign { color: var(--rr-fact); }
+.rr-chosen { box-shadow: 0 0 0 3px var(--rr-halo); }
+.rr-window i { display: inline-block; width: 9px; height: 9px; margin-right: 2px; border: 1px solid var(--rr-outline);
   border-radius: 2px; }
-.rr-window i.full { background: #ef8f00; } .rr-window i.over { background: #c62828; }
+.rr-window i.full { background: var(--rr-warm); } .rr-window i.over { background: var(--rr-bad); }
 .rr-window em { font-style: normal; }
+@container (max-width: 480px) {
+  .rr-tree li { flex-direction: column; }
+  .rr-tree ul { margin-top: 4px; } .rr-tree ul::before { display: none; }
+}
 @keyframes rr-pop { from { transform: scale(1.8); } to { transform: scale(1); } }
 """
 
@@ -49,20 +69,26 @@ class TreePicture(ui.element, component="tree_picture.js"):
         super().__init__()
         self._props["rows"] = []
         self._props["chosen"] = ""
+        self._props["unknown"] = ""
 
         def picked(event: GenericEventArguments) -> Any:
             return on_pick(str(event.args))
 
         self.on("pick", picked)
 
-    def show(self, children: Iterable[ChildRow], chosen: str = "") -> None:
-        """Show these children, each supervisor before its own ones, and mark one as chosen."""
-        rows = [_node(row) for row in children]
+    def show(self, moment: Moment, chosen: str = "") -> None:
+        """Show a moment's children, each supervisor before its own ones, and mark one as chosen.
+
+        While the system does not answer, nobody knows the children's states: the picture says so.
+        """
+        rows = [_node(row) for row in moment.children]
+        since = time.strftime("%H:%M:%S", time.localtime(moment.at))
+        self._props["unknown"] = f"unknown since {since}" if moment.problem else ""
         if rows != self._props["rows"] or chosen != self._props["chosen"]:
             self._props["rows"], self._props["chosen"] = rows, chosen
 
 
 def _node(row: ChildRow) -> dict[str, Any]:
-    node: dict[str, Any] = {"path": row.path, "id": row.path.rpartition("/")[2], "type": row.type, "state": row.state}
+    node: dict[str, Any] = {"path": row.path, "id": row.id, "type": row.type, "state": row.state}
     node |= {"pid": row.pid, "restarts": row.restarts, "error": row.error, "strategy": row.strategy}
     return node | {"most": row.max_restarts, "recent": row.recent_restarts}

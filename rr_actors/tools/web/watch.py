@@ -6,6 +6,7 @@ when `version` has changed, they show the newest moment.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import threading
@@ -18,14 +19,19 @@ from typing import TypeVar
 import msgspec
 
 from rr_actors.base.errors import RrError
-from rr_actors.registrar.pages import ResourceRow
+from rr_actors.registrar.pages import ResourceRow, ServerRow
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console import console_questions as questions
+from rr_actors.system.console.console_client import read_pages
+from rr_actors.system.console.console_view import Verb
+from rr_actors.system.recording.recordings import entry_of
+from rr_actors.system.recording.timeline_lanes import Lanes
+from rr_actors.system.recording.timelines import Timeline
 from rr_actors.tools.terminal.console_link import ConsoleLink
+from rr_actors.tools.terminal.event_lines import EventLines, event_of
 
 GROUPED_FROM = 300
-"""From so many resources on, a picture shows registrars in place of resources."""
-_SAMPLE = 20
-_SAMPLED = 50
+"""From so many resources on, a picture shows servers in place of resources."""
 CHILDREN = 1000
 """The most children that a picture shows."""
 KEPT_S = 600.0
@@ -41,6 +47,7 @@ _LONGEST_S = 5.0
 _AGAIN_S = 0.5
 _LOOK_S = 10.0
 
+_A = TypeVar("_A")
 _Row = TypeVar("_Row", c.ChildRow, c.RegistrarRow, ResourceRow)
 
 
@@ -50,7 +57,8 @@ class Moment:
 
     Attributes:
         at: seconds since the epoch.
-        resources: all resources, if there are few; else the first of each registrar.
+        resources: all resources, if there are few.
+        servers: else the servers, with their resources counted.
         total: the number of all resources.
         problem: why no system runs, or why it does not answer; "" if it answers.
     """
@@ -61,6 +69,7 @@ class Moment:
     resources: tuple[ResourceRow, ...] = ()
     total: int = 0
     problem: str = ""
+    servers: tuple[ServerRow, ...] = ()
 
     def says_the_same(self, other: Moment) -> bool:
         """Return whether another moment differs only in its time."""
@@ -74,7 +83,7 @@ class Watch:
     Attributes:
         link: the link for questions and commands of a page.
         moments: the moments of the last minutes, oldest first, never empty; one for each change.
-        events: the newest events.
+        events, lines: the newest events, and their lines for people.
         heard: the number of all events.
         version: grows with each change that a page could show.
     """
@@ -86,12 +95,16 @@ class Watch:
     missed: int = 0
     version: int = 0
     welcome: c.Welcome | None = None
+    lines: EventLines = field(default_factory=EventLines)
 
     def __post_init__(self) -> None:
         self.link = ConsoleLink(self.state_dir)
         self._tree_news, self._news = threading.Event(), threading.Event()
         self._closed = threading.Event()
         self._versions = itertools.count(1)
+        self._lanes, self._lanes_lock = Lanes(), threading.Lock()
+        self._latest = 0.0  # the time of the newest record in the lanes
+        self._timeline: tuple[int, Timeline] | None = None  # and the version that it shows
         self._threads = [
             threading.Thread(target=target, name=f"rr-watch-{target.__name__.strip('_')}", daemon=True)
             for target in (self._follow, self._keep_looking)
@@ -110,6 +123,17 @@ class Watch:
                 break
             found = moment
         return found
+
+    def timeline(self) -> Timeline:
+        """Return the timeline of all that is known: the records of the state directory, and the events since then."""
+        version, now = self.version, self.now
+        if (made := self._timeline) is None or made[0] != version:
+            with self._lanes_lock:
+                lanes, began = self._lanes.lanes(), self._lanes.began
+            until = now.at if now.problem and now.at else time.time()
+            title = self.welcome.system if self.welcome is not None else ""
+            made = self._timeline = version, Timeline(lanes, began or until, until, title)
+        return made[1]
 
     def start(self) -> None:
         """Start both threads."""
@@ -140,6 +164,9 @@ class Watch:
 
     def _reached(self, welcome: c.Welcome) -> None:
         self.welcome = welcome
+        with contextlib.suppress(RrError):  # the system ends
+            records = self._ask(questions.ListHistory(limit=c.PAGE_LIMIT)).records
+            self._note(*(event_of(record) for record in records if record.at > self._latest))
         self._tree_news.set()
 
     def _hear(self, part: c.Events | c.Missed) -> None:
@@ -149,11 +176,21 @@ class Watch:
             self._tree_news.set()
         else:
             self.events.extend(part.events)
+            for event in part.events:
+                self.lines.take(event)
+            self._note(*part.events)
             self.heard += len(part.events)
             self._news.set()
             if any("path" in event.facts for event in part.events):  # an event of the tree
                 self._tree_news.set()
         self.version = next(self._versions)
+
+    def _note(self, *events: c.Event) -> None:
+        with self._lanes_lock:
+            for event in events:
+                self._lanes.take(entry_of({**event.facts, "event": event.event, "at": event.at}))
+                if "path" in event.facts:
+                    self._latest = max(self._latest, event.at)
 
     # -- in the thread that asks -------------------------------------------------------------------------------------
 
@@ -179,38 +216,36 @@ class Watch:
         try:
             moment = self._asked()
         except RrError as error:
-            moment = replace(self.now, at=time.time(), problem=str(error))
+            since = self.now.at if self.now.problem and self.now.at else time.time()
+            moment = replace(self.now, at=since, problem=str(error))
         self._add(moment)
 
     def _asked(self) -> Moment:
         before = self.now
-        page = self.link.ask(c.ListChildren(), c.Children, _LOOK_S)
-        rows = list(page.rows)
-        while len(rows) < min(page.total, CHILDREN) and page.rows:
-            page = self.link.ask(c.ListChildren("", len(rows)), c.Children, _LOOK_S)
-            rows += page.rows
-        registrars = self.link.ask(c.ListRegistrars(), c.Registrars, _LOOK_S).rows
-        found = self.link.ask(c.ListResources(limit=GROUPED_FROM), c.Resources, _LOOK_S)
-        resources = self._samples(registrars) if found.total > GROUPED_FROM else list(found.rows)
-        while len(resources) < found.total <= GROUPED_FROM and found.rows:  # an answer has no room for many long texts
-            found = self.link.ask(c.ListResources(offset=len(resources), limit=GROUPED_FROM), c.Resources, _LOOK_S)
-            resources += found.rows
+        pages_of_tree = read_pages(self._ask, questions.ListChildren(), CHILDREN)
+        children = [row for page in pages_of_tree for row in page.rows]
+        with self._lanes_lock:
+            for row in children if self._latest else ():  # after the records of what was before
+                self._lanes.sees(row.path, row.pid or 0, time.time())
+        registrars = self._ask(questions.ListRegistrars()).rows
+        pages = read_pages(self._ask, questions.ListResources(), GROUPED_FROM)
+        found = next(pages)
+        resources, servers = list[ResourceRow](), list[ServerRow]()
+        if found.total > GROUPED_FROM:
+            servers = self._ask(questions.ListServers()).rows
+        else:  # an answer has no room for many long texts: then there are more pages
+            resources = [*found.rows, *(row for page in pages for row in page.rows)]
         return Moment(
             time.time(),
-            _shared([msgspec.structs.replace(row, up_s=None) for row in rows[:CHILDREN]], before.children),
+            _shared([msgspec.structs.replace(row, up_s=None) for row in children[:CHILDREN]], before.children),
             _shared(registrars, before.registrars),
             _shared(resources, before.resources),
             found.total,
+            servers=before.servers if servers == list(before.servers) else tuple(servers),
         )
 
-    def _samples(self, registrars: list[c.RegistrarRow]) -> list[ResourceRow]:
-        """Return a few resources of each registrar, which show how the registrars depend on each other."""
-        rows: list[ResourceRow] = []
-        for registrar in registrars[:_SAMPLED]:
-            if registrar.status == "up":
-                request = c.ListResources(registrar=registrar.name, limit=_SAMPLE)
-                rows += self.link.ask(request, c.Resources, _LOOK_S).rows
-        return rows
+    def _ask(self, request: Verb[_A]) -> _A:
+        return self.link.ask(request, _LOOK_S)
 
     def _add(self, moment: Moment) -> None:
         if moment.says_the_same(self.now):

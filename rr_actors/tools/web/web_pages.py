@@ -10,21 +10,28 @@ reader chooses something, a thread asks the system for it.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from nicegui import background_tasks, ui
 
 from rr_actors.base.errors import RrError
+from rr_actors.registrar.pages import ResourceRow
+from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
-from rr_actors.tools.explanations import ago, event_line
+from rr_actors.system.console.console_view import Command
+from rr_actors.system.recording.event_texts import ago
+from rr_actors.tools.terminal.event_lines import EventFilter
 from rr_actors.tools.terminal.terminal_rows import Neighbours, Past, Row, Rows, Window, refused
 from rr_actors.tools.web import graph_picture, tree_picture
 from rr_actors.tools.web.resource_table import ResourceTable
 from rr_actors.tools.web.tree_picture import TreePicture
-from rr_actors.tools.web.watch import CHILDREN, GROUPED_FROM, Moment, Watch
+from rr_actors.tools.web.watch import CHILDREN, Moment, Watch
 
 _LOOK_S = 0.2
 _LINES = 14  # events
@@ -33,6 +40,8 @@ _WIDTH = 110
 _STEP_S = 0.5
 """How long a status takes in the picture from one resource to the next. In the system it is too fast to see."""
 _STEPS = 30  # statuses
+_NONE: dict[str, int] = {}
+_PAGES = (("Tree", "/"), ("Timeline", "/timeline"), ("Resources", "/resources"), ("Sequence", "/sequence"))
 
 CSS = (
     tree_picture.CSS
@@ -42,18 +51,31 @@ CSS = (
 .rr-bar { width: 100%; background: #263238; color: #fff; padding: 6px 14px; align-items: center; gap: 18px; }
 .rr-bar a { color: #cfd8dc; } .rr-bar a.rr-here { color: #fff; font-weight: 700; text-decoration: underline; }
 .rr-status { margin-left: auto; font-size: 13px; } .rr-status.rr-bad { color: #ffccbc; font-weight: 700; }
-.rr-panel { border: 1px solid #b0bec5; border-radius: 8px; padding: 8px 12px; overflow: auto; }
+.rr-panel { border: 1px solid var(--rr-edge); border-radius: 8px; padding: 8px 12px; overflow: auto; min-width: 0; }
+.rr-split { display: flex; width: 100%; gap: 16px; align-items: stretch; } .rr-split > .rr-panel { max-height: 62vh; }
+.rr-holds-tree { container-type: inline-size; }
+@media (max-width: 900px) { .rr-split { flex-direction: column; } .rr-split > .rr-panel { flex: none !important; } }
+@media (prefers-color-scheme: dark) { .rr-graph canvas, .rr-sequence svg { filter: invert(1) hue-rotate(180deg); } }
 .rr-rows, .rr-events { font: 12px/1.45 monospace; white-space: pre-wrap; overflow-wrap: anywhere; width: 100%; }
-.rr-line { display: flex; gap: 10px; align-items: baseline; } .rr-line.rr-red { color: #c62828; }
-.rr-line.rr-bold { font-weight: 700; } .rr-line.rr-dim { color: #607d8b; } .rr-line.rr-yellow { color: #a15c00; }
+.rr-line { display: flex; gap: 10px; align-items: baseline; } .rr-line.rr-red { color: var(--rr-bad); }
+.rr-line.rr-bold { font-weight: 700; } .rr-line.rr-dim { color: var(--rr-dim); }
+.rr-line.rr-yellow { color: var(--rr-amber); }
 .rr-rows .q-btn { flex: none; white-space: nowrap; overflow-wrap: normal; }
-.rr-note { color: #607d8b; }
+.rr-note { color: var(--rr-dim); }
+.rr-banner { width: 100%; padding: 6px 14px; background: var(--rr-warm-paper); color: var(--rr-text);
+  font-weight: 600; }
+.rr-banner.rr-bad { background: var(--rr-bad-paper); }
 """
 )
 
 
 class Page(ABC):
-    """The parts of all pages: a bar, a status line, events, and a slider over the last minutes."""
+    """The parts of all pages: a bar, a status line, events, and a slider over the last minutes.
+
+    A page that shows the past by itself sets goes_back to False: it has no slider.
+    """
+
+    goes_back = True
 
     def __init__(self, watch: Watch, here: str) -> None:
         self.watch = watch
@@ -64,12 +86,14 @@ class Page(ABC):
         ui.add_css(CSS)
         with ui.row().classes("rr-bar"):
             ui.label("rr-actors").classes("text-bold")
-            for name, target in (("Tree", "/"), ("Resources", "/resources"), ("Sequence", "/sequence")):
+            for name, target in _PAGES:
                 ui.link(name, target).classes("rr-here" if target == here else "")
             self._status = ui.label("").classes("rr-status").props('role="status" aria-live="polite"')
+        self._banner = ui.label("").classes("rr-banner").props('role="alert"')
         with ui.column().classes("rr-page"):
             self.build()
-            with ui.row().classes("w-full items-center no-wrap"):
+            with ui.row().classes("w-full items-center no-wrap") as back:
+                back.set_visibility(self.goes_back)
                 ui.button("now", on_click=lambda: self._slider.set_value(0)).props("dense no-caps outline")
                 self._slider = ui.slider(
                     min=-1, max=0, value=0, step=0.2, on_change=lambda event: self._slid(event.value)
@@ -77,6 +101,8 @@ class Page(ABC):
                 self._slider.props('aria-label="seconds back"').classes("grow")
                 self._clock = ui.label().classes("rr-clock").style("min-width: 13em")
             with ui.element("div").classes("rr-panel w-full"):
+                self._wanted = ui.input("events: a text, event:KIND, child:ID, server:NAME", on_change=self._show_lines)
+                self._wanted.props("dense outlined clearable debounce=200").classes("w-full")
                 self._events = ui.label().classes("rr-events").props('role="log" aria-label="events"')
         ui.timer(_LOOK_S, self._look)
 
@@ -92,15 +118,28 @@ class Page(ABC):
         """Return a value that changes when the page must be drawn again for the same moment."""
         return None
 
-    async def carry_out(self, what: str, command: c.Command) -> None:
+    async def carry_out(self, what: str, command: Command[c.Done]) -> None:
         """Send a command to the system, and show the reader what was done, or the error."""
-        try:
-            done = await asyncio.to_thread(self.watch.link.ask, command, c.Done)
-        except RrError as error:
-            ui.notify(f"{what}: {error}", type="negative", multi_line=True)
-        else:
-            ui.notify(done.text, type="positive")
+        with ui.context.client:  # not in the button's place: the page may draw it anew before the answer is here
+            try:
+                done = await asyncio.to_thread(self.watch.link.ask, command)
+            except RrError as error:
+                ui.notify(f"{what}: {error}", type="negative", multi_line=True, position="top")
+            else:
+                ui.notify(done.text, type="positive", position="top")
         self.watch.look_soon()
+
+    async def ask_first(self, question: str, carry_out: Callable[[], Awaitable[None]]) -> None:
+        """Carry out a command if the reader agrees."""
+        with ui.context.client, ui.dialog() as dialog, ui.card():
+            ui.label(question)
+            with ui.row():
+                ui.button("cancel", on_click=lambda: dialog.submit(False)).props("no-caps outline")
+                ui.button("kill", on_click=lambda: dialog.submit(True)).props("no-caps color=negative")
+        agreed = await dialog
+        dialog.delete()
+        if agreed:
+            await carry_out()
 
     def _slid(self, back: float | None) -> None:
         back = back or 0.0
@@ -114,21 +153,39 @@ class Page(ABC):
         watch, moment = self.watch, self.watch.now if self.at is None else self.watch.moment_at(self.at)
         if self.at is None:
             begins = watch.moments[0].at
-            self._slider.props(f"min={min(-1, round(begins - time.time())) if begins else -1}")
+            self._slider.props["min"] = min(-1, round(begins - time.time())) if begins else -1
             self._clock.text = "now"
         else:
-            self._clock.text = f"{time.strftime('%H:%M:%S', time.localtime(self.at))}, {ago(time.time() - self.at)} ago"
+            self._clock.text = f"{_clock(self.at)}, {ago(time.time() - self.at)} ago"
         if watch.heard != self._heard:
             self._heard = watch.heard
-            newest = list(watch.events.copy())[-_LINES:]
-            self._events.text = "\n".join(event_line(event) for event in newest)
-            self._events.props(f"data-seq={newest[-1].seq if newest else 0}")
+            self._events.props(f"data-seq={watch.events[-1].seq if watch.events else 0}")
+            self._show_lines()
+        self._warn()
         problem = watch.now.problem
         self._status.text = f"{problem}: waiting for it" if problem else _named(watch)
         self._status.classes(toggle="rr-bad") if bool(problem) != ("rr-bad" in self._status.classes) else None
         if (state := (id(moment), self.step())) != self._drawn:
             self._drawn = state
             self.draw(moment)
+
+    def _show_lines(self) -> None:
+        lines = self.watch.lines.lines(EventFilter.parse(self._wanted.value or ""))[-_LINES:]
+        self._events.text = "\n".join(map(str, lines))
+
+    def _warn(self) -> None:
+        """Say above the page that it does not show the running system of now."""
+        now, at = self.watch.now, self.at
+        text = f"No answer since {_clock(now.at)}: {now.problem}." if now.problem and now.at else ""
+        if at is not None:
+            text = f"This is the picture of {_clock(at)}. Details and events are of now, and buttons are off."
+        self._banner.text = text
+        self._banner.set_visibility(bool(text))
+        self._banner.classes(add="rr-bad" if at is None else "", remove="rr-bad" if at is not None else "")
+
+
+def _clock(at: float) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(at))
 
 
 def _named(watch: Watch) -> str:
@@ -142,18 +199,19 @@ class _Panel:
 
     Args:
         page: the page, which carries out the buttons' commands.
+        hint: what the panel says until something is chosen.
     """
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, page: Page, hint: str) -> None:
         self._page = page
         self._rows: Rows | None = None
         self._shown: list[Row] = []
         self._is_asking = self._is_wanted = False
-        self._title = ui.label("").classes("text-bold")
+        self._title = ui.label(hint).classes("text-bold")
         self._buttons = ui.row().classes("gap-2")
         self._lines = ui.column().classes("rr-rows gap-0")
 
-    async def show(self, rows: Rows, buttons: dict[str, c.Command]) -> None:
+    async def show(self, rows: Rows, buttons: dict[str, Command[c.Done]]) -> None:
         """Show these rows, and a button for each command."""
         self._rows = rows
         self._title.text = rows.title
@@ -192,11 +250,16 @@ class _Panel:
             if row.note:
                 ui.label(row.note).classes("rr-note")
             if row.query:
-                self._button("unload", c.Unload(row.query))
+                self._button("unload", commands.Unload(row.query))
 
-    def _button(self, name: str, command: c.Command) -> None:
+    def _button(self, name: str, command: Command[c.Done]) -> None:
         carry_out = partial(self._page.carry_out, name, command)
-        ui.button(name, on_click=carry_out).props("dense no-caps outline")
+        if isinstance(command, commands.Kill):
+            carry_out = partial(
+                self._page.ask_first, f"Kill {command.child}? It cannot finish what it does.", carry_out
+            )
+        button = ui.button(name, on_click=carry_out).props("dense no-caps outline")
+        button.bind_enabled_from(self._page, "at", backward=lambda at: at is None)
 
 
 class TreePage(Page):
@@ -208,29 +271,29 @@ class TreePage(Page):
 
     def build(self) -> None:
         """Put the tree and the panel on the page."""
-        with ui.row().classes("w-full no-wrap items-start"):
-            with ui.element("div").classes("rr-panel").style("flex: 3; max-height: 62vh"):
+        with ui.element("div").classes("rr-split"):
+            with ui.element("div").classes("rr-panel rr-holds-tree").style("flex: 3"):
                 self._tree = TreePicture(self._choose)
                 self._more = ui.label()
-            with ui.element("div").classes("rr-panel").style("flex: 2; max-height: 62vh"):
-                self._panel = _Panel(self)
+            with ui.element("div").classes("rr-panel").style("flex: 2"):
+                self._panel = _Panel(self, "Choose a child to see its history.")
 
     def draw(self, moment: Moment) -> None:
         """Show the tree, and ask for the rows of the chosen child."""
-        self._tree.show(moment.children, self._chosen)
+        self._tree.show(moment, self._chosen)
         self._more.text = f"the first {CHILDREN} children" if len(moment.children) >= CHILDREN else ""
         if self._chosen:
             background_tasks.create(self._panel.ask())
 
     async def _choose(self, path: str) -> None:
         self._chosen = path
-        self._tree.show(self.watch.now.children, path)
-        commands: dict[str, c.Command] = {
-            "kill -9": c.Kill(path),
-            "stop": c.Terminate(path),
-            "restart": c.Restart(path),
-        }
-        await self._panel.show(Past(path), commands)
+        self._tree.show(self.watch.now, path)
+        buttons: dict[str, Command[c.Done]] = {}
+        if "/" in path:  # the root itself can only be looked at
+            buttons["kill -9"] = commands.Kill(path)
+            buttons["stop"] = commands.Terminate(path)
+            buttons["restart"] = commands.Restart(path)
+        await self._panel.show(Past(path), buttons)
 
 
 class ResourcesPage(Page):
@@ -238,33 +301,44 @@ class ResourcesPage(Page):
 
     def __init__(self, watch: Watch) -> None:
         self._chosen = ""
-        self._opened = time.time()
+        self._began = time.time()
+        self._opened: dict[str, list[ResourceRow]] = {}  # servers, with their resources that are drawn
+        self._focus: list[ResourceRow] = []  # the chosen resource and its neighbours, where all are too many to draw
         super().__init__(watch, "/resources")
 
     def build(self) -> None:
         """Put the tree, the graph, the panel and the table on the page."""
-        with ui.row().classes("w-full no-wrap items-stretch"):
-            with ui.element("div").classes("rr-panel").style("flex: 2; max-height: 52vh"):
+        with ui.element("div").classes("rr-split"):
+            with ui.element("div").classes("rr-panel rr-holds-tree").style("flex: 2"):
                 self._tree = TreePicture(lambda path: ui.navigate.to("/"))
             with ui.element("div").classes("rr-panel").style("flex: 4"):
-                self._said = ui.label().classes("rr-note")
+                with ui.row().classes("items-center gap-2"):
+                    self._said = ui.label().classes("rr-note")
+                    self._back = ui.button("all", on_click=self._show_all).props("dense no-caps outline")
                 self._graph = ui.echart(graph_picture.chart(Moment(0)), on_point_click=self._clicked)
-                self._graph.style("height: 48vh")
-            with ui.element("div").classes("rr-panel").style("flex: 2; max-height: 52vh"):
-                self._panel = _Panel(self)
+                self._graph.classes("rr-graph").style("height: 48vh")
+            with ui.element("div").classes("rr-panel").style("flex: 2"):
+                self._panel = _Panel(self, "Choose a resource to see its holders and parts.")
         self._table = ResourceTable(self._choose)
 
     def draw(self, moment: Moment) -> None:
         """Show the tree and the graph, and make the table and the panel ask for their rows again."""
-        self._tree.show(moment.children)
-        options = graph_picture.chart(moment, self._chosen, self.step())
+        self._tree.show(moment)
+        grouped = bool(moment.servers)
+        if grouped and self._focus and self.at is None:
+            moment = replace(moment, resources=tuple(self._focus), servers=())
+        chosen = self._chosen if any(row.id == self._chosen for row in moment.resources) else ""
+        options = graph_picture.chart(moment, chosen, self.step(), self._opened)
         self._graph.options.clear()
         self._graph.options.update(options)
-        grouped = moment.total > GROUPED_FROM
-        self._said.text = f"{moment.total} resources" + (": too many to draw, these are their registrars" * grouped)
+        how = ": the chosen one, with all above and below it" if self._focus else ": a click opens a server"
+        self._said.text = f"{moment.total:,} resources{how * grouped}"
+        self._back.set_visibility(grouped and bool(self._focus or self._opened))
         if self.at is None:
             self._table.refresh()
             background_tasks.create(self._panel.ask())
+            if grouped:
+                background_tasks.create(self._renew())
 
     def step(self) -> set[str]:
         """Return the nodes that the newest statuses have just reached on their way up, slowed down for the picture.
@@ -273,7 +347,7 @@ class ResourcesPage(Page):
         """
         if self.at is not None:
             return set()
-        statuses = [event for event in self.watch.events.copy() if event.event == "status" and event.at > self._opened]
+        statuses = [event for event in self.watch.events.copy() if event.event == "status" and event.at > self._began]
         told = [(str(event.facts.get("resource_id")), event.at) for event in statuses[-_STEPS:]]
         begins = graph_picture.travels(told, self.watch.now, _STEP_S)
         now = time.time()
@@ -281,9 +355,41 @@ class ResourcesPage(Page):
 
     def _clicked(self, event: Any) -> Any:
         name = str(event.name)
+        if name.startswith(graph_picture.SERVER):
+            return self._open(name.removeprefix(graph_picture.SERVER))
         return None if name.startswith("@") else self._choose(name)
+
+    async def _open(self, server: str) -> None:
+        """Draw the first resources of a server."""
+        self._opened[server] = []
+        await self._renew()
+
+    def _show_all(self) -> None:
+        self._opened.clear()
+        self._focus, self._chosen, self._drawn = [], "", None
+
+    async def _renew(self) -> None:
+        """Ask again for the rows of opened servers, and of the resource that is shown with its neighbours."""
+        chosen, servers = self._chosen, list(self._opened)
+        states = {one.server: one.states for one in self.watch.now.servers}
+        ask = self.watch.link.ask
+        with contextlib.suppress(RrError):  # the next moment says why there is no answer
+            focus = await asyncio.to_thread(graph_picture.neighbours_of, ask, chosen) if chosen else []
+            asked = [
+                await asyncio.to_thread(graph_picture.rows_of_server, ask, one, states.get(one, _NONE))
+                for one in servers
+            ]
+            opened = dict(zip(servers, asked, strict=True))
+            if (chosen, servers) == (self._chosen, list(self._opened)) and (focus, opened) != (
+                self._focus,
+                self._opened,
+            ):
+                self._focus, self._opened, self._drawn = focus, opened, None
 
     async def _choose(self, id: str) -> None:
         self._chosen = id
         self._drawn = None
-        await self._panel.show(Neighbours(id), {"unload from all": c.Unload(id, force=True)})
+        if self.watch.now.servers:
+            await self._renew()
+        name = next((row.name for row in (*self.watch.now.resources, *self._focus) if row.id == id), "")
+        await self._panel.show(Neighbours(id, name), {"unload from all": commands.Unload(id, force=True)})

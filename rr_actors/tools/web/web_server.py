@@ -20,11 +20,12 @@ from nicegui import app, ui
 
 from rr_actors.base.errors import RrError, UsageError
 from rr_actors.runtime.processes import lifeline
-from rr_actors.system.console import console_messages as c
+from rr_actors.system.console import console_questions as questions
 from rr_actors.system.recording.figures import prometheus_text
 from rr_actors.tools.web.lab_pages import add_lab
 from rr_actors.tools.web.resource_table import add_rows
 from rr_actors.tools.web.sequence_page import SequencePage
+from rr_actors.tools.web.timeline_page import TimelinePage
 from rr_actors.tools.web.watch import Watch
 from rr_actors.tools.web.web_access import Access, Keys
 from rr_actors.tools.web.web_pages import ResourcesPage, TreePage
@@ -65,6 +66,7 @@ def serve(
     else:
         watch = Watch(state_dir)
         ui.page("/", title="rr-actors: tree")(partial(TreePage, watch))
+        ui.page("/timeline", title="rr-actors: timeline")(partial(TimelinePage, watch))
         ui.page("/resources", title="rr-actors: resources")(partial(ResourcesPage, watch))
         ui.page("/sequence", title="rr-actors: sequence")(partial(SequencePage, watch))
         add_rows(watch)
@@ -74,7 +76,7 @@ def serve(
     shown = f"[{host}]" if ":" in host else host
     app.on_startup(lambda: say(f"http://{shown}:{port}/{'lab' if lab else ''}?token={keys.token}"))
     served = FastAPI(openapi_url=None)
-    ui.run_with(served, title="rr-actors", favicon="🎭", show_welcome_message=False)
+    ui.run_with(served, title="rr-actors", favicon="🎭", dark=None, show_welcome_message=False)
     config = uvicorn.Config(
         Access(served, keys, host, port), log_level="warning", timeout_graceful_shutdown=_CLOSE_S, server_header=False
     )
@@ -89,7 +91,7 @@ def _add_metrics(watch: Watch) -> None:
     @app.get("/metrics", response_class=PlainTextResponse)
     def _() -> PlainTextResponse:
         try:
-            figures = watch.link.ask(c.ListFigures(), c.Figures, _LOOK_S).figures
+            figures = watch.link.ask(questions.ListFigures(), _LOOK_S).figures
         except RrError as error:
             return PlainTextResponse(f"{error}\n", 503)
         return PlainTextResponse(prometheus_text(figures), media_type="text/plain; version=0.0.4")

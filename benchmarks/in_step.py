@@ -1,0 +1,207 @@
+"""Whether cost grows in step with the work: what each of a hundred, a thousand, ten thousand of something costs.
+
+The exponent says how the whole cost grows from the second size to the third: 1 is in step, 2 is quadratic. With ten
+times as many, 1.1 is 1.26 times as much for each. What a start costs, however few there are, hides in the first size.
+"""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Literal
+
+import pykka
+
+import rr_actors as rr
+from benchmarks.table import Row
+from benchmarks.workload import Empty
+
+Seconds = dict[str, float]
+"""What each step took, by its name."""
+
+_AIM = 1.1
+_LIMIT_S = 600.0
+
+
+def in_step(scale: int, times: int) -> list[Row]:
+    """Measure everything at three sizes: 10, 100 and 1,000 times `scale`, or less of what is dear.
+
+    Args:
+        times: how often each size is measured; the least counts.
+    """
+    few, some, many = (10 * scale, 100 * scale, 1_000 * scale)
+    dear = (scale, 3 * scale, 10 * scale)
+    return [
+        *_rows("children in threads", (few, some, many), times, lambda count: _children(count, "thread")),
+        *_rows("children in processes", dear, times, lambda count: _children(count, "process")),
+        *_rows("managers in threads", dear, times, _managers),
+        *_rows("actors", (few, some, many), times, _actors),
+        *_rows("registrars", dear, times, _registrars),
+        *_rows("registrars in a chain", dear, times, _chain),
+        *_rows("parts of a resource", (few, some, many), times, _parts),
+        *_rows("clients", dear, times, _clients),
+        *_rows("resources", (few, some, many), times, _inspected),
+    ]
+
+
+def _rows(what: str, sizes: Sequence[int], times: int, measure: Callable[[int], Seconds]) -> list[Row]:
+    least: dict[str, list[float]] = {}
+    for size in sizes:
+        taken = [measure(size) for _ in range(times)]
+        for step in taken[0]:
+            least.setdefault(step, []).append(min(seconds[step] for seconds in taken))
+    rows: list[Row] = []
+    for step, seconds in least.items():
+        rows += [
+            Row(f"{step}, for each of {size:,} {what}", 1e3 * whole / size, "ms")
+            for size, whole in zip(sizes, seconds, strict=True)
+        ]
+        exponent = math.log(seconds[2] / seconds[1]) / math.log(sizes[2] / sizes[1])
+        rows.append(Row(f"growth of {step}, {sizes[1]:,} to {sizes[2]:,} {what}", exponent, "exponent", at_most=_AIM))
+    return rows
+
+
+class _Clock:
+    """Takes the time of one step after another."""
+
+    def __init__(self) -> None:
+        self.taken: Seconds = {}
+        self._last = time.perf_counter()
+
+    def step(self, name: str) -> None:
+        now = time.perf_counter()
+        self.taken[name], self._last = now - self._last, now
+
+
+@contextmanager
+def _system(*children: rr.ChildSpec) -> Iterator[tuple[rr.System, _Clock]]:
+    with tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir:
+        root = rr.Supervisor(children, max_restarts=1_000_000)
+        clock = _Clock()
+        system = rr.System(root, state_dir=state_dir, config=rr.SystemConfig(clients_limit=1_000))
+        with system:
+            yield system, clock
+
+
+def _children(count: int, placement: Literal["process", "thread"]) -> Seconds:
+    specs = [rr.ChildSpec(Empty, id=f"child{number}", placement=placement) for number in range(count)]
+    with _system(*specs) as (_, clock):
+        clock.step("start")
+    clock.step("stop")
+    return clock.taken
+
+
+class _Shop(rr.Manager):
+    @rr.server("thing")
+    def load_thing(self, request: object) -> object:
+        return request
+
+
+def _managers(count: int) -> Seconds:
+    specs = [rr.ChildSpec(_Shop, id=f"shop{number}", placement="thread") for number in range(count)]
+    with _system(*specs) as (system, clock):
+        clock.step("start")
+        system.snapshot()
+        clock.step("snapshot")
+    return clock.taken
+
+
+def _actors(count: int) -> Seconds:
+    clock = _Clock()
+    refs = [Empty.start() for _ in range(count)]
+    clock.step("start")
+    pykka.ActorRegistry.broadcast(None)
+    for ref in refs:
+        ref.ask(None)
+    clock.step("broadcast, and an ask")
+    pykka.ActorRegistry.stop_all()
+    clock.step("stop_all")
+    return clock.taken
+
+
+def _registrars(count: int) -> Seconds:
+    with _system() as (system, clock):
+        clock.step("")
+        registrars = [system.open_registrar(f"session{number}") for number in range(count)]
+        clock.step("opening")
+        for registrar in registrars:
+            registrar.close()
+        clock.step("closing")
+    del clock.taken[""]
+    return clock.taken
+
+
+def _chain(count: int) -> Seconds:
+    """Each registrar's callback loads from the next one."""
+    with _system() as (system, _):
+        registrars = [system.open_registrar(f"link{number}") for number in range(count)]
+
+        def serve(number: int) -> None:
+            def load(request: object) -> None:
+                if number + 1 < count:
+                    registrars[number].load(f"link{number + 1}/link", request)
+
+            registrars[number].register_server("link", load, _nothing)
+
+        for number in range(count):
+            serve(number)
+        clock = _Clock()
+        query = system.open_registrar("consumer").load("link0/link", 1, timeout_s=_LIMIT_S)
+        clock.step("load")
+        query.unload(timeout_s=_LIMIT_S)
+        clock.step("unload")
+    return clock.taken
+
+
+def _nothing(request: object, response: object) -> None:
+    pass
+
+
+def _parts(count: int) -> Seconds:
+    with _system() as (system, _):
+        makers = {name: system.open_registrar(name) for name in ("whole", "part")}
+
+        def load(request: object) -> None:
+            for number in range(count):
+                makers["whole"].load("part/part", number)
+
+        makers["whole"].register_server("whole", load, _nothing)
+        makers["part"].register_server("part", lambda request: request, _nothing)
+        clock = _Clock()
+        query = system.open_registrar("consumer").load("whole/whole", 1, timeout_s=_LIMIT_S)
+        clock.step("load")
+        query.unload(timeout_s=_LIMIT_S)
+        clock.step("unload")
+    return clock.taken
+
+
+def _clients(count: int) -> Seconds:
+    with _system() as (system, _), ExitStack() as stack:
+        provider = system.open_registrar("provider")
+        provider.register_server("thing", lambda request: request, _nothing)
+        clock = _Clock()
+        for number in range(count):
+            client = stack.enter_context(rr.connect(system.state_dir))
+            client.open_registrar(f"worker{number}").load("provider/thing", "one for all")
+        clock.step("connection and a load")
+    return clock.taken
+
+
+def _inspected(count: int) -> Seconds:
+    """What `rr-actors inspect` and `tree` take longer than a command that does nothing."""
+    with _system() as (system, _):
+        provider, consumer = system.open_registrar("provider"), system.open_registrar("consumer")
+        provider.register_server("thing", lambda request: request, _nothing)
+        consumer.load_all([("provider/thing", number) for number in range(count)])
+        clock = _Clock()
+        for command in ("version", "inspect", "tree"):
+            wanted = [command] if command == "version" else [command, "--state", str(system.state_dir)]
+            subprocess.run([sys.executable, "-m", "rr_actors", *wanted], check=True, stdout=subprocess.DEVNULL)
+            clock.step(command)
+    start = clock.taken.pop("version")
+    return {command: max(seconds - start, 0.001) for command, seconds in clock.taken.items()}

@@ -1,0 +1,70 @@
+"""A laboratory: a manager owns the serial lines of the instruments, and opens them again after its own crash.
+
+A pseudo-terminal and a thread stand in for an instrument at /dev/ttyUSB0.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import tempfile
+import threading
+import tty
+
+import rr_actors as rr
+
+
+class Instruments(rr.Manager):
+    def __init__(self) -> None:
+        self.lines: dict[str, int] = {}
+        self.lock = threading.Lock()  # a load and a message may come at once
+
+    @rr.server("instrument")
+    def open_line(self, device: str) -> str:
+        self.lines[device] = os.open(device, os.O_RDWR | os.O_NOCTTY)
+        return self.ask(device, "*IDN?")
+
+    @open_line.recover
+    def open_again(self, device: str, name: str) -> str:
+        return self.open_line(device)  # if it raises, the holders hear FATAL
+
+    @open_line.unload
+    def close_line(self, device: str, name: str) -> None:
+        os.close(self.lines.pop(device))
+
+    def on_receive(self, message: tuple[str, str]) -> str:
+        return self.ask(*message)
+
+    def ask(self, device: str, command: str) -> str:
+        with self.lock:
+            os.write(self.lines[device], f"{command}\n".encode())
+            return os.read(self.lines[device], 100).decode().strip()
+
+
+def instrument() -> str:
+    """Start an instrument; the name of its line."""
+    inside, outside = pty.openpty()
+    tty.setraw(outside)
+
+    def answer() -> None:
+        while command := os.read(inside, 100).strip():
+            os.write(inside, b"multimeter 7\n" if command == b"*IDN?" else b"1.25 V\n")
+
+    threading.Thread(target=answer, daemon=True).start()
+    return os.ttyname(outside)
+
+
+def main() -> None:
+    device, children = instrument(), [rr.ChildSpec(Instruments, id="instruments")]
+    with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
+        first, second = (system.open_registrar(name) for name in ("plotter", "logger"))
+        meter = first.load("instruments/instrument", device)
+        print(f"{meter.response}: {system.ref('instruments').ask((device, 'READ?'))}")
+        system.ref("instruments").kill()
+        shared = second.load("instruments/instrument", device)  # waits for the new manager, and shares the line
+        print(f"after kill -9: {system.ref('instruments').ask((device, 'READ?'))}, {meter.state}")
+        print(f"one line for both: {shared.resource_id == meter.resource_id}")
+
+
+if __name__ == "__main__":
+    main()

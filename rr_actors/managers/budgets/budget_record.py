@@ -1,0 +1,45 @@
+"""The record of a Budgets manager, on disk: the capacities that were set while it ran, and the reserves it holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from rr_actors.managers.kept_record import KeptRecord
+
+
+class _Record(msgspec.Struct):
+    capacities: dict[str, tuple[float, float]] = {}  # of the pool: the file's, and the one that was set in its place
+    reserves: dict[str, str] = {}  # "pool/number": the id of the query that holds it
+
+
+class BudgetRecord:
+    """What is known after a restart beside the catalog. A changed capacity of the file replaces what was set."""
+
+    def __init__(self, path: Path) -> None:
+        self._record = KeptRecord(path, _Record)  # after damage the configured capacities hold, reserves start again
+
+    def capacity(self, pool: str, configured: float) -> float:
+        """Return the capacity that was set, or else the configured one."""
+        before, now = self._record.now.capacities.get(pool, (configured, configured))
+        return now if before == configured else configured
+
+    def set_capacity(self, pool: str, configured: float, capacity: float) -> None:
+        """Keep a capacity that was set."""
+        self._record.now.capacities[pool] = (configured, capacity)
+        self._record.save()
+
+    def reserves(self) -> dict[str, str]:
+        """Return the query ids of the reserves that are held."""
+        return dict(self._record.now.reserves)
+
+    def keep_reserve(self, key: str, query_id: str) -> None:
+        """Keep that a query holds this reserve."""
+        self._record.now.reserves[key] = query_id
+        self._record.save()
+
+    def drop_reserve(self, key: str) -> None:
+        """Keep that this reserve is not held."""
+        if self._record.now.reserves.pop(key, None) is not None:
+            self._record.save()

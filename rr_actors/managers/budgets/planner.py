@@ -1,0 +1,195 @@
+"""The planner: decides who may have a share of a pool, and who has to give one back. Pure.
+
+It looks at everybody who asks at once, the highest priority first, then the oldest. Who fits is admitted. For who does
+not, the steps of the pool's policy make room, and the room that they make is his: nobody who comes later gets it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import msgspec
+
+from rr_actors.managers.budgets.victims import fewest_newest, first_that_do, total
+
+Step = Literal["reclaim", "supply", "preempt", "wait"]
+_IDLE = -math.inf
+_TOLERANCE = 1e-9  # of the capacity: 0.1 + 0.2 fits into 0.3
+
+
+class Running(msgspec.Struct, frozen=True):
+    """A share that is held. `since` orders shares by age; `priority` None is idle; `leaving`: it is revoked already."""
+
+    id: str
+    amount: float
+    priority: int | None = 0
+    since: float = 0.0
+    leaving: bool = False
+
+
+class Asked(msgspec.Struct, frozen=True):
+    """A share that is asked for; `patient`: it may still wait."""
+
+    id: str
+    amount: float
+    priority: int | None = 0
+    since: float = 0.0
+    patient: bool = True
+
+
+class Spare(msgspec.Struct, frozen=True):
+    """A reserve that could add to the capacity. What an `on` one adds is in the capacity already."""
+
+    id: str
+    amount: float
+    state: Literal["off", "starting", "on"] = "off"
+
+
+class Plan(msgspec.Struct):
+    """What to do, by ids.
+
+    Attributes:
+        admit: who asked and gets a share now.
+        start, stop: reserves.
+        revoke: shares to revoke.
+        wait: who asked and goes on waiting, for room that is being made, or for others to release theirs.
+        refuse: who asked and gets nothing.
+    """
+
+    admit: list[str] = []
+    start: list[str] = []
+    stop: list[str] = []
+    revoke: list[str] = []
+    wait: list[str] = []
+    refuse: list[str] = []
+
+
+def plan(
+    capacity: float,
+    policy: Sequence[Step],
+    running: Sequence[Running],
+    asked: Sequence[Asked] = (),
+    reserves: Sequence[Spare] = (),
+) -> Plan:
+    """Return what is to be done in one pool.
+
+    No victim has the priority of the one that gets its room, or a higher one, unless the capacity has become less than
+    what runs. Then the lowest are shed, whatever the policy is. `capacity` includes every supply that is on.
+    """
+    planning = _Planning(capacity, running, reserves)
+    planning.shed()
+    for one in sorted(asked, key=lambda one: (-_rank(one.priority), one.since)):
+        planning.place(one, policy)
+    planning.rest()
+    return planning.made
+
+
+def _rank(priority: int | None) -> float:
+    return _IDLE if priority is None else priority
+
+
+class _Planning:
+    """One run of the planner.
+
+    Attributes:
+        free: what is free now.
+        ahead: what will be free for those who have not been looked at, when all that is begun has ended.
+    """
+
+    def __init__(self, capacity: float, running: Sequence[Running], reserves: Sequence[Spare]) -> None:
+        self.made = Plan()
+        self._reserves = reserves
+        self._off = [spare for spare in reserves if spare.state == "off"]
+        self._slack = (capacity + total(reserves)) * _TOLERANCE
+        self._levels: dict[float, list[Running]] = {}  # what may be revoked, by priority
+        for share in running:
+            if not share.leaving:
+                self._levels.setdefault(_rank(share.priority), []).append(share)
+        self._amounts = {rank: total(shares) for rank, shares in self._levels.items()}
+        self.free = capacity - total(running)
+        starting = total([spare for spare in reserves if spare.state == "starting"])
+        self.ahead = capacity - math.fsum(self._amounts.values()) + starting
+
+    def shed(self) -> None:
+        """Make room for what runs already, if the capacity has become less."""
+        need = -self.ahead - self._slack
+        if need > 0 and not self._make_room(need, math.inf, ("reclaim", "supply", "preempt")):
+            self.made.revoke += [share.id for _, level in sorted(self._levels.items()) for share in reversed(level)]
+            self.made.start += [spare.id for spare in self._off]
+            self.ahead += math.fsum(self._amounts.values()) + total(self._off)
+            self._levels, self._amounts, self._off = {}, {}, []
+
+    def place(self, one: Asked, policy: Sequence[Step]) -> None:
+        """Admit one, or make room for it, or let it wait, or refuse it."""
+        need = one.amount - self.ahead - self._slack
+        if need > 0 and not self._make_room(need, _rank(one.priority), policy):
+            (self.made.wait if one.patient and "wait" in policy else self.made.refuse).append(one.id)
+            return
+        self.ahead -= one.amount
+        if one.amount <= self.free + self._slack:
+            self.free -= one.amount
+            self.made.admit.append(one.id)
+        else:
+            self.made.wait.append(one.id)
+
+    def rest(self) -> None:
+        """Stop the reserves that nobody needs, the last first."""
+        if self.made.wait or self.made.start:
+            return
+        spare_room = min(self.free, self.ahead)
+        for spare in reversed(self._reserves):
+            if spare.state == "on" and spare.amount <= spare_room + self._slack:
+                self.made.stop.append(spare.id)
+                spare_room -= spare.amount
+
+    def _make_room(self, need: float, rank: float, policy: Sequence[Step]) -> bool:
+        """Begin what makes `need` more room for somebody of this rank; return False if nothing makes as much.
+
+        The groups of what may make room are in the order of their use. All before the last one that is needed are
+        taken for granted while as little as possible of the last is chosen, and so on back to the first.
+        """
+        groups = self._groups(rank, policy)
+        amounts: list[float] = []
+        while math.fsum(amounts) < need:
+            if len(amounts) == len(groups):
+                return False
+            level = groups[len(amounts)]
+            amounts.append(total(self._off) if level is None else self._amounts[level])
+        for level in reversed(groups[: len(amounts)]):
+            amounts.pop()
+            missing = need - math.fsum(amounts)
+            if missing > 0:
+                need -= self._use_reserves(missing) if level is None else self._revoke(level, missing)
+        return True
+
+    def _groups(self, rank: float, policy: Sequence[Step]) -> list[float | None]:
+        """Return the priorities that may give way to this rank, and None for the reserves, in the policy's order."""
+        lower = sorted(level for level in self._levels if level < rank)
+        groups: list[float | None] = []
+        for step in policy:
+            if step == "reclaim":
+                groups += [level for level in lower if level == _IDLE and level not in groups]
+            elif step == "supply":
+                groups.append(None)
+            elif step == "preempt":
+                groups += [level for level in lower if level not in groups]
+        return groups
+
+    def _use_reserves(self, need: float) -> float:
+        chosen = first_that_do(self._off, need)
+        self._off = [spare for spare in self._off if spare not in chosen]
+        self.made.start += [spare.id for spare in chosen]
+        self.ahead += total(chosen)
+        return total(chosen)
+
+    def _revoke(self, level: float, need: float) -> float:
+        shares = sorted(self._levels[level], key=lambda share: share.since)
+        chosen = fewest_newest(shares, need)
+        ids = {share.id for share in chosen}
+        self._levels[level] = [share for share in shares if share.id not in ids]
+        self._amounts[level] = total(self._levels[level])
+        self.made.revoke += [share.id for share in chosen]
+        self.ahead += total(chosen)
+        return total(chosen)

@@ -1,0 +1,94 @@
+"""Pools: what a file or a program says about each, and the checks of that.
+
+A file has one table for each pool::
+
+    [[pool]]
+    name = "watts"
+    capacity = 100
+    policy = ["reclaim", "supply", "preempt", "wait"]    # the default: in this order they make room
+
+    [[pool.reserve]]                                     # what can be loaded to add to the capacity
+    server = "power/generator"
+    request = "diesel"
+    amount = 50
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import msgspec
+
+from rr_actors.base.checks import is_number
+from rr_actors.base.errors import shown
+from rr_actors.base.toml import read_typed, wrong
+from rr_actors.managers.budgets.planner import Step
+
+POLICY: tuple[Step, ...] = get_args(Step)
+
+
+class Reserve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A resource that adds `amount` to the capacity by a supply of its own, and is loaded when that is needed."""
+
+    server: str
+    amount: float
+    request: Any = None
+
+
+class Pool(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A quantity that resources share.
+
+    Attributes:
+        name: such as "watts".
+        capacity: how much there is without supplies.
+        policy: what makes room for a share that does not fit, in this order. "reclaim": revoke shares that are idle.
+            "supply": load a reserve. "preempt": revoke shares of lower priority. "wait": wait until others release
+            theirs. What is left out is not done.
+        reserve: what can be loaded to add to the capacity, the preferred first.
+    """
+
+    name: str
+    capacity: float
+    policy: tuple[Step, ...] = POLICY
+    reserve: tuple[Reserve, ...] = ()
+
+
+class PoolFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    pool: list[Pool]
+
+
+def read_pools(file_or_pools: str | os.PathLike[str] | Sequence[Pool]) -> dict[str, Pool]:
+    """Return the pools by name, from a TOML file or as they are given.
+
+    Raises:
+        ConfigError: the file cannot be read, or a pool is wrong. `.file`, `.key`, `.expected`, `.got`
+    """
+    if isinstance(file_or_pools, (str, os.PathLike)):
+        file: str | None = str(Path(file_or_pools).absolute())
+        pools: Sequence[Pool] = read_typed(file, PoolFile).pool
+    else:
+        file, pools = None, file_or_pools
+    found: dict[str, Pool] = {}
+    for i, pool in enumerate(pools):
+        key = f"pool[{i}]"
+        if pool.name in found or not pool.name:
+            said = f"{shown(pool.name)} again" if pool.name else None
+            raise wrong(file, f"{key}.name", "a name that no other pool has", pool.name, where="Budgets", said=said)
+        check_amount(file, f"{key}.capacity", pool.capacity)
+        for j, reserve in enumerate(pool.reserve):
+            check_amount(file, f"{key}.reserve[{j}].amount", reserve.amount)
+        if unknown := [step for step in pool.policy if step not in POLICY]:
+            raise wrong(file, f"{key}.policy", f"of {', '.join(POLICY)}", unknown[0], where="Budgets")
+        found[pool.name] = pool
+    return found
+
+
+def check_amount(file: str | None, key: str, amount: float) -> None:
+    """Raise ConfigError for an amount that is no number of at least 0."""
+    if not is_number(amount) or amount < 0:
+        raise wrong(file, key, "a number of at least 0", amount, where="Budgets")

@@ -1,0 +1,282 @@
+"""The effects of a decision, carried out once it is on disk: one method for each kind."""
+
+from __future__ import annotations
+
+import functools
+from asyncio import TimerHandle
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rr_actors.base.errors import RrError
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.values.canonical import text_of_value
+from rr_actors.base.values.failure import error_of, failure_of
+from rr_actors.registrar.engine.monitor import RegistrarBase
+from rr_actors.registrar.engine.server import Servers
+from rr_actors.registrar.links.consumer_links import Consumers
+from rr_actors.registrar.links.provider_link import ProviderLinks
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import effects as e
+from rr_actors.registrar.model.effects import Effect
+from rr_actors.registrar.model.messages import Load
+from rr_actors.registrar.model.rows import OWED, Resource, is_revocation
+from rr_actors.runtime.thread_rules import on_loop, with_lock
+from rr_actors.wire.transport import Link
+
+logger = Log("rr_actors.registrar")
+
+_SAID_AGAIN_S = 60.0
+_NAMED = 3  # callbacks that a message names
+_CALLBACKS = frozenset((e.StartLoad, e.StartUnload, e.StartRecover, e.StartPause, e.StartResume, e.StartStatus, e.Hear))
+
+
+@on_loop
+class EffectRunner:
+    """Carries out the effects that decisions cause, for a registrar's actor."""
+
+    def __init__(self, registrar: RegistrarBase, consumers: Consumers, servers: Servers, links: ProviderLinks) -> None:
+        self._registrar = registrar
+        self._consumers = consumers
+        self._servers = servers
+        self._clients = links
+        self._loop = registrar.node.dispatcher.loop
+        self._workers = registrar.node.dispatcher.workers
+        self._timers: dict[str, TimerHandle] = {}
+        self._dirty: dict[int, Link] = {}
+        self._silent_until: dict[str, float] = {}  # by consumer: when the log says next that it is behind
+        self._methods: dict[type, Callable[[Any], None]] = {
+            e.Reply: self._reply,
+            e.Request: self._request,
+            e.Connect: self._connect,
+            e.StartLoad: self._start_load,
+            e.StartUnload: self._start_unload,
+            e.StartRecover: self._start_recover,
+            e.StartPause: self._start_pause,
+            e.StartResume: self._start_resume,
+            e.StartStatus: self._start_status,
+            e.SetTimer: self._set_timer,
+            e.LoadResolved: self._load_resolved,
+            e.UnloadResolved: self._unload_resolved,
+            e.Receive: self._receive,
+            e.Hear: self._hear,
+            e.FellBehind: self._fell_behind,
+            e.Answer: self._answer,
+            e.Happened: self._happened,
+            e.Died: self._died,
+        }
+
+    def do(self, effects: Sequence[Effect]) -> None:
+        """Carry out the effects in their order, and flush each link once, at the end.
+
+        A decision has its events before its answers, some of which leave at once, by direct lines. A process that is
+        killed after an answer has therefore sent the event. Worker threads are woken once for all callbacks: otherwise
+        the first callback might end, and its thread sleep again, before the second is submitted.
+        """
+        methods = self._methods
+        if len(effects) > 1 and not _CALLBACKS.isdisjoint(map(type, effects)):
+            self._workers.threads.gather()
+            try:
+                for effect in effects:
+                    methods[type(effect)](effect)
+            finally:
+                self._workers.threads.go()
+        else:
+            for effect in effects:
+                methods[type(effect)](effect)
+        self._consumers.flush()
+        if self._dirty:
+            dirty, self._dirty = self._dirty, {}
+            for link in dirty.values():
+                link.flush()
+
+    @with_lock
+    def by_thread(self, effects: Sequence[Effect]) -> Callable[[], None] | None:
+        """Return a function that any thread may call to carry out the effects; None if the loop has to.
+
+        A thread may send only the answer to one direct line, which has no order with other messages. Watchers hear of
+        an event before the answer, so while anybody watches, the loop sends both.
+        """
+        answer: e.Reply | None = None
+        for effect in effects:
+            if type(effect) is e.Reply and answer is None:
+                answer = effect
+            elif type(effect) is not e.Happened or self._registrar.node.watched:
+                return None
+        return _nothing if answer is None else self._consumers.by_line(answer.message)
+
+    def close(self) -> None:
+        """Cancel all timers."""
+        for timer in self._timers.values():
+            timer.cancel()
+
+    # -- messages ------------------------------------------------------------------------------------------------
+
+    def _reply(self, effect: e.Reply) -> None:
+        self._consumers.send(effect.origin, effect.message)
+
+    def _request(self, effect: e.Request) -> None:
+        client = self._clients[effect.registrar]
+        link = client.link
+        if link is None:
+            client.want()
+            return
+        if self._registrar.catalog.up.get(effect.registrar) != client.opened:
+            return  # decided for an earlier link: reconciling this one sends all open messages again
+        try:
+            if type(effect.message) is Load:
+                client.describe(effect.message.server)
+            link.send(effect.message)
+        except RrError as error:
+            self._not_sent(effect, error)
+            return
+        if self._registrar.node.watched.level[0] > 1:
+            self._registrar.recorder.message("sent", self._registrar.name, effect.registrar, effect.message)
+        self._dirty[id(link)] = link
+
+    def _not_sent(self, effect: e.Request, error: RrError) -> None:
+        if type(effect.message) is Load:
+            self._registrar.post(c.GiveUp(effect.message.query_id, failure_of(error)))
+            return
+        name = self._registrar.name
+        logger.error("%s: %s; closing the link, what is open is sent again over the next", name, error)
+        link = self._clients[effect.registrar].link
+        if link is not None:
+            link.close()
+
+    def _connect(self, effect: e.Connect) -> None:
+        self._clients[effect.registrar].want()
+
+    def _receive(self, effect: e.Receive) -> None:
+        self._registrar.monitor.receive(effect.message, effect.sender)
+
+    # -- callbacks -----------------------------------------------------------------------------------------------
+
+    def _before(self, role: str, resource: Resource) -> None:
+        """Say which callback goes on with work of before the last crash: it may end this process during its start."""
+        registrar = self._registrar
+        if not registrar.serving:
+            origin = registrar.catalog.origin_of(resource)
+            registrar.node.on_resumed(f"the {role} callback of {origin} for resource {resource.id}")
+
+    def _start_load(self, effect: e.StartLoad) -> None:
+        server = self._servers.get(effect.resource.server)
+        if server is not None:
+            self._before("load", effect.resource)
+            server.start_load(effect.resource)
+
+    def _start_unload(self, effect: e.StartUnload) -> None:
+        server = self._servers.get(effect.resource.server)
+        if server is not None:
+            self._before("unload", effect.resource)
+            server.start_unload(effect.resource)
+
+    def _start_recover(self, effect: e.StartRecover) -> None:
+        server = self._servers.get(effect.resource.server)
+        if server is not None:
+            self._before("recover", effect.resource)
+            server.start_recover(effect.resource, effect.reload)
+
+    def _start_pause(self, effect: e.StartPause) -> None:
+        server = self._servers.get(effect.resource.server)
+        if server is not None:
+            self._before("pause", effect.resource)
+            server.start_pause(effect.resource)
+
+    def _start_resume(self, effect: e.StartResume) -> None:
+        server = self._servers.get(effect.resource.server)
+        if server is not None:
+            self._before("resume", effect.resource)
+            server.start_resume(effect.resource)
+
+    def _start_status(self, effect: e.StartStatus) -> None:
+        server = self._servers.get(effect.resource.server)
+        if server is None or server.spec.status is None:
+            self._registrar.post(c.StatusDone(effect.resource.id, effect.notice, handled=False))
+        else:
+            self._before("status", effect.resource)
+            server.start_status(effect.resource, effect.notice, repeated=effect.repeated)
+
+    # -- timers --------------------------------------------------------------------------------------------------
+
+    def _set_timer(self, effect: e.SetTimer) -> None:
+        old = self._timers.pop(effect.key, None)
+        if old is not None:
+            old.cancel()
+        if effect.delay_s is not None:
+            fire = functools.partial(self._timer_fired, effect.key, effect.command)
+            self._timers[effect.key] = self._loop.call_later(effect.delay_s, fire)
+
+    def _timer_fired(self, key: str, command: c.Command) -> None:
+        self._timers.pop(key, None)
+        self._registrar.post(command)
+
+    # -- waiting callers and listeners ---------------------------------------------------------------------------
+
+    def _load_resolved(self, effect: e.LoadResolved) -> None:
+        held = effect.held
+        if effect.failure is not None:
+            self._forget(held.id)
+        waiter = self._registrar.loads.pop(held.id, None)
+        if waiter is not None:
+            waiter(held, None if effect.failure is None else error_of(effect.failure))
+
+    def _unload_resolved(self, effect: e.UnloadResolved) -> None:
+        held = self._registrar.catalog.held.get(effect.query_id)
+        if effect.failure is None or (held is not None and held.hold is OWED):  # else the query is held, or will be
+            self._forget(effect.query_id)
+        waiter = self._registrar.unloads.pop(effect.query_id, None)
+        if waiter is not None:
+            waiter(None if effect.failure is None else error_of(effect.failure))
+
+    def _hear(self, effect: e.Hear) -> None:
+        audience = self._registrar.audience
+        if audience is None:
+            self._heard(effect, False)
+            return
+        audience.hear(effect.held, effect.notice, functools.partial(self._heard, effect), repeated=effect.repeated)
+
+    def _heard(self, effect: e.Hear, handled: bool) -> None:
+        self._registrar.post(c.Heard(effect.held.id, effect.notice.event, handled, is_revocation(effect.notice)))
+
+    def _fell_behind(self, effect: e.FellBehind) -> None:
+        if effect.dropped:
+            who = f"{effect.origin} (query {effect.query_id})" if effect.query_id else "its own status callback"
+            text = "%s: more than %d statuses of resource %s wait for %s: the %d oldest that are not FATAL are dropped"
+            backlog = self._registrar.catalog.backlog
+            logger.error(text, self._registrar.name, backlog, effect.resource_id, who, effect.dropped)
+            return
+        now = self._loop.time()
+        if now >= self._silent_until.get(effect.origin, 0.0):
+            self._silent_until[effect.origin] = now + _SAID_AGAIN_S
+            text = "%s: %s is behind with its statuses: %d of query %s wait there, and newer ones here"
+            logger.warning(text, self._registrar.name, effect.origin, effect.on_way, effect.query_id)
+
+    def _forget(self, query_id: str) -> None:
+        if self._registrar.audience is not None:
+            self._registrar.audience.forget(query_id)
+
+    def _answer(self, effect: e.Answer) -> None:
+        effect.ticket(None if effect.failure is None else error_of(effect.failure))
+
+    def _happened(self, effect: e.Happened) -> None:
+        registrar, resource = self._registrar, effect.resource
+        if not registrar.node.watched:
+            return
+        facts: dict[str, Any] = {"request": text_of_value(resource.request), "detail": effect.detail}
+        if effect.notice is not None:
+            with registrar.lock:
+                holders = dict.fromkeys(q.origin for q in registrar.catalog.queries_of(resource.id) if not q.parent)
+            facts |= {"status_id": effect.notice.event, "source": effect.notice.source, "heard_by": ", ".join(holders)}
+        server = registrar.catalog.origin_of(resource)
+        registrar.node.emit(effect.what, registrar=registrar.name, server=server, resource_id=resource.id, **facts)
+
+    def _died(self, effect: e.Died) -> None:
+        name = self._registrar.name
+        for given_up in effect.given_up:
+            logger.error("%s: %s", name, given_up)
+        ran = "; ".join(effect.runs[:_NAMED]) + ("; and others" if len(effect.runs) > _NAMED else "")
+        self._registrar.node.on_death_in_callback(ran)
+
+
+def _nothing() -> None:
+    """Do nothing: the decision has no answer to send."""

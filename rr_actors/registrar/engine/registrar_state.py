@@ -1,0 +1,156 @@
+"""The catalog of one registrar, in memory and on disk, and the lock that guards it.
+
+Under the lock no user code runs, nothing is pickled and no message is sent. A thread that has the lock never waits, and
+never takes the lock of another registrar.
+
+    with state.enter():
+        catalog = state.whole()
+        ...
+
+An interrupt (Ctrl-C) may stop a thread between any two instructions, and so may a defect. The next thread that takes
+the lock rolls the unfinished decision back before it reads anything. Therefore every use of the catalog begins with
+whole().
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from asyncio import AbstractEventLoop
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+
+from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.errors import CatalogError, RegistrarDown, RrError
+from rr_actors.registrar.core.decide import Item, decide
+from rr_actors.registrar.engine.commit_log import CommitLog
+from rr_actors.registrar.model import digests
+from rr_actors.registrar.model.catalog import Catalog, Decision
+from rr_actors.registrar.model.rows import Held
+from rr_actors.registrar.model.store import Store
+from rr_actors.runtime.thread_rules import on_loop, with_lock
+from rr_actors.runtime.workers import Workers
+
+LoadWaiter = Callable[[Held | None, RrError | None], None]
+UnloadWaiter = Callable[[RrError | None], None]
+
+
+class _OpenLocks:
+    """The locks of this process's registrars: for each, a function that says whether the calling thread has it.
+
+    The tuple is replaced as a whole, on the loop.
+    """
+
+    def __init__(self) -> None:
+        self.owned: tuple[Callable[[], bool], ...] = ()
+
+
+_open_locks = _OpenLocks()
+
+
+def is_deciding() -> bool:
+    """Return whether the calling thread has the lock of any registrar of this process.
+
+    A finalizer (__del__) must not wait if so: the garbage collector runs it anywhere, also in the middle of a decision.
+    """
+    for is_owned in _open_locks.owned:  # noqa: SIM110 - any() takes longer
+        if is_owned():
+            return True
+    return False
+
+
+def answered_by_line(_error: RrError | None) -> None:
+    """Do nothing: this waiter marks an unload whose thread reads the answer on its own direct line."""
+
+
+class RegistrarState:
+    """The catalog of one registrar, in memory and on disk.
+
+    Attributes:
+        lock: held by the thread that decides, or that reads more than one entry. enter() returns it.
+        is_inside: whether the calling thread has the lock; is_deciding() asks it.
+        closed: whether the registrar is closed; then nothing is decided any more.
+        waiting: the messages and commands that are not decided yet (monitor.py). One of a thread waits behind them.
+        commits: the disk, and which changes are still to be written.
+        sequence: the running numbers of queries, in the order in which they are asked for. Releases go newest first.
+        loads, unloads: by query, the callback that hears how its load, or its release, ended.
+    """
+
+    def __init__(
+        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.lock = threading.RLock()
+        self.commits = CommitLog(name, config, store, loop, workers, self.lock)
+        self.is_inside: Callable[[], bool] = self.lock._is_owned  # type: ignore[attr-defined]  # as in threading
+        self.epoch = store.epoch
+        self.catalog = self.stored_catalog()
+        self.waiting: deque[Item] = deque()
+        self.sequence = itertools.count(self.catalog.since + 1)
+        self.loads: dict[str, LoadWaiter] = {}
+        self.unloads: dict[str, UnloadWaiter] = {}
+        self.closed = False
+        self._why_down = "closed"
+
+    def stored_catalog(self) -> Catalog:
+        """Return the catalog that is on disk.
+
+        Raises:
+            CatalogError: it cannot be read, or unsaved changes could not be written before.
+        """
+        catalog = Catalog(self.name, self.commits.content(), self.epoch)
+        catalog.max_priority = self.config.max_priority
+        return catalog
+
+    @on_loop
+    def lock_in_use(self, *, in_use: bool) -> None:
+        """Have is_deciding() ask this lock from now on, or no longer."""
+        others = tuple(owned for owned in _open_locks.owned if owned != self.is_inside)
+        _open_locks.owned = (*others, self.is_inside) if in_use else others
+
+    def enter(self) -> AbstractContextManager[object]:
+        """Return the lock, for a `with` statement.
+
+        Raises:
+            RegistrarDown: the registrar is closed, or this process is a fork of the registrar's process: there the
+                thread that had the lock does not exist, so nobody would release it.
+        """
+        if self.closed:
+            raise self.down()
+        return self.lock
+
+    @with_lock
+    def whole(self) -> Catalog:
+        """Return the catalog, and roll back a decision that an interrupt left unfinished."""
+        catalog = self.catalog
+        if catalog.unfinished is not None:
+            self.commits.restore(catalog)
+            catalog.unfinished = None
+        return catalog
+
+    def commit(self, items: Iterable[Item]) -> Decision:
+        """Decide the items in their order, and write the changes now, or note them to be written a moment later.
+
+        Raises:
+            CatalogError: the changes were not written. Nothing has happened, and no other thread has seen any of it.
+        """
+        with self.lock:
+            decision = decide(self.whole(), items)
+            try:
+                self.commits.commit(decision)
+            except CatalogError:
+                decision.undo()
+                raise
+            decision.close()
+            return decision
+
+    def held_at(self, provider: str) -> list[Held] | None:
+        """Return the rows held at a provider; None while messages wait that could change them."""
+        with self.lock:
+            return None if self.waiting else digests.held_at(self.whole(), provider)
+
+    def down(self) -> RegistrarDown:
+        """Return the error that callers of a closed registrar get."""
+        return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")

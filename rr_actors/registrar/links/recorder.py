@@ -1,0 +1,105 @@
+"""Recorder: sends the messages and callbacks of one process up while somebody records.
+
+The caller's thread makes an entry and appends it to a list. At most 10 ms later the loop sends a batch to the
+application's process. The unsent entries of a killed process are lost. While nobody records, nothing of this is called.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import Unavailable
+from rr_actors.registrar.model.messages import Message
+from rr_actors.registrar.model.recorded import Entry, message_entry
+from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.runtime.thread_rules import on_loop
+
+RECORDED = "recorded"
+"""The event that carries a batch: "entries", encoded, and "dropped", the number of entries without room."""
+KEPT = 10_000
+"""How many entries may wait for the loop. More are counted and dropped."""
+BATCH_S = 0.01
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(list[Entry]).decode
+
+
+class Recorder:
+    """The recorder of one process. Call it from any thread.
+
+    Args:
+        path: the process's, "root/cameras".
+        emit: sends an event to the application's process; called on the loop.
+    """
+
+    def __init__(self, path: str, dispatcher: Dispatcher, emit: Callable[..., None]) -> None:
+        self._path = path
+        self._dispatcher = dispatcher
+        self._emit = emit
+        self._lock = threading.Lock()
+        self._waiting: list[Entry] = []
+        self._dropped = 0
+        self._scheduled = False
+        self._pid = os.getpid()
+
+    def message(self, event: str, registrar: str, peer: str, message: Message, at: float | None = None) -> None:
+        """Record that a registrar of this process has "sent" a message to `peer`, or "received" one from it.
+
+        Args:
+            at: seconds since the epoch; None: now. The peer may read a message before this call.
+        """
+        at = time.time() if at is None else at
+        self._add(message_entry(at, event, self._path, self._pid, registrar, peer, message))
+
+    def callback(self, event: str, server: str, role: str, resource: str, detail: str = "") -> None:
+        """Record that a callback of "registrar/server" "began" or "ended"; `detail` is the error that ended it."""
+        registrar = server.partition("/")[0]
+        where = (self._path, self._pid, registrar)
+        self._add(Entry(time.time(), event, 0, *where, "", role, "", resource, "", server, detail))
+
+    def _add(self, entry: Entry) -> None:
+        with self._lock:
+            if len(self._waiting) >= KEPT:
+                self._dropped += 1
+                return
+            self._waiting.append(entry)
+        if not self._scheduled:  # set by the loop: if a thread is interrupted here, the next entry does this
+            try:
+                self._dispatcher.call(self._flush_soon)
+            except Unavailable:  # the loop has ended, and nothing more can be sent
+                self._waiting.clear()
+
+    @on_loop
+    def close(self) -> None:
+        """Send the waiting entries before this process's part of the system ends."""
+        if self._waiting:
+            self._flush()
+
+    @on_loop
+    def _flush_soon(self) -> None:
+        if not self._scheduled:
+            self._scheduled = True
+            self._dispatcher.loop.call_later(BATCH_S, self._flush)
+
+    @on_loop
+    def _flush(self) -> None:
+        self._scheduled = False
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+            dropped, self._dropped = self._dropped, 0
+        self._emit(RECORDED, entries=_encode(waiting), dropped=dropped)
+
+
+def entries_of(event: dict[str, Any]) -> list[Entry]:
+    """Return the entries of a batch.
+
+    Raises:
+        msgspec.MsgspecError: the event has no valid batch.
+    """
+    return _decode(event["entries"])

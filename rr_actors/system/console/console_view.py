@@ -1,0 +1,304 @@
+"""View: a running system as a console sees it, and Verb, the base of what a console can ask and do. In a worker.
+
+A verb is declared once, as a class. Its fields are its arguments, its base names the type of its answer, and its method
+_carry_out() does it. The questions are in console_questions.py, the commands in console_commands.py.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import dataclasses
+import itertools
+import os
+import threading
+import time
+import weakref
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+import msgspec
+
+from rr_actors.actors.messaging.dead_letters import DeadLetters
+from rr_actors.actors.messaging.exit_reports import ExitReport
+from rr_actors.actors.refs import ActorRef
+from rr_actors.base.config import SystemConfig
+from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, readable, text_of
+from rr_actors.registrar.engine.node import Node
+from rr_actors.registrar.pages import Page, QueryRow, ResourceRow, ServerRow, Wanted
+from rr_actors.registrar.registrar import Registrar, page
+from rr_actors.runtime.processes.lifeline import stopped
+from rr_actors.supervision.event_history import Record, TreeLog, records_of
+from rr_actors.supervision.supervisor import SupervisorRef
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.client_registrars import ClientRegistrars
+from rr_actors.system.recording.figures import Figure
+from rr_actors.system.registrar_lookup import open_registrar, registrar_in
+from rr_actors.system.snapshots import describe_supervisor
+from rr_actors.wire.name_service import Presence
+
+_LOOK_S = 5.0
+"""Seconds that one supervisor may take to answer; after that, a console shows the others without it."""
+_USAGE_S = 2.0
+REGISTRAR = "console"
+"""The registrar of the system that holds the resources that a console loads and keeps. The first such load opens it."""
+_A = TypeVar("_A")
+
+
+class Viewed(Protocol):
+    """The part of System that a console uses. System has the docstrings."""
+
+    name: str
+    config: SystemConfig
+
+    @property
+    def ended(self) -> ExitReport | None: ...
+
+    def supervisor(self, path: str | None = None) -> SupervisorRef: ...
+
+    def ref(self, id: str) -> ActorRef[Any]: ...
+
+    def registrar(self, name: str) -> Registrar: ...
+
+    def dead_letters(self) -> DeadLetters: ...
+
+    def figures(self) -> list[Figure]: ...
+
+
+class View:
+    """A running system, as a console sees it. From workers.
+
+    Args:
+        system: held weakly, so that a dropped system is noticed.
+        log: the log of its tree.
+        shut_down: stops the system, in a thread of its own.
+
+    Attributes:
+        clients: the registrars of clients.
+    """
+
+    def __init__(self, system: Viewed, node: Node, log: TreeLog, shut_down: Callable[[], None]) -> None:
+        self._system = weakref.ref(system)
+        self.node = node
+        self._log = log
+        self.shut_down = shut_down
+        self.clients = ClientRegistrars()
+        self._opening = threading.Lock()
+        self.since = time.time()
+        self._began = time.monotonic()
+
+    @property
+    def system(self) -> Viewed:
+        """Return the system that the console looks at; raise Unavailable if it was dropped."""
+        if (system := self._system()) is None:
+            raise Unavailable("the system was dropped, and is being stopped")
+        return system
+
+    # -- the tree --------------------------------------------------------------------------------------------------
+
+    def children(self, match: str = "", offset: int = 0, limit: int = c.PAGE_LIMIT) -> c.Children:
+        """Return a page of the tree."""
+        rows = [row for row in self._walk() if match in row.path]
+        return c.Children(len(rows), rows[offset : offset + limit])
+
+    def _walk(self) -> Iterator[c.ChildRow]:
+        if (ended := self.system.ended) is not None:  # what has ended is not asked: that would make a dead letter
+            return _last_seen(self._log.of_this_run(), self.system.supervisor().path, readable(ended.detail))
+        state = {"state": "running", "pid": os.getpid()}
+        root = describe_supervisor(SupervisorRef(self.system.supervisor().path, timeout_s=_LOOK_S), text_of)
+        return _rows(root | state | {"up_s": time.monotonic() - self._began})
+
+    def history(self, path: str) -> list[Record]:
+        """Return the records of the child at `path` and of all below it, oldest first."""
+        records = self._log.records()
+        if path and self.system.ended is None:
+            with contextlib.suppress(NotFound, Unavailable):
+                path = self.path_of(path)
+        return records_of(records, path)
+
+    def path_of(self, child: str) -> str:
+        """Return the path of a child that is given by its path or its id.
+
+        Raises:
+            NotFound: there is no such child, or several have the id.
+        """
+        root = self.system.supervisor().path
+        if child == root:
+            return root
+        path = self.system.ref(child).path
+        if path is None:
+            raise NotFound(f"{child}: it is not in the tree", id=child)
+        return path
+
+    # -- registrars --------------------------------------------------------------------------------------------------
+
+    def up(self, registrar: str) -> list[str]:
+        """Return the names of the registrars that can be asked: this one, or all that are up.
+
+        Raises:
+            UnknownRegistrar: the system has no registrar of this name.
+        """
+        if registrar:
+            self.registrar(registrar)
+            return [registrar]
+        return [name for name, status in self.node.statuses().items() if status is Presence.UP]
+
+    def registrar(self, name: str) -> Registrar:
+        """Return a registrar, or a handle on it that does not wait for a restart.
+
+        Raises:
+            UnknownRegistrar, InvalidName: the system has no registrar of this name.
+        """
+        return registrar_in(self.node, name, patient=False)
+
+    def open_registrar(self, name: str) -> Registrar:
+        """Open a registrar as registrar_lookup.open_registrar() does; its catalog is removed when it is closed."""
+        config = dataclasses.replace(self.system.config.registrar(name), erase_on_destruct=True)
+        return open_registrar(self.node, name, config, self.system)
+
+    def holder(self, name: str) -> Registrar:
+        """Return the registrar that holds what a console loads: this one, or with "" the console's own."""
+        if not name:
+            with self._opening:
+                if self.node.status_of(REGISTRAR) in (None, Presence.GONE, Presence.DORMANT):
+                    return self.open_registrar(REGISTRAR)
+        return self.system.registrar(name or REGISTRAR)
+
+    def described(self, name: str) -> c.RegistrarRow:
+        """Return a registrar's row. One that does not answer has an error in it."""
+        status = self.node.status_of(name)
+        if status is not Presence.UP:
+            entry = self.node.find(name)
+            contents = f"dormant{entry.because}" if entry is not None and status is Presence.DORMANT else ""
+            return c.RegistrarRow(name, (status or Presence.GONE).value, error=contents)
+        try:
+            registrar = self.registrar(name)
+            return c.RegistrarRow(name, status.value, registrar.servers(), registrar.stats())
+        except RrError as error:
+            return c.RegistrarRow(name, status.value, error=readable(text_of(error)))
+
+    def page(
+        self,
+        what: Literal["resources", "queries", "id", "servers"],
+        registrar: str,
+        match: str,
+        offset: int = 0,
+        limit: int = 0,
+    ) -> tuple[Page, list[str]]:
+        """Return a page over several registrars, and notes on registrars that do not answer."""
+        total, resources, queries, notes = 0, list[ResourceRow](), list[QueryRow](), list[str]()
+        servers: list[ServerRow] = []
+        for name in self.up(registrar):
+            wanted = Wanted(what, match, max(0, offset - total), limit - len(resources) - len(queries))
+            try:
+                found = page(self.registrar(name), wanted)
+            except RrError as error:
+                notes.append(readable(text_of(error)))
+            else:
+                total += found.total
+                resources += found.resources
+                queries += found.queries
+                servers += found.servers
+        return Page(total, resources, queries, servers), notes
+
+    def usages(
+        self, resources: Sequence[tuple[str, str]], notes: list[str]
+    ) -> tuple[dict[str, dict[str, float]], dict[str, str]]:
+        """Return the usage of resources by their ids, and why others are not known. Each is (registrar, id).
+
+        Add notes on registrars that do not answer. A registrar has _USAGE_S for all its callbacks.
+        """
+        usages, failures = dict[str, dict[str, float]](), dict[str, str]()
+        for name in dict.fromkeys(name for name, _ in resources):
+            try:
+                found = self.registrar(name).usage(of=[id for one, id in resources if one == name], timeout_s=_USAGE_S)
+            except RrError as error:
+                notes.append(readable(text_of(error)))
+            else:
+                usages |= found
+                failures |= found.failures
+        return usages, failures
+
+    def find(self, id: str, registrar: str = "") -> c.Found:
+        """Return the resources and queries with this id, or else those whose ids begin or end with it.
+
+        The name of a resource stands for its id: "cameras/camera "/dev/video7"", also as it is shortened for people.
+        """
+        if not id:
+            raise UsageError("expected the id or name of a query or resource, or four characters of an id, got nothing")
+        server, space, request = id.partition(" ")
+        if space and "/" in server:
+            part = request.partition("…")[0]
+            found, notes = self.page("resources", server.partition("/")[0], part, limit=c.PAGE_LIMIT)
+            rows = [row for row in found.resources if id in (row.name, f"{row.server} {row.request}")]
+            return c.Found(rows, [], notes)
+        found, notes = self.page("id", registrar, id)
+        resources, queries = found.resources, found.queries
+        if any(row.id == id for row in (*resources, *queries)):
+            resources = [row for row in resources if id in (row.id, *(holder.query_id for holder in row.holders))]
+            queries = [row for row in queries if row.id == id]
+        return c.Found(resources, queries, notes)
+
+
+def _last_seen(records: list[Record], root: str, why: str) -> Iterator[c.ChildRow]:
+    """Yield the rows of a tree that has ended, as its records know it."""
+    yield c.ChildRow(root, 0, "supervisor", "stopped", error=why)
+    newest = {record.path: record for record in records if record.path != root}
+    restarts = Counter(record.path for record in records if record.event == "restarted")
+    for path in sorted(newest, key=lambda path: path.split("/")):
+        if newest[path].state is not None:
+            kind = "supervisor" if newest[path].kind == "supervisor" else "worker"
+            yield c.ChildRow(path, path.count("/"), kind, "stopped", restarts=restarts[path])
+
+
+def _rows(node: Mapping[str, Any], depth: int = 0) -> Iterator[c.ChildRow]:
+    """Yield the rows of a child and of all below it, each supervisor before its children."""
+    paused = "" if node["pid"] is None else stopped(node["pid"])
+    error, most = paused or node.get("error", ""), node.get("max_restarts", 0)
+    state = "unavailable" if error and node["state"] == "running" else node["state"]
+    row = c.ChildRow(node["path"], depth, node["type"], state, node["pid"], node.get("restarts", 0), node["up_s"])
+    if error:
+        row = msgspec.structs.replace(row, error=readable(error))
+    elif "strategy" in node:
+        strategy = f"{node['strategy']}, {most} in {node['max_seconds']:g} s"
+        recent = node["recent_restarts"]
+        row = msgspec.structs.replace(row, strategy=strategy, max_restarts=most, recent_restarts=recent)
+    yield row
+    for child in node.get("children", ()):
+        yield from _rows(child, depth + 1)
+
+
+def room_for(rows: Sequence[ResourceRow | c.UsageRow | Record], notes: Sequence[str] = ()) -> int:
+    """Return how many of these rows, from the first on, have room in an answer with the notes: texts may be long."""
+    limit = c.RESPONSE_LIMIT_BYTES - len(msgspec.msgpack.encode(notes))
+    sizes = itertools.accumulate(len(msgspec.msgpack.encode(row)) for row in rows)
+    return sum(size <= limit for size in sizes)
+
+
+class Caller(Protocol):
+    """The connection by which a request came. What a client opens lives as long."""
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether the client has left."""
+        ...
+
+
+class Verb(c.Message, Generic[_A], frozen=True):
+    """What a console can ask or do; Verb[Children] is answered with Children."""
+
+    def carry_out(self, view: View, caller: Caller) -> _A:
+        """Answer the question, or do what is asked for, and return what was done. In a worker.
+
+        Raises:
+            RrError: it cannot be done; nothing was changed, or the error says what was.
+        """
+        return self._carry_out(view, caller)
+
+    @abc.abstractmethod
+    def _carry_out(self, view: View, caller: Caller) -> _A: ...
+
+
+class Command(Verb[_A], frozen=True):
+    """A verb that changes something. A system that is stopping refuses it."""

@@ -1,0 +1,93 @@
+"""Waiting from outside: until a child of a running system, or a resource, is in a state."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+from rr_actors.base.errors import NotRunning, UsageError, few, shown
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_questions import Find
+
+CHILD_STATES = ("running", "starting", "restarting", "stopped")
+RESOURCE_STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL", "loaded", "loading", "unloading", "paused")
+GONE = "gone"
+
+_AGAIN_S = 0.1  # between two attempts to reach a system that does not run yet, and between two looks at one that does
+_TICK_S = 0.5  # while nothing happens, so often
+
+
+def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, timeout_s: float) -> tuple[bool, str]:
+    """Wait until a child or a resource is in a state; while no system runs, for one that does.
+
+    Args:
+        target: a child's id or path, or a resource's name, or its id or a part of that.
+        wanted: one of CHILD_STATES, RESOURCE_STATES (of upper or lower case) or GONE: there is none of this name; "":
+            the child runs, or the resource is loaded.
+
+    Returns:
+        Whether it was in time, and the state that was seen last.
+
+    Raises:
+        NotRunning: no system ran until the time limit; or it has ended meanwhile, and `wanted` is not GONE.
+        UsageError: no such state is known, or several children or resources have this name.
+    """
+    known = (*CHILD_STATES, *RESOURCE_STATES, GONE)
+    if wanted and wanted.lower() not in map(str.lower, known):
+        raise UsageError(f"--for: expected {', '.join(known)}, got {shown(wanted)}")
+    deadline = time.monotonic() + timeout_s
+    accepted = {wanted.lower()} if wanted else {"running", "loaded"}
+    states = [GONE]
+    try:
+        with _patiently(connect, 0.0 if GONE in accepted else deadline) as asking, connect() as hearing:
+            for _ in _looks(hearing, deadline):
+                states = _states_of(asking, target)
+                if not accepted.isdisjoint(map(str.lower, states)):
+                    return True, states[0]
+    except NotRunning:
+        if GONE not in accepted:
+            raise
+        return True, GONE
+    return False, states[0]
+
+
+def _patiently(connect: Callable[[], ConsoleClient], deadline: float) -> ConsoleClient:
+    while True:
+        try:
+            return connect()
+        except NotRunning:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_AGAIN_S)
+
+
+def _looks(hearing: ConsoleClient, deadline: float) -> Iterator[None]:
+    """Yield at once, and then whenever something may have changed, until the time limit.
+
+    Raises:
+        NotRunning: the system has ended.
+    """
+    looked_at = 0.0
+    for _ in hearing.follow(c.Follow(), _TICK_S):
+        now = time.monotonic()
+        if now - looked_at > _AGAIN_S or now > deadline:
+            yield
+            looked_at = now
+        if now > deadline:
+            return
+    raise NotRunning(f"the system in {hearing.welcome.state_dir} has ended")
+
+
+def _states_of(asking: ConsoleClient, target: str) -> list[str]:
+    """Return the state of the child of this name, or the last status and the phase of the resource; else GONE."""
+    children = [row for row in asking.children().rows if target in (row.path, row.id)]
+    if len(children) > 1:
+        raise UsageError(f"{shown(target)}: several children have this id: {few(row.path for row in children)}")
+    if children:
+        return [children[0].state]
+    resources = asking.ask(Find(target)).resources
+    if len(resources) > 1:
+        several = few(f"{row.name} ({row.id})" for row in resources)
+        raise UsageError(f"{shown(target)}: several resources have this in their ids: {several}; give more of the id")
+    return [resources[0].condition, resources[0].phase] if resources else [GONE]

@@ -1,0 +1,238 @@
+"""The planner of budgets: who gets a share, and who gives way."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from rr_actors.managers.budgets.planner import Asked, Plan, Running, Spare, Step, plan
+from support_steps import steps_of
+
+ALL: tuple[Step, ...] = ("reclaim", "supply", "preempt", "wait")
+
+
+def running(*shares: tuple[float, int | None], since: int = 0) -> list[Running]:
+    return [Running(f"r{i}", amount, priority, since + i) for i, (amount, priority) in enumerate(shares)]
+
+
+def rank(priority: int | None) -> float:
+    return -math.inf if priority is None else priority
+
+
+TABLE = [
+    # asked, running, reserves, policy, then the plan
+    ((40, 0), [(60, 0)], [], ALL, Plan(admit=["a"])),
+    ((0.3, 0), [(99.7, 0)], [], ALL, Plan(admit=["a"])),
+    ((41, 0), [(60, 0)], [], ALL, Plan(wait=["a"])),
+    ((41, 0), [(60, 0)], [], ("preempt",), Plan(refuse=["a"])),
+    ((41, 1), [(60, 0)], [], ALL, Plan(revoke=["r0"], wait=["a"])),
+    ((41, 1), [(60, 0)], [], ("wait",), Plan(wait=["a"])),
+    # idle ones first, but not for one that is idle itself
+    ((50, 0), [(50, None), (50, -5)], [], ALL, Plan(revoke=["r0"], wait=["a"])),
+    ((50, None), [(50, None), (50, -5)], [], ALL, Plan(wait=["a"])),
+    # a reserve before anybody who is not idle
+    ((50, 9), [(100, 1)], [50], ALL, Plan(start=["s0"], wait=["a"])),
+    ((50, 9), [(100, 1)], [20, 50], ALL, Plan(start=["s1"], wait=["a"])),
+    ((50, 9), [(100, 1)], [20], ALL, Plan(revoke=["r0"], wait=["a"])),
+    # the lowest, then the fewest, then the newest
+    ((30, 9), [(50, 2), (50, 1)], [], ALL, Plan(revoke=["r1"], wait=["a"])),
+    ((30, 9), [(30, 1), (10, 1), (10, 1), (10, 1), (40, 3)], [], ALL, Plan(revoke=["r0"], wait=["a"])),
+    ((30, 9), [(30, 1), (30, 1), (40, 1)], [], ALL, Plan(revoke=["r2"], wait=["a"])),
+    ((40, 9), [(30, 1), (30, 1), (40, 3)], [], ALL, Plan(revoke=["r1", "r0"], wait=["a"])),
+    # a low one that is not needed any more is spared
+    ((50, 9), [(10, 1), (50, 2), (40, 9)], [], ALL, Plan(revoke=["r1"], wait=["a"])),
+]
+
+
+@pytest.mark.parametrize(("asked", "shares", "spares", "policy", "expected"), TABLE)
+def test_one_that_asks(
+    asked: tuple[float, int | None],
+    shares: list[tuple[float, int | None]],
+    spares: list[float],
+    policy: tuple[Step, ...],
+    expected: Plan,
+) -> None:
+    reserves = [Spare(f"s{i}", amount) for i, amount in enumerate(spares)]
+
+    assert plan(100, policy, running(*shares), [Asked("a", *asked)], reserves) == expected
+
+
+def test_the_highest_priority_is_placed_first_then_the_oldest() -> None:
+    asked = [Asked("late", 60, 1, 3), Asked("early", 60, 1, 2), Asked("high", 30, 5, 9)]
+
+    assert plan(100, ALL, [], asked) == Plan(admit=["high", "early"], wait=["late"])
+
+
+def test_room_that_is_made_is_for_the_one_it_is_made_for() -> None:
+    leaving = Running("r0", 60, 1, leaving=True)
+
+    made = plan(100, ALL, [leaving, Running("r1", 20, 9)], [Asked("a", 70, 5), Asked("b", 20, 0), Asked("c", 10, 0)])
+
+    assert made == Plan(admit=["c"], wait=["a", "b"])
+
+
+def test_one_that_has_waited_long_enough_is_refused_unless_room_is_being_made_for_it() -> None:
+    leaving = Running("r0", 60, 1, leaving=True)
+    late = Asked("a", 60, 5, patient=False)
+
+    assert plan(100, ALL, [leaving, Running("r1", 40, 9)], [late]) == Plan(wait=["a"])
+    assert plan(100, ALL, [Running("r1", 50, 9)], [late]) == Plan(refuse=["a"])
+
+
+def test_a_capacity_that_has_become_less_sheds_the_lowest_whatever_the_policy_is() -> None:
+    shares = running((30, 1), (30, 9), (30, 5))
+
+    assert plan(60, ("wait",), shares) == Plan(revoke=["r0"])
+    assert plan(-9, ("wait",), shares).revoke == ["r0", "r2", "r1"]
+    assert plan(0, ("wait",), shares).revoke == ["r1", "r2", "r0"]
+    assert plan(60, ALL, shares, reserves=[Spare("s0", 30)]) == Plan(start=["s0"])
+    assert plan(60, ALL, shares, reserves=[Spare("s0", 30, "starting")]) == Plan()
+
+
+def test_a_reserve_stops_when_nobody_needs_it() -> None:
+    reserves = [Spare("s0", 20, "on"), Spare("s1", 50, "on")]
+
+    assert plan(170, ALL, running((90, 0)), reserves=reserves) == Plan(stop=["s1", "s0"])
+    assert plan(170, ALL, running((110, 0)), reserves=reserves) == Plan(stop=["s1"])
+    assert plan(170, ALL, running((160, 0)), [Asked("a", 20)], reserves) == Plan(wait=["a"])
+
+
+levels = st.none() | st.integers(-2, 2)
+amounts = st.sampled_from([0.1, 1, 2, 3, 5, 8, 13])
+
+
+@given(st.lists(st.tuples(amounts, levels), max_size=7), amounts, levels, st.floats(0, 20))
+def test_the_victims_are_the_lowest_then_the_fewest_then_the_newest(
+    shares: list[tuple[float, int | None]], amount: float, priority: int | None, capacity: float
+) -> None:
+    """Compared with the best of all sets, in the smallest cases."""
+    held = running(*shares)
+    capacity += math.fsum(share.amount for share in held)
+
+    made = plan(capacity, ALL, held, [Asked("a", amount + 5, priority)])
+
+    need = amount + 5 - (capacity - math.fsum(share.amount for share in held)) - capacity * 1e-9
+    lower = [share for share in held if rank(share.priority) < rank(priority)]
+    sets = [chosen for size in range(len(lower) + 1) for chosen in itertools.combinations(lower, size)]
+    enough = [chosen for chosen in sets if math.fsum(share.amount for share in chosen) >= need]
+
+    def worth(chosen: tuple[Running, ...]) -> list[tuple[int, list[float]]]:
+        """The count at each priority, the highest first, and the ages there, the newest first."""
+        of_level = [
+            [share for share in chosen if rank(share.priority) == level] for level in (2, 1, 0, -1, -2, -math.inf)
+        ]
+        return [(len(level), sorted(-share.since for share in level)) for level in of_level]
+
+    if not enough:
+        assert made == Plan(wait=["a"])
+    else:
+        assert set(made.revoke) == {share.id for share in min(enough, key=worth)}
+
+
+def test_ten_thousand_shares_take_few_steps() -> None:
+    shares = running(*((1 + i % 7, i % 50) for i in range(10_000)))
+    capacity = math.fsum(share.amount for share in shares)
+
+    steps, made = steps_of(lambda: plan(capacity, ALL, shares, [Asked("a", 1000, 100)]))
+
+    assert made.wait == ["a"]
+    assert steps < 60 * len(shares)
+
+
+class Pools(RuleBasedStateMachine):
+    """A pool in which anything happens in any order, as a manager would carry out the plans."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.capacity = 20.0
+        self.running: dict[str, Running] = {}
+        self.asked: dict[str, Asked] = {}
+        self.count = 0
+        self.is_late = False  # the capacity was lowered, and what is over has not left yet
+
+    @rule(amount=amounts, priority=levels, patient=st.booleans())
+    def ask(self, amount: float, priority: int | None, patient: bool) -> None:
+        self.count += 1
+        self.asked[f"{self.count}"] = Asked(f"{self.count}", amount, priority, self.count, patient)
+        self.settle()
+
+    @rule(capacity=st.sampled_from([0, 5, 10, 20, 30]))
+    def change(self, capacity: float) -> None:
+        self.capacity = capacity
+        self.is_late = True
+        self.settle()
+
+    @precondition(lambda self: self.running)
+    @rule(data=st.data())
+    def leave(self, data: st.DataObject) -> None:
+        del self.running[data.draw(st.sampled_from(sorted(self.running)))]
+        self.settle()
+
+    @precondition(lambda self: self.running)
+    @rule(data=st.data(), priority=levels)
+    def reprioritise(self, data: st.DataObject, priority: int | None) -> None:
+        one = self.running[data.draw(st.sampled_from(sorted(self.running)))]
+        self.running[one.id] = Running(one.id, one.amount, priority, one.since, one.leaving)
+        self.settle()
+
+    @precondition(lambda self: self.asked)
+    @rule(data=st.data())
+    def lose_patience(self, data: st.DataObject) -> None:
+        one = self.asked[data.draw(st.sampled_from(sorted(self.asked)))]
+        self.asked[one.id] = Asked(one.id, one.amount, one.priority, one.since, False)
+        self.settle()
+
+    def settle(self) -> None:
+        made = plan(self.capacity, ALL, list(self.running.values()), list(self.asked.values()))
+        assert sorted([*made.admit, *made.wait, *made.refuse]) == sorted(self.asked)
+        self._check_victims(made)
+        for id in made.refuse:
+            del self.asked[id]
+        for id in made.revoke:
+            one = self.running[id]
+            self.running[id] = Running(id, one.amount, one.priority, one.since, True)
+        for id in made.admit:
+            one = self.asked.pop(id)
+            self.running[id] = Running(id, one.amount, one.priority, one.since)
+        self.is_late = self.is_late and self.used() > self.capacity + 1e-6
+
+    def _check_victims(self, made: Plan) -> None:
+        """Check that no victim is one too many, and that each is lower than somebody who waits."""
+        victims = [self.running[id] for id in made.revoke]
+        waiting = [self.asked[id] for id in made.wait]
+        if self.used(staying=True) <= self.capacity:
+            for victim in victims:
+                assert any(rank(victim.priority) < rank(one.priority) for one in waiting)
+
+    def used(self, staying: bool = False) -> float:
+        return math.fsum(one.amount for one in self.running.values() if not (staying and one.leaving))
+
+    @invariant()
+    def the_sum_is_within_the_capacity(self) -> None:
+        assert self.is_late or self.used() <= self.capacity + 1e-6
+
+    @invariant()
+    def nothing_more_is_to_be_done(self) -> None:
+        """A plan that was carried out is complete: planned again, nothing more comes of it."""
+        made = plan(self.capacity, ALL, list(self.running.values()), list(self.asked.values()))
+        assert made == Plan(wait=made.wait)
+
+    @invariant()
+    def nobody_waits_who_would_fit_while_a_lower_one_runs(self) -> None:
+        room = self.capacity - self.used(staying=True)
+        first = max(self.asked.values(), key=lambda one: (rank(one.priority), -one.since), default=None)
+        if first is not None and room < first.amount - 1e-6:
+            lower = [
+                one.amount
+                for one in self.running.values()
+                if not one.leaving and rank(one.priority) < rank(first.priority)
+            ]
+            assert room + math.fsum(lower) < first.amount + 1e-6
+
+
+TestPools = Pools.TestCase

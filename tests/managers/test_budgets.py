@@ -1,0 +1,269 @@
+"""Budgets: shares of a pool, what gives way, and what a crash leaves."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.managers import Budgets, OverCapacity, Pool, PoolInfo, Reserve, Share, Supply
+from support import Calls, eventually, kill, wait_respawned
+
+Start = Callable[..., rr.System]
+
+
+class House:
+    """A system with budgets, and devices and generators in this process. A device's request is (name, watts, wait)."""
+
+    def __init__(self, start: Start, *pools: Pool, grace_s: float = 30.0) -> None:
+        budgets = rr.ChildSpec(Budgets, id="budgets", args=(pools, grace_s))
+        self.system = start(rr.Supervisor([budgets], max_restarts=100))
+        self.app = self.system.open_registrar("app")
+        self.devices = self.system.open_registrar("devices")
+        self.ended = Calls()
+        self.started = Calls()
+        self.devices.register_server("device", self._load, self._unload)
+        self.devices.register_server("generator", self._start, self._stop)
+
+    def _load(self, request: Any) -> str:
+        name, watts, wait_s = request
+        self.devices.load("budgets/share", Share("watts", watts, wait_s), timeout_s=60)
+        return name
+
+    def _unload(self, request: Any, response: str | None) -> None:
+        self.ended(request[0])
+
+    def _start(self, request: float) -> str:
+        if request < 0:
+            raise OSError("no fuel")
+        self.devices.load("budgets/supply", Supply("watts", request))
+        self.started(request)
+        return "runs"
+
+    def _stop(self, request: float, response: str | None) -> None:
+        self.ended(f"generator {request:g}")
+
+    def run(self, name: str, watts: float, *, wait_s: float = 0.0, **options: Any) -> Any:
+        return self.app.load("devices/device", (name, watts, wait_s), timeout_s=60, **options)
+
+    def pool(self) -> PoolInfo:
+        (pool,) = self.system.ref("budgets").proxy().pools().get()
+        return pool
+
+    def set_capacity(self, capacity: float) -> None:
+        self.system.ref("budgets").proxy().set_capacity("watts", capacity).get()
+
+    def respawn(self) -> None:
+        wait_respawned(self.system, "budgets", kill(self.system, "budgets"))
+
+
+@pytest.fixture
+def house(start: Start) -> House:
+    return House(start, Pool("watts", 100))
+
+
+def test_shares_are_admitted_while_they_fit_and_given_back(house: House) -> None:
+    one, _ = house.run("heater", 60), house.run("lamp", 40)
+    assert house.pool() == PoolInfo("watts", 100, 100, 0)
+    one.unload()
+    assert house.pool().used == 40
+    house.run("oven", 60)
+
+
+def test_equal_devices_have_a_share_each(house: House) -> None:
+    house.run("left", 40)
+    house.run("right", 40)
+    assert house.pool().used == 80
+
+
+def test_what_does_not_fit_is_refused_by_name(house: House) -> None:
+    house.run("heater", 60)
+    with pytest.raises(OverCapacity, match="pool 'watts': asked 50, free 40 of 100; held by devices") as raised:
+        house.run("oven", 50)
+    error = raised.value
+    assert (error.pool, error.asked, error.free, error.holders) == ("watts", 50, 40, ("devices",))
+    assert error.trace[0].origin == "budgets/share"
+    with pytest.raises(OverCapacity):
+        house.run("never", 101, wait_s=60)  # at once, as it can never fit
+    assert house.pool() == PoolInfo("watts", 100, 60, 0)
+
+
+WRONG: list[tuple[Any, str]] = [
+    (Share("volts", 1), "no pool 'volts': expected one of watts"),
+    (Share("watts", -1), "amount: expected a number of at least 0, got -1"),
+    (Share("watts", 1, -1), "wait_s: expected a number of at least 0, got -1"),
+    (Share("watts", math.inf), "amount"),
+    (Share("watts", math.nan), "amount"),
+    ({"pool": "watts", "amont": 1}, "amont"),
+]
+
+
+def test_what_is_wrong_is_refused_by_name(house: House) -> None:
+    for share, why in WRONG:
+        with pytest.raises(rr.RrError, match=why):
+            house.app.load("budgets/share", share)
+    wrong: list[Any] = [-1, math.nan, "60"]
+    for capacity in wrong:
+        with pytest.raises(rr.ConfigError, match="capacity: expected a number of at least 0"):
+            house.set_capacity(capacity)
+    with pytest.raises(rr.NotFound, match="no pool 'volts': expected one of watts"):
+        house.system.ref("budgets").proxy().set_capacity("volts", 1).get()
+    assert house.pool() == PoolInfo("watts", 100, 0, 0)
+
+
+def test_who_waits_gets_room_when_others_give_theirs_back(house: House) -> None:
+    heater = house.run("heater", 60)
+    oven = house.run("oven", 50, wait_s=60, block=False)
+    eventually(lambda: house.pool().waiting == 1)
+    heater.unload()
+    assert oven.get(timeout=30).response == "oven"
+
+
+def test_who_has_waited_long_enough_is_refused(house: House) -> None:
+    house.run("heater", 60)
+    with pytest.raises(OverCapacity):
+        house.run("oven", 50, wait_s=0.3)
+    assert house.pool() == PoolInfo("watts", 100, 60, 0)
+
+
+def test_the_lowest_give_way_to_a_higher_priority(house: House) -> None:
+    heard = Calls()
+    for name, watts, priority in (("a", 20, 1), ("b", 20, 2), ("c", 60, 3)):
+        house.run(name, watts, priority=priority, on_status=heard)
+    house.run("urgent", 40, priority=9)
+    assert sorted(house.ended.items) == ["a", "b"]
+    assert {(status.state, status.reason) for status in heard.wait(2)} == {(rr.State.FATAL, "revoked")}
+    assert house.pool() == PoolInfo("watts", 100, 100, 0)
+    with pytest.raises(OverCapacity):
+        house.run("equal", 10, priority=3)
+
+
+def test_what_is_idle_gives_way_to_any_other(house: House) -> None:
+    house.run("spare", 50, priority=-5)
+    house.run("idle", 50).standby()
+    eventually(lambda: None in [info.priority for info in house.system.registrar("budgets").resources()])
+    house.run("lamp", 50, priority=-9)
+    assert house.ended.items == ["idle"]
+
+
+def test_a_priority_that_changes_makes_room(house: House) -> None:
+    heater = house.run("heater", 60, priority=5)
+    oven = house.run("oven", 60, wait_s=60, priority=4, block=False)
+    eventually(lambda: house.pool().waiting == 1)
+    heater.priority = 3
+    assert oven.get(timeout=30).response == "oven"
+    assert house.ended.items == ["heater"]
+
+
+def test_a_load_that_is_withdrawn_waits_no_more(house: House) -> None:
+    house.run("heater", 60)
+    with pytest.raises(rr.LoadTimeout):
+        house.app.load("budgets/share", Share("watts", 50, 600), timeout_s=0.5)
+    assert eventually(lambda: house.pool() == PoolInfo("watts", 100, 60, 0))
+
+
+def test_a_reserve_starts_before_anybody_gives_way_and_stops_when_it_is_not_needed(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, 50.0),)))
+    house.run("heater", 100, priority=1)
+    lamp = house.run("lamp", 50, priority=9)
+    assert house.started.wait() == [50.0]
+    assert house.pool() == PoolInfo("watts", 150, 150, 0)
+    house.respawn()  # perhaps before the start of the reserve was noted: then it is started again
+    assert eventually(lambda: house.pool() == PoolInfo("watts", 150, 150, 0))
+    assert "heater" not in house.ended.items
+    lamp.unload()
+    eventually(lambda: "generator 50" in house.ended.items)
+    assert eventually(lambda: house.pool() == PoolInfo("watts", 100, 100, 0))
+
+
+def test_after_a_reserve_that_fails_others_give_way(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, -1.0),)))
+    house.run("heater", 100, priority=1)
+    house.run("lamp", 50, priority=9)
+    assert house.ended.items == ["heater"]
+
+
+def test_a_reserve_that_is_lost_takes_its_supply_with_it(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, 50.0),)))
+    house.run("heater", 100, priority=1)
+    house.run("lamp", 50, priority=9)
+    eventually(lambda: house.pool().used == 150)
+
+    def loaded() -> list[rr.ResourceInfo]:
+        return [info for info in house.devices.resources() if info.server == "generator" and info.phase == "loaded"]
+
+    (generator,) = eventually(loaded)
+    house.devices.send_status(generator, rr.Status(rr.State.FATAL, "it burns"))
+    eventually(lambda: "heater" in house.ended.items)
+    assert eventually(lambda: house.pool() == PoolInfo("watts", 100, 50, 0))
+
+
+def test_a_capacity_that_falls_sheds_and_one_that_rises_restores_by_priority(house: House) -> None:
+    for name, priority in (("a", 1), ("b", 2), ("c", 3)):
+        house.run(name, 30, priority=priority)
+    house.set_capacity(60)
+    eventually(lambda: house.pool().used == 60)
+    assert house.ended.items == ["a"]
+    again = [house.run(f"{name} again", 30, wait_s=60, priority=p, block=False) for name, p in (("x", 0), ("a", 1))]
+    eventually(lambda: house.pool().waiting == 2)
+    house.set_capacity(100)
+    assert again[1].get(timeout=30).response == "a again"
+    assert house.pool() == PoolInfo("watts", 100, 90, 1)
+    house.set_capacity(120)
+    assert again[0].get(timeout=30).response == "x again"
+
+
+def test_a_manager_that_is_killed_knows_all_shares_and_who_waits(house: House) -> None:
+    house.set_capacity(80)
+    heater = house.run("heater", 60)
+    oven = house.run("oven", 50, wait_s=60, block=False)
+    eventually(lambda: house.pool().waiting == 1)
+    house.respawn()
+    assert eventually(lambda: house.pool() == PoolInfo("watts", 80, 60, 1))
+    with pytest.raises(OverCapacity):
+        house.run("lamp", 30)
+    heater.unload()
+    assert oven.get(timeout=30).response == "oven"
+
+
+def test_a_manager_that_is_killed_while_others_give_way_goes_on_and_takes_no_more(start: Start) -> None:
+    house = House(start, Pool("watts", 100))
+    goes_on, asked = threading.Event(), threading.Event()
+
+    def holds_up(_status: rr.Status) -> None:
+        asked.set()
+        goes_on.wait(60)
+
+    house.run("low", 50, priority=1, on_status=holds_up)
+    house.run("other", 50, priority=2)
+    urgent = house.run("urgent", 50, priority=9, block=False)
+    assert asked.wait(30)
+    house.respawn()
+    assert house.pool().used == 100
+    goes_on.set()
+    assert urgent.get(timeout=30).response == "urgent"
+    assert house.ended.items == ["low"]
+    assert house.pool() == PoolInfo("watts", 100, 100, 0)
+
+
+def test_the_sum_is_within_the_capacity_while_the_manager_is_killed_again_and_again(house: House) -> None:
+    for round in range(5):
+        loads = [house.run(f"{round}.{i}", 30, priority=i, wait_s=1, block=False) for i in range(6)]
+        kill(house.system, "budgets")
+        for load in loads:
+            with contextlib.suppress(OverCapacity):
+                load.get(timeout=60)
+            assert house.pool().used <= 100
+        assert eventually(lambda: len(house.devices.resources()) == house.pool().used / 30)
+
+
+def test_a_file_that_is_wrong_fails_the_start_by_name(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "pools.toml").write_text('[[pool]]\nname = "watts"\ncapcity = 100\n')
+    with pytest.raises(rr.StartFailed, match=r"pools.toml: pool\[0\].capcity: expected one of name, capacity"):
+        start(rr.ChildSpec(Budgets, id="budgets", args=(str(tmp_path / "pools.toml"),)))

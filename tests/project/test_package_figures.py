@@ -1,0 +1,35 @@
+"""What the shell has reached in the counts of `make figures` stays reached."""
+
+from __future__ import annotations
+
+import statistics
+
+from package_figures import function_lengths, imports_up, monitor_entries, passed, private_uses, untyped_hubs
+
+USERS_OBJECTS = {"rr_actors/supervision/hosted.py", "rr_actors/supervision/supervisor.py"}
+"""Where an object of any class is what a user's code made, and not a part of the registrar."""
+
+
+def test_no_room_imports_a_room_above_it() -> None:
+    assert imports_up() == []
+
+
+def test_what_has_the_registrar_knows_its_type() -> None:
+    assert [hub for hub in untyped_hubs() if hub.partition(":")[0] not in USERS_OBJECTS] == []
+
+
+def test_functions_are_as_short_as_they_were() -> None:
+    lengths = function_lengths()
+    assert statistics.median(lengths) <= 7
+    assert lengths[len(lengths) * 9 // 10] <= 18
+
+
+def test_a_load_a_status_and_a_restore_pass_no_more_files_than_they_did() -> None:
+    assert len(monitor_entries("load")) <= 3
+    assert len(passed("load")) <= 40
+    assert len(passed("status")) <= 44
+    assert len(passed("restore")) <= 62
+
+
+def test_no_more_lines_of_tests_use_a_private_attribute() -> None:
+    assert len(private_uses()) <= 139

@@ -1,0 +1,98 @@
+"""Follow a first load, a status and a restore, and print the files that each passes, as JSON.
+
+A load and a status are followed through both processes, a restore as the application sees it. trips() in
+tests/project/package_figures.py runs this, with the sitecustomize.py that lies beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import pykka
+import sitecustomize
+
+import rr_actors as rr
+
+ROOT = f"{Path(rr.__file__).parent.parent}/"
+ACKNOWLEDGED_S = 0.2
+"""A consumer's acknowledgement of a status follows within a few milliseconds; nothing public says when."""
+
+
+class Cameras(rr.Manager):
+    """Serves one kind of resource, and sends a status when the shared byte says so."""
+
+    def on_start(self) -> None:
+        threading.Thread(target=self._send_status, daemon=True).start()
+
+    def _send_status(self) -> None:
+        while not sitecustomize.shared[1]:
+            time.sleep(0.002)
+        sitecustomize.shared[1] = 0
+        self.registrar.send_status(self.registrar.resources()[0].id, rr.Status(rr.State.WARNING, "blurred"))
+
+    @rr.server("camera")
+    def open_camera(self, device: str) -> str:
+        return f"open {device}"
+
+    @open_camera.recover
+    def recover_camera(self, device: str, response: str) -> str:
+        return f"{response} again"
+
+    def entered(self) -> set[tuple[str, str]]:
+        noted = set(sitecustomize.entered)
+        sitecustomize.entered.clear()
+        return noted
+
+
+def _below(noted: set[tuple[str, str]]) -> list[tuple[str, str]]:
+    return sorted((file.removeprefix(ROOT), caller.removeprefix(ROOT)) for file, caller in noted)
+
+
+def _here() -> set[tuple[str, str]]:
+    noted = set(sitecustomize.entered)
+    sitecustomize.entered.clear()
+    return noted
+
+
+def main() -> None:
+    trips: dict[str, list[tuple[str, str]]] = {}
+    heard = threading.Event()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir=Path(folder) / "state") as system,
+    ):
+        app = system.open_registrar("app")
+        for device in ("one", "two", "three"):  # the connection is made, and what each load needs once
+            app.load("cameras/camera", device).unload()
+        cameras: pykka.ActorProxy[Cameras] = system.ref("cameras").proxy()
+        cameras.entered().get()
+
+        sitecustomize.shared[0] = 1
+        query = app.load("cameras/camera", "/dev/video0", on_status=lambda _status: heard.set())
+        sitecustomize.shared[0] = 0
+        trips["load"] = _below(_here() | cameras.entered().get())
+
+        sitecustomize.shared[0] = sitecustomize.shared[1] = 1
+        assert heard.wait(10)
+        time.sleep(ACKNOWLEDGED_S)
+        sitecustomize.shared[0] = 0
+        trips["status"] = _below(_here() | cameras.entered().get())
+
+        heard.clear()
+        child = system.supervisor().which_children()[0]
+        sitecustomize.shared[0] = 1
+        child.ref.kill()
+        assert heard.wait(10)
+        sitecustomize.shared[0] = 0
+        trips["restore"] = _below(_here())
+        query.unload()
+    json.dump(trips, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

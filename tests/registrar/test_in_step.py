@@ -1,0 +1,78 @@
+"""What a registrar does takes for each of many as much as for each of few. Bytecodes and bytes are counted."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.effects import Request
+from rr_actors.registrar.model.messages import Unload, Unloaded
+from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Query, Resource, Row, State, content_of
+from rr_actors.runtime import event_loop
+from support import LIMIT_S, serve
+from support_steps import steps_of
+
+
+def whole_of(parts: int) -> tuple[Catalog, list[Any]]:
+    """Return a catalog whose resource with so many parts has just been unloaded, and the effects of that."""
+    rows: list[Row] = [
+        Peer("parts"),
+        Resource("r", "car", b"", b"", Phase.UNLOADING, State.OK, "", 1),
+        Query("q", "r", "app", "", 1, 1),
+    ]
+    rows += [Held(f"p{n}", "parts", "wheel", b"", b"", f"w{n}", "r", 1, n, Hold.HELD, State.OK) for n in range(parts)]
+    catalog = Catalog("shop", content_of(rows))
+    catalog.up["parts"] = 1
+    decide(catalog, [(c.Register(Server("car"), "event"), None)])
+    return catalog, decide(catalog, [(c.UnloadDone("r", 1), None)]).effects
+
+
+def release_next(catalog: Catalog, effects: list[Any]) -> list[Any]:
+    """Answer the release that was sent, and return the effects of that."""
+    sent = [e.message.query_id for e in effects if isinstance(e, Request) and isinstance(e.message, Unload)]
+    return decide(catalog, [(Unloaded(id), "parts") for id in sent]).effects
+
+
+def test_the_release_of_one_of_many_parts_takes_as_much_as_of_one_of_few() -> None:
+    def cost(parts: int) -> tuple[int, int]:
+        catalog, effects = whole_of(parts)
+        steps, effects = steps_of(lambda: release_next(catalog, effects))
+        tracemalloc.start()
+        try:
+            release_next(catalog, effects)
+            return steps, tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    (few, few_bytes), (many, many_bytes) = cost(10), cost(2_000)
+    assert many <= few * 1.1
+    assert many_bytes <= few_bytes + 4_000, "it copies the ids of the parts"
+
+
+@pytest.mark.parametrize("look", ["stats", "owed", "fetch_state"])
+def test_a_look_at_one_of_many_queries_takes_as_many_steps_as_at_one_of_few(
+    app: rr.Registrar, provider: rr.Registrar, look: str
+) -> None:
+    serve(provider, "thing")
+    newest = app.load_all([("provider/thing", n) for n in range(10)])[-1].id
+
+    async def look_now() -> int:  # on the loop, where the look is
+        arguments = (newest,) if look == "fetch_state" else ()
+        return steps_of(lambda: getattr(app, look)(*arguments))[0]
+
+    def steps() -> int:
+        dispatcher = event_loop.acquire()
+        try:
+            return dispatcher.run(look_now(), LIMIT_S)
+        finally:
+            event_loop.release()
+
+    few = steps()
+    newest = app.load_all([("provider/thing", n) for n in range(10, 1_000)])[-1].id
+    assert steps() <= few * 1.1

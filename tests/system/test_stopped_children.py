@@ -1,0 +1,50 @@
+"""A child that a signal has stopped is named as that in whatever waits for it in vain."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pykka
+import pytest
+
+import rr_actors as rr
+from support import hang, pid_of
+
+STOPPED = r"is stopped by a signal, .*kill -CONT"
+
+
+class Asked(rr.Manager):
+    @rr.server("thing")
+    def load_thing(self, request: str) -> str:
+        return request
+
+    def on_receive(self, message: Any) -> Any:
+        return message
+
+
+@pytest.fixture
+def system(start: Callable[..., rr.System]) -> Iterator[rr.System]:
+    system = start(rr.ChildSpec(Asked, id="asked", heartbeat_s=None))
+    assert system.ref("asked").ask("hello") == "hello"
+    pid = pid_of(system, "asked")
+    hang(pid)
+    yield system
+    os.kill(pid, signal.SIGCONT)
+
+
+def test_an_ask_says_so(system: rr.System) -> None:
+    ref = system.ref("asked")
+    with pytest.raises(pykka.Timeout, match=f"no reply after 0.3 seconds: the reply of root/asked; it {STOPPED}"):
+        ref.ask("hello", timeout=0.3)
+    with pytest.raises(pykka.Timeout, match=f"the reply of root/asked; it {STOPPED}"):
+        ref.ask("hello", block=False).get(timeout=0.3)
+
+
+def test_a_call_of_a_handle_says_so(system: rr.System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rr_actors.registrar.remote_registrar._GRACE_S", 0.1)
+    handle = system.registrar("asked")
+    with pytest.raises(rr.Unavailable, match=rf"registrar 'asked': no answer within 0.3 s; it {STOPPED}"):
+        handle.load("asked/thing", "x", timeout_s=0.3)

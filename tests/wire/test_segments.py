@@ -1,0 +1,338 @@
+"""Large values in shared memory: both ends of a connection, here of one process, and ends that lie."""
+
+from __future__ import annotations
+
+import array
+import errno
+import fcntl
+import gc
+import os
+import pickle
+import resource
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from rr_actors.base import pickling
+from rr_actors.base.errors import MailboxFull, Unavailable
+from rr_actors.wire.segments import PAGE_BYTES, Lie, Parcel, Parcels, Segments
+
+LARGE = pickling.LARGE_BYTES
+
+
+class Box:
+    """Has a buffer that pickle hands out of band, as numpy's arrays do."""
+
+    def __init__(self, data: Any) -> None:
+        self.data = data
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return Box, (pickle.PickleBuffer(self.data),)
+
+    @property
+    def bytes(self) -> bytes:
+        return bytes(self.data)
+
+
+def box(size: int, seed: int = 7) -> Box:
+    return Box(bytearray((index * seed + seed) % 251 for index in range(251)) * (size // 251 + 1))
+
+
+class Ends:
+    """Both ends of a connection."""
+
+    def __init__(self, limit: int | None = 2**24, frame_limit: int = 2**20) -> None:
+        self.segments = Segments(limit, frame_limit)
+        self.here = self.segments.parcels(os.getpid())
+        self.there = Segments(2**24).parcels(os.getpid())
+
+    def pack(self, value: Any) -> bytes | Parcel:
+        packed = self.here.pack(pickling.dumps_large(value, "value"))
+        if isinstance(packed, Parcel):
+            self.fd = packed.fd
+        return packed
+
+    def parcel(self, value: Any) -> Parcel:
+        packed = self.pack(value)
+        assert type(packed) is Parcel
+        return packed
+
+    def send(self, value: Any) -> Any:
+        packed = self.pack(value)
+        return pickling.loads(packed) if isinstance(packed, bytes) else self.there.claim(packed)()
+
+    @property
+    def resident(self) -> int:
+        """The memory that the kernel counts."""
+        return os.fstat(self.fd).st_blocks * 512
+
+    def close(self) -> None:
+        self.here.close()
+        self.there.close()
+
+
+def memfds() -> list[str]:
+    found: list[str] = []
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            found.append(os.readlink(f"/proc/self/fd/{name}"))
+        except OSError:
+            continue
+    return [link for link in found if "memfd:rr_actors" in link]
+
+
+def test_a_buffer_arrives_writable_and_is_the_receivers_own() -> None:
+    ends = Ends()
+    sent = box(300_000)
+    before = sent.bytes
+    arrived = ends.send(sent)
+    sent.data[:] = bytes(len(sent.data))
+    assert arrived.bytes == before
+    view = memoryview(arrived.data)
+    assert not view.readonly
+    view[0] = 1
+    assert sent.data[0] == 0
+    ends.close()
+    assert arrived.bytes[1:] == before[1:]  # after the connection, too
+
+
+@pytest.mark.parametrize("size", [LARGE - 1, LARGE, LARGE + 1, 3 * LARGE + 17])
+def test_every_kind_of_value_arrives_as_it_was_around_the_threshold(size: int) -> None:
+    ends = Ends()
+    data = os.urandom(size)
+    values: list[Any] = [
+        data,
+        bytearray(data),
+        "é" * size,
+        array.array("B", data),
+        {"a": [data, "x", (bytearray(data), list(range(size // 50)))]},
+    ]
+    for value in values:
+        assert ends.send(value) == value
+    for data_of_box in (bytearray(data), array.array("B", data), memoryview(bytearray(data))):
+        assert ends.send(Box(data_of_box)).bytes == data
+    assert ends.send([Box(bytearray(data)), Box(bytearray(data[::-1]))])[1].bytes == data[::-1]
+    ends.close()
+
+
+@pytest.mark.parametrize(("size", "kind"), [(LARGE - 1, bytes), (LARGE, Parcel)])
+def test_a_buffer_of_64_kib_goes_through_a_segment_and_a_shorter_one_does_not(size: int, kind: type) -> None:
+    ends = Ends()
+    overhead = len(pickle.dumps(Box(bytearray()), 5))
+    short = size if kind is Parcel else size - overhead - 100
+    assert type(ends.pack(Box(bytearray(short)))) is kind
+    ends.close()
+
+
+def test_a_read_only_buffer_stays_read_only() -> None:
+    ends = Ends()
+    assert memoryview(ends.send(Box(bytes(LARGE))).data).readonly
+    ends.close()
+
+
+def test_a_slot_is_used_again_when_its_value_is_dropped_and_not_before() -> None:
+    ends = Ends()
+    held = ends.send(box(LARGE))
+    content = held.bytes
+    second = ends.parcel(box(LARGE, 11))
+    third = ends.parcel(box(LARGE, 13))
+    assert held.bytes == content
+    place = second.start
+    ends.there.claim(second)  # not opened: nobody wanted it
+    gc.collect()
+    assert ends.parcel(box(LARGE, 17)).start == place
+    assert ends.there.claim(third)().bytes == box(LARGE, 13).bytes
+    view = memoryview(held.data)[5:9]
+    del held
+    assert ends.parcel(box(LARGE, 19)).start > place  # a part of it is still in use
+    assert bytes(view) == content[5:9]
+    ends.close()
+
+
+def test_thousands_of_values_take_one_descriptor_and_bounded_memory() -> None:
+    ends = Ends(limit=2**22)
+    for number in range(3_000):
+        assert ends.send(box(LARGE, number % 100 + 1)).bytes == box(LARGE, number % 100 + 1).bytes
+    assert ends.resident <= 3 * LARGE
+    assert len(memfds()) <= 3
+    ends.close()
+
+
+def test_free_pages_are_given_back_to_the_machine() -> None:
+    ends = Ends()
+    first, second = ends.send(box(2**20)), ends.send(box(2**20))
+    content = second.bytes
+    assert ends.resident > 2 * 2**20
+    del first
+    ends.segments.give_back()
+    assert ends.resident < 1.1 * 2**20
+    assert second.bytes == content
+    del second
+    assert ends.segments.give_back(PAGE_BYTES) == PAGE_BYTES  # in pieces
+    ends.segments.give_back()
+    assert ends.resident <= PAGE_BYTES
+    assert ends.send(box(2**20)).bytes == box(2**20).bytes
+    ends.close()
+
+
+def test_when_the_segments_are_full_a_value_goes_in_band_or_the_error_says_who_holds_what() -> None:
+    ends = Ends(limit=2**20, frame_limit=2**18)
+    held = [ends.send(box(3 * LARGE)) for _ in range(5)]
+    assert type(ends.pack(box(3 * LARGE))) is bytes
+    with pytest.raises(MailboxFull, match="segments_limit_bytes") as caught:
+        ends.pack(box(2**19))
+    assert str(os.getpid()) in str(caught.value)
+    held.clear()
+    assert type(ends.pack(box(2**19))) is Parcel
+    ends.close()
+
+
+def test_the_limit_holds_for_all_connections_together() -> None:
+    ends = Ends(limit=2**20)
+    other = ends.segments.parcels(os.getpid())
+    held = ends.send(box(2**19))
+    assert type(other.pack(pickling.dumps_large(box(2**19 + 2**18), "value"))) is bytes
+    del held
+    assert type(other.pack(pickling.dumps_large(box(2**19 + 2**18), "value"))) is Parcel
+    ends.close()
+    other.close()
+
+
+def test_without_memfd_create_values_go_in_band(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "memfd_create")
+    ends = Ends()
+    assert ends.send(box(2**18)).bytes == box(2**18).bytes
+    assert type(ends.pack(box(2**18))) is bytes
+
+
+@pytest.mark.parametrize("code", [errno.EMFILE, errno.ENOMEM, errno.ENFILE, errno.ENOSYS])
+def test_when_memfd_create_fails_a_value_goes_in_band_or_the_error_names_what_is_wanting(
+    monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    def fail(*_: Any) -> int:
+        raise OSError(code, os.strerror(code))
+
+    ends = Ends()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "memfd_create", fail)
+        assert ends.send(box(2**18)).bytes == box(2**18).bytes
+        if code != errno.ENOSYS:
+            with pytest.raises(Unavailable, match=errno.errorcode[code]):
+                ends.pack(box(2**21))
+    assert type(ends.pack(box(2**18))) is Parcel  # it may be possible later
+    ends.close()
+
+
+def test_when_the_machine_has_no_memory_for_a_slot_the_value_goes_in_band(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, "full")
+
+    ends = Ends()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", fail)
+        assert type(ends.pack(box(2**18))) is bytes
+    assert ends.send(box(2**18)).bytes == box(2**18).bytes
+    ends.close()
+
+
+def test_a_receiver_without_descriptors_gets_an_error_that_says_so() -> None:
+    ends = Ends()
+    parcel = ends.parcel(box(2**18))
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest = os.dup(0)
+    os.close(lowest)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, hard))
+    try:
+        opens = ends.there.claim(parcel)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    with pytest.raises(Unavailable, match="EMFILE"):
+        opens()
+    assert ends.there.claim(parcel)().bytes == box(2**18).bytes
+    ends.close()
+
+
+def test_a_process_whose_id_is_not_known_gets_values_in_band() -> None:
+    for pid in (0, None):
+        nobody = Segments().parcels(pid)
+        assert type(nobody.pack(pickling.dumps_large(box(2**18), "value"))) is bytes
+
+
+# -- ends that lie -----------------------------------------------------------------------------------------------------
+
+
+def lies(true: Parcel) -> list[Parcel]:
+    size = true.segment_bytes
+    changed = msgspec.structs.replace
+    return [
+        changed(true, key=true.key ^ 1),
+        changed(true, segment_bytes=size - PAGE_BYTES),
+        changed(true, segment_bytes=2**62),
+        changed(true, start=0),
+        changed(true, start=-PAGE_BYTES),
+        changed(true, start=size - 64),
+        changed(true, start=2**62),
+        changed(true, lengths=()),
+        changed(true, lengths=(-1,)),
+        changed(true, lengths=(size,)),
+        changed(true, lengths=(2**63 - 1, 2**63 - 1)),
+        changed(true, lengths=(true.lengths[0], -5, *true.lengths[1:])),
+        changed(true, slot=0),
+        changed(true, slot=-1),
+        changed(true, slot=PAGE_BYTES),
+        changed(true, slot=true.slot + 1),
+    ]
+
+
+@pytest.mark.parametrize("number", range(16))
+@pytest.mark.parametrize("mapped", [False, True])
+def test_a_parcel_that_cannot_be_true_is_a_lie(number: int, mapped: bool) -> None:
+    ends = Ends()
+    if mapped:
+        ends.send(box(2**18))
+    parcel = ends.parcel(box(2**18))
+    with pytest.raises(Lie):
+        ends.there.claim(lies(parcel)[number])
+    ends.close()
+
+
+def test_what_is_no_sealed_segment_is_not_mapped(tmp_path: Path) -> None:
+    ends = Ends()
+    true = ends.parcel(box(2**18))
+    file = tmp_path / "file"
+    file.write_bytes(bytes(true.segment_bytes))
+    read, write = os.pipe()
+    unsealed = os.memfd_create("rr_actors_unsealed", os.MFD_ALLOW_SEALING)
+    os.ftruncate(unsealed, true.segment_bytes)
+    with file.open("r+b") as opened:
+        for fd in (opened.fileno(), read, unsealed):
+            with pytest.raises(Lie):
+                ends.there.claim(msgspec.structs.replace(true, fd=fd))
+    for fd in (read, write, unsealed):
+        os.close(fd)
+    ends.close()
+
+
+def test_a_segment_cannot_be_made_shorter() -> None:
+    ends = Ends()
+    ends.parcel(box(2**18))
+    assert fcntl.fcntl(ends.fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK
+    with pytest.raises(PermissionError):
+        os.ftruncate(ends.fd, PAGE_BYTES)
+    ends.close()
+
+
+def test_nothing_is_left_when_both_ends_are_closed_and_the_values_dropped() -> None:
+    gc.collect()
+    before = memfds()
+    ends = Ends()
+    values = [ends.send(box(2**18)) for _ in range(5)]
+    assert len(memfds()) > len(before)
+    ends.close()
+    del values
+    gc.collect()
+    assert memfds() == before
+    closed: Parcels = ends.here
+    assert type(closed.pack(pickling.dumps_large(box(2**18), "value"))) is bytes
