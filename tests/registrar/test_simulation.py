@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import random
-import time
 from typing import Any
 
 import pytest
@@ -35,7 +32,6 @@ from simulation.sim_registrar import SimRegistrar
 from support_directed import DIRECTED_WORLDS
 from support_mutations import DIRECTED, MUTATIONS
 
-BUDGET_S = float(os.environ.get("RR_ACTORS_SIMULATE_S", "8"))
 WORLDS_FOR_A_MUTATION = 1500
 
 # Every one of these once broke a promise; the commit that made it keep it says which.
@@ -80,6 +76,7 @@ SEEDS_THAT_FAILED = (
     *(700000000003440, 700000000008059, 710000000021883, 720000000013046, 720000000047468, 720000000049692),
     *(720000000076682, 720000000103535, 658211668766320, 282525437366615, 282188443193118),
     *(281796104698359, 1814140422246228, 2124356231658425, 3000000000000695),
+    *(4603599627393736, 4703599627428769, 5203599627440150, 5603599627375579, 5803599627417252),
 )
 
 
@@ -120,18 +117,6 @@ def test_a_seed_that_once_failed_keeps_every_promise(seed: int) -> None:
 @pytest.mark.parametrize(("seed", "steps"), LONG_SEEDS_THAT_FAILED)
 def test_a_long_history_that_once_failed_keeps_every_promise(seed: int, steps: int) -> None:
     assert_kept(run(seed, steps))
-
-
-@pytest.mark.slow
-def test_fresh_seeds_keep_every_promise() -> None:
-    first = random.SystemRandom().randrange(IDLE_FIRST, 2 * IDLE_FIRST)
-    print(f"fresh seeds from {first} on; python -m simulation --seed {first} runs them again")
-    until = time.monotonic() + BUDGET_S
-    seed = first
-    while time.monotonic() < until:
-        assert_kept(run(seed))
-        seed += 1
-    assert seed - first > 50
 
 
 def test_lists_that_are_compared_in_many_spans_keep_every_promise(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,6 +63,7 @@ class Ledger:
         self.said: set[str] = set()  # events that status callbacks have said of their own resources
         self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
         self.heard: set[tuple[str, str]] = set()  # and it was dealt with
+        self.about: dict[str, str] = {}  # notice -> its resource
         self.losses: set[str] = set()  # queries whose holders heard that they are gone
         self.revoked: set[str] = set()  # queries whose holders heard that they are to let them go
         self.given_up_parts: set[tuple[str, str]] = set()  # a whole, and the revoked resource that it was to let go

@@ -406,7 +406,10 @@ def let_go(world: World) -> None:
         for query_id in registrar.holds():
             world.apply(("unload", registrar.name, query_id))
     finish(world)
-    for _ in range(8):  # what lingers may hold what lingers
+    levels = sum(len(registrar.catalog.resources) for registrar in world.live())
+    for _ in range(8 + 2 * levels):  # what lingers may hold what lingers, and each is paused, then unloaded
+        if not any(registrar.catalog.resources for registrar in world.live()):
+            break
         for registrar in world.live():
             for timer in list(registrar.timers):
                 world.apply(("timer", registrar.name, timer))

@@ -111,10 +111,20 @@ def _hear(shell: SimShell, effect: e.Hear) -> None:
 
 
 def _check_window(shell: SimShell, effect: e.Hear) -> None:
-    """Of one query no more statuses wait at its holder than its provider may have on their way."""
+    """Of one query no more statuses wait at its holder than its provider may have on their way.
+
+    They count for each resource: a provider that has lost a query, and gets its Load again, drops what it has sent of
+    the resource before.
+    """
     hearing = shell.catalog.hearing.items()  # its holder itself says that it is lost, if there is no provider
-    deleted = shell.world.ledger.deleted
-    waiting = sum(bool(it.provider) and id.endswith(f":{effect.held.id}") and id not in deleted for id, it in hearing)
+    deleted, about = shell.world.ledger.deleted, shell.world.ledger.about
+    about[effect.notice.id] = effect.notice.resource_id
+    alike = {
+        id
+        for id, it in hearing
+        if it.provider and id.endswith(f":{effect.held.id}") and about.get(id) == about[effect.notice.id]
+    }
+    waiting = len(alike - deleted)
     window = shell.world.registrars[effect.held.registrar].catalog.window
     if waiting > window:
         raise Violation("bounds", f"{waiting} statuses of {effect.held.id} wait at {shell.name}: more than {window}")

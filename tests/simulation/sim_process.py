@@ -342,10 +342,9 @@ class SimShell:
         ledger = self.world.ledger
         if failure is None:
             provider = self.world.registrars[ledger.provider[query_id]]
-            on_disk = (
-                query_id in provider.disk["queries"] or query_id in ledger.taken or provider.name in self.world.left
-            )
-            ledger.loaded(query_id, on_disk)
+            # A revoked query may have been taken, or released by its holder, before the thread's own line answers.
+            ended = query_id in ledger.taken or query_id in ledger.revoked or provider.name in self.world.left
+            ledger.loaded(query_id, ended or query_id in provider.disk["queries"])
         else:
             ledger.failed(query_id)
         if run is not None:

@@ -288,6 +288,7 @@ def end_query(decision: Decision, held_id: str, provider: str) -> None:
             decision.cause(LoadResolved(held, failure))
         end_direct(decision, held_id)
         decision.forget(catalog.kept, held_id)
+        decision.forget(catalog.unsent, held_id)
         if doubted:
             decision.put(replace(held, hold=Hold.OWED, resource_id=""))
             request(decision, held.registrar, Unload(held_id, catalog.name))

@@ -26,6 +26,7 @@ from rr_actors.registrar.model.rows import (
     QUEUED,
     RESTING,
     STANDBY,
+    UNLOAD_FAILED,
     TABLE_OF,
     UNLOADING,
     CallbackRun,
@@ -311,10 +312,12 @@ class Catalog:
     def inherited(self, resource_id: str) -> int:
         """Return the priority that the parts of a resource inherit.
 
-        A resource that its server pauses needs its parts until it is paused, and before it is resumed.
+        A resource that its server pauses needs its parts until it is paused, and before it is resumed. One that could
+        not be unloaded is not paused any more: its server may go and come back, and that changes nothing.
         """
         priority = min(self.priority_of(resource_id), self.max_priority)
-        if priority <= STANDBY and (row := self.resources.get(resource_id)) and row.phase is not PAUSED:
+        row = self.resources.get(resource_id) if priority <= STANDBY else None
+        if row is not None and row.phase not in (PAUSED, UNLOAD_FAILED):
             server = self.servers.get(row.server)
             return LOWEST if server is not None and server.pauses else priority
         return priority
