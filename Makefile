@@ -92,7 +92,7 @@ fuzz-quick: $(STAMP)
 	$(BIN)/python tests/support_interrupts.py --most 40 --together 20 --only "load here" "ask far" queries
 	$(BIN)/python tests/support_interrupts.py --most 40 --together 20 --raising Exception --only "load here" "tell near"
 	$(BIN)/python -m rr_actors.testing --kills 3 --seconds 4
-	cd tests && ../$(BIN)/python -m simulation --seconds 3
+	cd tests && ../$(BIN)/python -m simulation 300 --seed 4503599627375496
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.run $(ARGS)
