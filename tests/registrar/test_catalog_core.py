@@ -1280,6 +1280,20 @@ def test_a_status_callback_that_runs_while_its_server_is_registered_anew_is_not_
     assert registrar.catalog.own_notices == {}
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_who_releases_a_resource_whose_server_is_missing_hears_how_the_unload_ends_later(fails: bool) -> None:
+    registrar = provider("loaded").again()
+    registrar.decide(Fetch("app", True))
+    registrar.decide(Unload("q", "app"))
+    assert [(type(reply), reply.failure.kind) for reply in registrar.replies] == [(UnloadRefused, "Unavailable")]
+
+    registrar.obey(c.Register(Server("cam"), "event"))
+    tries = registrar.catalog.resources["q"].tries
+    registrar.obey(c.UnloadErred("q", tries, FAILURE) if fails else c.UnloadDone("q", tries))
+    assert registrar.replies == [UnloadRefused("q", FAILURE) if fails else Unloaded("q")]
+    assert registrar.catalog.unanswered == {}
+
+
 @pytest.mark.parametrize("phase", ["queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering"])
 def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
     registrar = provider(phase, has_status=True)

@@ -83,8 +83,7 @@ def _release(decision: Decision, query: Query) -> None:
         decision.note(catalog.unanswered, query.id, True)  # answered when the resource is gone, and the query with it
         if not again:
             run_unload(decision, resource)
-        if resource.server not in catalog.servers:  # the release stays owed
-            decision.forget(catalog.unanswered, query.id)
+        if resource.server not in catalog.servers:  # the release stays owed, and its end is answered, too
             decision.cause(Reply(query.origin, UnloadRefused(query.id, failures.serverless(catalog, resource))))
         return
     drop_query(decision, query)
