@@ -77,6 +77,7 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
     from rr_actors.registrar.engine.status import Status
     from rr_actors.registrar.load_groups import Queries
     from rr_actors.registrar.manager import Manager, ref
+    from rr_actors.registrar.model.health import Health
     from rr_actors.registrar.model.rows import State
     from rr_actors.registrar.queries import Query, ResourceInfo
     from rr_actors.registrar.registrar import Registrar
@@ -131,6 +132,7 @@ __all__ = [
     "Event",
     "ExitReport",
     "Frame",
+    "Health",
     "InvalidName",
     "InvalidRequest",
     "InvalidResponse",

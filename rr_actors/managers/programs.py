@@ -26,7 +26,7 @@ from rr_actors.base.errors import InvalidRequest, RrError, shown, text_of
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.server import ServerSpec, checked_pauses, checked_spec, current
+from rr_actors.registrar.engine.server import ServerSpec, checked_spec, checked_whole, current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State
@@ -166,7 +166,7 @@ class Programs(Manager):
     def _adapted(self, spec: ServerSpec) -> ServerSpec:
         pauses = self._idleness["idle"] == "pause"
         unused = {} if pauses else {"pause": None, "resume": None}
-        return checked_pauses(checked_spec(replace(spec, **self._idleness, **unused)))
+        return checked_whole(checked_spec(replace(spec, **self._idleness, **unused)))
 
     @property
     def _external(self) -> ExternalPrograms:

@@ -17,9 +17,10 @@ from rr_actors.registrar.engine.server import (
     ROLES,
     ServerSpec,
     checked_callback,
-    checked_pauses,
     checked_spec,
+    checked_whole,
 )
+from rr_actors.registrar.model.health import Health
 from rr_actors.wire.name_service import Directory, Presence, registrar_key
 
 Request = TypeVar("Request")
@@ -37,8 +38,8 @@ class server:  # noqa: N801 - used as a decorator
         @load_camera.unload
         def close_camera(self, request: OpenCamera, response: Feed) -> None: ...
 
-    ``status``, ``recover``, ``upgrade``, ``usage``, ``pause`` and ``resume`` work in the same way. A method with
-    several parameters, or none, takes the fields of the request, as ``def load_range(self, name: str, rate: float)``.
+    ``status``, ``recover``, ``upgrade``, ``usage``, ``health``, ``pause`` and ``resume`` work in the same way. A method
+    with several parameters, or none, takes the fields of the request: ``def load_range(self, name: str, rate: float)``.
     The options are those of Registrar.register_server().
     ``Cameras.load_camera`` then names the server in Registrar.load().
 
@@ -56,6 +57,7 @@ class server:  # noqa: N801 - used as a decorator
         recovery: Literal["keep", "reload", "lost"] | None = None,
         idle: Literal["unload", "pause"] = "unload",
         paused_s: float | None = None,
+        health: Health | None = None,
         request_type: Any = None,
         response_type: Any = None,
     ) -> None:
@@ -64,7 +66,8 @@ class server:  # noqa: N801 - used as a decorator
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
         callbacks, types = (_nothing, None, None, None), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
-        self._spec = checked_spec(ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s))
+        spec = ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s, health=health)
+        self._spec = checked_spec(spec)
 
     # The first overload that fits is meant: two parameters, of which one may have a default; one; any number.
     @overload
@@ -156,6 +159,13 @@ class Declared(Generic[Request, Returned, Response]):
         """
         return self._take("usage", callback)
 
+    def health(self, callback: F) -> F:
+        """Declare a method that says how well a resource is: ``(self, request, response)``. For health=rr.Health(...).
+
+        It returns None (well), a State, or a Status with a text; or it raises. See docs/planning.md, "Health".
+        """
+        return self._take("probe", callback)
+
     def pause(self, callback: F) -> F:
         """Declare a method that pauses an idle resource: ``(self, request, response)``. For idle="pause"."""
         return self._take("pause", callback)
@@ -196,7 +206,7 @@ class Declared(Generic[Request, Returned, Response]):
     def _spec_for(self, manager: object) -> ServerSpec:
         """Return the spec of one manager's server. Its callbacks are bound; a subclass may override all but `load`."""
         roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
-        return checked_pauses(checked_spec(replace(self._spec, load=functools.partial(self._load, manager), **roles)))
+        return checked_whole(checked_spec(replace(self._spec, load=functools.partial(self._load, manager), **roles)))
 
     def _id_in(self, directory: Directory) -> str:
         """Return "registrar/server". The registrar is that of the one child of the system that has the declaring class.

@@ -58,8 +58,8 @@ from rr_actors.registrar.engine.server import (
     Usages,
     check_not_measuring,
     check_not_own,
-    checked_pauses,
     checked_spec,
+    checked_whole,
     current_or_none,
     log_unread_types,
     serving,
@@ -70,6 +70,7 @@ from rr_actors.registrar.load_groups import Group, GroupWays, LoadWanted, Querie
 from rr_actors.registrar.loads import CALL_TIMEOUT_S, Calls, Loads, LoadWays, Unloads, UnloadWays, settle
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.health import Health
 from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import (
     STANDBY,
@@ -553,6 +554,8 @@ class Registrar(Consumer):
         paused_s: float | None = None,
         pause: Callable[..., Any] | None = None,
         resume: Callable[..., Any] | None = None,
+        health: Health | None = None,
+        probe: Callable[..., Any] | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
@@ -590,6 +593,10 @@ class Registrar(Consumer):
                 idle="pause".
             resume: ``resume(request, response)`` runs when the resource is needed again, and may return a new response.
                 Default: None. Give one with idle="pause".
+            health: how often `probe` runs, and what follows from what it finds. Default: None, never. Give one where a
+                resource may fail without anybody noticing.
+            probe: ``probe(request, response)`` says how well a loaded resource is: it returns None (well), a State or a
+                Status, or it raises. Default: None. Give one with `health`.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -599,10 +606,9 @@ class Registrar(Consumer):
         """
         callbacks, types = (load, unload, status, recover), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
-        spec = ServerSpec(
-            name, *callbacks, *types, *limits, usage=usage, idle=idle, paused_s=paused_s, pause=pause, resume=resume
-        )
-        spec = checked_pauses(checked_spec(spec))
+        spec = ServerSpec(name, *callbacks, *types, *limits, usage=usage, idle=idle, paused_s=paused_s)
+        spec = replace(spec, pause=pause, resume=resume, health=health, probe=probe)
+        spec = checked_whole(checked_spec(spec))
         self._register_spec(spec)
 
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Time limits: the check of a user's limit, waits with a limit, and one timer for many limits."""
+"""Time limits: the check of a user's limit, waits with a limit, one timer for many limits, and probes with a limit."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import asyncio
 import itertools
 import math
 import time
-from collections.abc import Callable
+from asyncio import AbstractEventLoop, TimerHandle
+from collections import deque
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import msgspec
+
 from rr_actors.base.errors import UsageError, exact_number, is_a, shown
+from rr_actors.runtime.thread_rules import any_thread, on_loop
 
 _LONGEST_S = 2_000_000  # 23 days
 _SLICE_S = 0.25  # the longest wait before the clock is read again,
@@ -97,3 +102,148 @@ class TimeLimits:
             self._timers[limit_s] = self._loop.call_at(next(iter(calls.values())), self._look, limit_s)
         else:
             del self._calls[limit_s], self._timers[limit_s]
+
+
+# -- callbacks in rounds, each with a limit ----------------------------------------------------------------------------
+#
+# A round has all keys of that moment. Its probes are spread over the period, so 10,000 keys do not wake all threads at
+# once. Of one key no two probes run at the same time: one that hangs is not started again until it has returned.
+
+_PART_S = 0.05  # between the parts of a round
+_FEW = 8  # probes that begin together, without being spread
+_SOON_S = 0.005
+
+
+class Probe(msgspec.Struct, eq=False):
+    """One run of a callback.
+
+    Attributes:
+        began: when the callback began; None while it waits for a thread. Another thread sets it.
+        late_at: when the callback was last found late; None: it is not late.
+        after: what waits until it has returned, or is late.
+    """
+
+    began: float | None = None
+    late_at: float | None = None
+    after: list[Callable[[], None]] = msgspec.field(default_factory=list[Callable[[], None]])
+
+
+@on_loop
+class Probes:
+    """The probes of the resources of one server.
+
+    Args:
+        every_s: the length of a period.
+        timeout_s: the time limit of a callback.
+        keys: returns the keys of the next round.
+        start: starts the callbacks of keys. Each calls begins(), and ended() is called on the loop for each.
+        late: called for a key whose callback is late, and in each later round in which it has not returned.
+    """
+
+    def __init__(
+        self,
+        loop: AbstractEventLoop,
+        every_s: float,
+        timeout_s: float,
+        keys: Callable[[], Sequence[str]],
+        start: Callable[[Sequence[str]], None],
+        late: Callable[[str], None],
+    ) -> None:
+        self._loop = loop
+        self._every_s, self._timeout_s = every_s, timeout_s
+        self._keys, self._start, self._late = keys, start, late
+        self._running: dict[str, Probe] = {}
+        self._left: deque[str] = deque()
+        self._size = 0  # keys of this round
+        self._round_began = -math.inf
+        self._timer: TimerHandle | None = None
+        self._closed = False
+
+    def open(self) -> None:
+        """Begin the first round."""
+        self._tick()
+
+    def close(self) -> None:
+        """Begin no more probes. What waits for one goes on."""
+        self._closed = True
+        if self._timer is not None:
+            self._timer.cancel()
+        for probe in list(self._running.values()):
+            _go_on(probe)
+
+    # -- one probe ---------------------------------------------------------------------------------------------------
+
+    @any_thread
+    def begins(self, key: str, may_begin: Callable[[str], bool]) -> bool:
+        """Note that a callback begins now, and return whether it may. In the thread that runs it."""
+        probe = self._running[key]
+        probe.began = time.monotonic()  # before the question: after a "no", when_free() need not wait
+        if may_begin(key):
+            return True
+        probe.began = None
+        return False
+
+    def ended(self, key: str) -> bool:
+        """Note that a callback has returned; return whether its result counts: it had begun, and is not late."""
+        probe = self._running.pop(key)
+        _go_on(probe)
+        return probe.began is not None and probe.late_at is None and not self._closed
+
+    def when_free(self, key: str, action: Callable[[], None]) -> None:
+        """Call `action` when no callback of the key runs any more; or when the one that runs is late."""
+        probe = self._running.get(key)
+        if probe is None or probe.began is None or probe.late_at is not None or self._closed:
+            action()
+        else:
+            probe.after.append(action)
+
+    # -- rounds ------------------------------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        if self._closed:
+            return
+        now = time.monotonic()
+        self._end_late(now)
+        if not self._left and now >= self._round_began + self._every_s:
+            self._left = deque(self._keys())
+            self._size, self._round_began = len(self._left), now
+        self._probe(self._due(now), now)
+        self._timer = self._loop.call_later(max(self._next_at(now) - now, _SOON_S), self._tick)
+
+    def _due(self, now: float) -> list[str]:
+        """Take the next keys out of the round: as many as belong into the part of the period that is over."""
+        part = 1.0 if self._size <= _FEW else (now - self._round_began + _PART_S) / self._every_s
+        due = len(self._left) - math.floor(self._size * (1 - min(part, 1.0)))
+        return [self._left.popleft() for _ in range(due)]
+
+    def _probe(self, keys: list[str], now: float) -> None:
+        free = [key for key in keys if key not in self._running]
+        if len(free) < len(keys):
+            for key in set(keys) - set(free):
+                self._still_late(key, self._running[key], now)
+        if free:
+            self._running.update((key, Probe()) for key in free)
+            self._start(free)
+
+    def _end_late(self, now: float) -> None:
+        for key, probe in list(self._running.items()):
+            if probe.late_at is None and probe.began is not None and now - probe.began >= self._timeout_s:
+                probe.late_at = now
+                self._late(key)
+                _go_on(probe)
+
+    def _still_late(self, key: str, probe: Probe, now: float) -> None:
+        if probe.late_at is not None and now - probe.late_at >= self._every_s / 2:  # else this round has counted it
+            probe.late_at = now
+            self._late(key)
+
+    def _next_at(self, now: float) -> float:
+        round_at = now + _PART_S if self._left else self._round_began + self._every_s
+        limits = (probe.began or now for probe in self._running.values() if probe.late_at is None)
+        return min(round_at, min(limits, default=math.inf) + self._timeout_s)
+
+
+def _go_on(probe: Probe) -> None:
+    actions, probe.after = probe.after, []
+    for action in actions:
+        action()

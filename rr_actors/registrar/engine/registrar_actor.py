@@ -118,7 +118,7 @@ class RegistrarActor(RegistrarBase):
             return
         self.closed = True
         steps = Steps()
-        for part in (self.monitor, self.consumers, *self.clients.values()):
+        for part in (self.monitor, self.servers, self.consumers, *self.clients.values()):
             steps.take(f"closing its {type(part).__name__}", part.close)
         steps.take("closing its streams", self.publishers.close_all)
         down = self.down()

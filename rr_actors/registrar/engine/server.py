@@ -10,9 +10,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
+import time
 import typing
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextvars import ContextVar
 from typing import Any, NoReturn, cast
@@ -49,10 +50,11 @@ from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.fields import by_fields, field_names, fields_type
 from rr_actors.registrar.engine.monitor import RegistrarBase
 from rr_actors.registrar.engine.progress import checked
-from rr_actors.registrar.engine.status import status_of
+from rr_actors.registrar.engine.status import Status, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
+from rr_actors.registrar.model.health import WELL, Counts, Found, Health, first_counts, judged
 from rr_actors.registrar.model.messages import Described, Load
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -64,9 +66,11 @@ from rr_actors.registrar.model.rows import (
     Notice,
     Phase,
     Resource,
+    State,
 )
 from rr_actors.runtime.callback_errors import Raised, described, log_raised, traceback_of
 from rr_actors.runtime.thread_rules import on_loop, with_lock
+from rr_actors.runtime.time_limits import Probes
 from rr_actors.runtime.user_loop import Done, closing, is_coroutine
 from rr_actors.runtime.workers import is_async
 
@@ -97,9 +101,10 @@ STATUS = Role("status", ("request", "status"), in_order=True)
 RECOVER = Role("recover", ("request", "response"), LOADED, reports=True, patient=True)
 UPGRADE = Role("upgrade", ("request", "response"))
 USAGE = Role("usage", ("request", "response"), patient=True)
+PROBE = Role("probe", ("request", "response"), patient=True)
 PAUSE = Role("pause", ("request", "response"), PAUSING, patient=True)
 RESUME = Role("resume", ("request", "response"), RESUMING, patient=True)
-ROLES = {role.name: role for role in (LOAD, UNLOAD, STATUS, RECOVER, UPGRADE, USAGE, PAUSE, RESUME)}
+ROLES = {role.name: role for role in (LOAD, UNLOAD, STATUS, RECOVER, UPGRADE, USAGE, PROBE, PAUSE, RESUME)}
 
 
 class Current(msgspec.Struct, frozen=True):
@@ -256,6 +261,7 @@ _TOO_GREAT = 2**63  # as a console's answer has room for
 RECOVER_S = 30.0
 """How long a recover callback may take, if its server says nothing else."""
 
+_NO_HEALTH = Health()
 _ROW_BYTES = 1024  # room for the names and ids that are sent with a request, a response, or types
 
 
@@ -279,6 +285,8 @@ class ServerSpec(msgspec.Struct, frozen=True):
     paused_s: float | None = None
     pause: Callback | None = None
     resume: Callback | None = None
+    health: Health | None = None
+    probe: Callback | None = None
 
 
 class Usages(dict[str, dict[str, float]]):
@@ -335,8 +343,13 @@ class ServerActor:
             USAGE: self._described(USAGE, both, self._numbers),
             PAUSE: self._described(PAUSE, both, _nothing),
             RESUME: self._described(RESUME, both, self._new_response),
+            PROBE: self._described(PROBE, self._probe_arguments, self._found),
         }
         self._measuring: dict[str, Future[Measured]] = {}
+        health = spec.health or _NO_HEALTH
+        loop, rounds = registrar.node.dispatcher.loop, (health.every_s, health.timeout_s)
+        self.probes = Probes(loop, *rounds, self._probed, self._probe, self._probe_late)
+        self._health, self._counts = health, dict[str, Counts]()  # by resource
 
     def _described(
         self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
@@ -484,7 +497,8 @@ class ServerActor:
             return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
 
         done = functools.partial(self._unload_ended, resource)
-        self._submit(UNLOAD, resource, resource.tries, done, at_once=at_once)
+        start = functools.partial(self._submit, UNLOAD, resource, resource.tries, done, at_once=at_once)
+        self.probes.when_free(resource.id, start)
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:
@@ -524,7 +538,8 @@ class ServerActor:
     @on_loop
     def start_pause(self, resource: Resource) -> None:
         """Run the pause callback."""
-        self._submit(PAUSE, resource, resource.attempt, functools.partial(self._pause_ended, resource))
+        done = functools.partial(self._pause_ended, resource)
+        self.probes.when_free(resource.id, functools.partial(self._submit, PAUSE, resource, resource.attempt, done))
 
     def _pause_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:
@@ -604,6 +619,73 @@ class ServerActor:
                 text = f"expected {expected}, got {shown(number)} ({type(number).__name__}) as {shown(name)}"
                 raise InvalidResponse(text, server=self.origin, path=shown(name), expected=expected)
         return {name: number + 0 for name, number in numbers.items()}  # of the plain types: they travel
+
+    # -- health --------------------------------------------------------------------------------------------------
+
+    @on_loop
+    def _probed(self) -> list[str]:
+        """Return the resources of the next round, and forget the results of the others."""
+        with self.registrar.lock:
+            ids = list(self.registrar.whole().by_server.get(self.spec.name, ()))
+        ids = [id for id in ids if self._is_probed(id)]
+        self._counts = {id: counts for id in ids if (counts := self._counts.get(id)) is not None}
+        return ids
+
+    def _is_probed(self, resource_id: str) -> bool:
+        catalog = self.registrar.catalog
+        resource = catalog.resources.get(resource_id)
+        lives = resource is not None and resource.phase is LOADED and resource.state is not State.FATAL
+        return lives and resource_id not in catalog.recovering and resource_id not in catalog.revocations
+
+    @on_loop
+    def _probe(self, ids: Sequence[str]) -> None:
+        """Have the health callback run for each of these resources."""
+        self.registrar.workers.threads.gather()
+        try:
+            for id in ids:
+                resource = self.registrar.catalog.resources.get(id)
+                if resource is None:
+                    self.probes.ended(id)
+                else:
+                    self._submit(PROBE, resource, resource.attempt, functools.partial(self._probe_ended, id))
+        finally:
+            self.registrar.workers.threads.go()
+
+    def _probe_arguments(self, resource: Resource) -> tuple[Any, Any]:
+        if not self.probes.begins(resource.id, self._is_probed):
+            raise Unavailable(f"{self.origin}: resource {resource.id} is not probed now")
+        return self._request_and_response_of(resource)
+
+    def _found(self, answer: object) -> Found:
+        if answer is None:
+            return WELL
+        status = answer if is_a(answer, Status) else None
+        state = answer if status is None else status.state
+        if not is_a(state, State) or state is State.UPDATE:
+            expected = "None, or the State OK, WARNING, ERROR or FATAL, or a Status with one"
+            text = f"expected {expected}, got {shown(answer)} ({type(answer).__name__})"
+            raise InvalidResponse(text, server=self.origin, path="", expected=expected)
+        return Found(State(state), "" if status is None else status.message)
+
+    def _probe_ended(self, resource_id: str, found: Found | None, error: BaseException | None) -> None:
+        if self.probes.ended(resource_id):
+            self._judge(resource_id, found or Found(State.ERROR, "" if error is None else _text_of(error)), error)
+
+    def _probe_late(self, resource_id: str) -> None:
+        self._judge(resource_id, Found(State.ERROR, f"not returned within {self._health.timeout_s:g} s"))
+
+    def _judge(self, resource_id: str, found: Found, error: BaseException | None = None) -> None:
+        """Count a result, and set the status of the resource if its state changes by that."""
+        if self.registrar.closed or not self._is_probed(resource_id):
+            return
+        counts = self._counts.get(resource_id) or first_counts(self.registrar.catalog.resources[resource_id].state)
+        self._counts[resource_id], state = judged(self._health, counts, found, time.monotonic())
+        if state is None:
+            return
+        text = readable(f"health: {found.message or found.state}")
+        if error is not None:
+            log_raised(logger, error, "%s: %s; resource %s has the state %s", self.origin, text, resource_id, state)
+        self.registrar.post(c.SetStatus(resource_id, new_id(), state, text, _nothing))
 
     # -- how callbacks run ---------------------------------------------------------------------------------------
 
@@ -741,11 +823,21 @@ class Servers:
             text = f"server {server.origin}: registered already; unregister it first, or take another name"
             raise NameTaken(text, name=name)
         self._by_name[name] = server
+        if old is not None:
+            old.probes.close()
         self._consumers.tell_all(Described(name, server.facts.types))
         if old is None:
             registrar.post(c.Register(server.facts, new_id(), reread, server.digest))
         else:
             registrar.catalog.servers[name] = server.facts
+        if server.spec.health is not None:
+            server.probes.open()
+
+    @on_loop
+    def close(self) -> None:
+        """Probe nothing more."""
+        for server in self._by_name.values():
+            server.probes.close()
 
     @on_loop
     def register_again(self) -> None:
@@ -759,8 +851,8 @@ class Servers:
         registrar = self._registrar
 
         def ended(error: RrError | None) -> None:
-            if name not in registrar.catalog.servers:
-                self._by_name.pop(name, None)
+            if name not in registrar.catalog.servers and (server := self._by_name.pop(name, None)) is not None:
+                server.probes.close()
             done(error)
 
         registrar.post(c.Unregister(name, new_id(), ended))
@@ -854,6 +946,8 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
         if not is_number(spec.linger_s) or spec.linger_s < 0:
             _invalid(name, "linger_s", "seconds, 0 or more", spec.linger_s)
         _check_idle(name, spec)
+        if spec.health is not None and not is_a(spec.health, Health):
+            _invalid(name, "health", "an rr.Health or None", spec.health)
         for field in ("load_timeout_s", "recover_timeout_s"):
             limit_s = getattr(spec, field)
             if limit_s is not None and not (is_number(limit_s) and limit_s > 0):
@@ -878,12 +972,16 @@ def _check_idle(name: str, spec: ServerSpec) -> None:
         _invalid(name, "paused_s", "None, as idle is not 'pause'", spec.paused_s)
 
 
-def checked_pauses(spec: ServerSpec) -> ServerSpec:
-    """Check that a server has the callbacks that its idle policy needs, and no others; all are known now.
+def checked_whole(spec: ServerSpec) -> ServerSpec:
+    """Check that a server has the callbacks that its options need, and no others; all are known now.
 
     Raises:
-        InvalidSpec: pause or resume is missing, or never called.
+        InvalidSpec: pause, resume or the health callback is missing, or never called.
     """
+    if spec.health is not None and spec.probe is None:
+        _invalid(spec.name, "probe", "a callable, the health callback, as there is a health", spec.probe)
+    if spec.health is None and spec.probe is not None:
+        _invalid(spec.name, "probe", "health=rr.Health(...), without which it is never called", spec.probe)
     for field in ("pause", "resume"):
         callback = getattr(spec, field)
         if spec.idle == "pause" and callback is None:
