@@ -17,7 +17,7 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import BeginTrial, LoadOverdue, RefusalOver, TrialOver
 from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
-from rr_actors.registrar.model.rows import LOADING, UNLOADING, CallbackRun, Phase, Resource
+from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, CallbackRun, Phase, Resource, State
 
 ATTEMPTS = 3
 """How often a callback of a resource begins whose process dies each time."""
@@ -81,6 +81,16 @@ def running(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> Resou
     if resource is None or resource.phase is not phase:
         return None
     return resource if run == (resource.tries if phase is UNLOADING else resource.attempt) else None
+
+
+def is_unwanted(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> bool | None:
+    """Return whether nobody needs a run of a load or recover callback any more; None if it has ended as it should."""
+    resource = catalog.resources.get(resource_id)
+    if resource is None or resource.attempt != run or resource.state is State.FATAL:
+        return True
+    if phase is LOADING and resource.phase is LOADING:
+        return resource_id not in catalog.holders
+    return False if phase is LOADED and resource_id in catalog.recovering else None
 
 
 # -- runs that end the process -----------------------------------------------------------------------------------------

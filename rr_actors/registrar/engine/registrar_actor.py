@@ -120,6 +120,7 @@ class RegistrarActor(RegistrarBase):
         steps = Steps()
         for part in (self.monitor, self.servers, self.consumers, *self.clients.values()):
             steps.take(f"closing its {type(part).__name__}", part.close)
+        steps.take("stopping its callbacks", self.stop_callbacks)
         steps.take("closing its streams", self.publishers.close_all)
         down = self.down()
         loads, self.loads = self.loads, {}

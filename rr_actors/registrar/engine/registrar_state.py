@@ -23,11 +23,12 @@ from contextlib import AbstractContextManager
 
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError, RegistrarDown, RrError
+from rr_actors.registrar.core.callback_runs import is_unwanted
 from rr_actors.registrar.core.decide import Item, decide
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.rows import Held
+from rr_actors.registrar.model.rows import Held, Phase
 from rr_actors.registrar.model.store import Store
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.workers import Workers
@@ -75,6 +76,7 @@ class RegistrarState:
         commits: the disk, and which changes are still to be written.
         sequence: the running numbers of queries, in the order in which they are asked for. Releases go newest first.
         loads, unloads: by query, the callback that hears how its load, or its release, ended.
+        stops: by resource, phase and attempt of a callback that runs, the event that tells it to stop.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class RegistrarState:
         self.sequence = itertools.count(self.catalog.since + 1)
         self.loads: dict[str, LoadWaiter] = {}
         self.unloads: dict[str, UnloadWaiter] = {}
+        self.stops: dict[tuple[str, Phase, int], threading.Event] = {}
         self.closed = False
         self._why_down = "closed"
 
@@ -144,7 +147,39 @@ class RegistrarState:
                 decision.undo()
                 raise
             decision.close()
+            if self.stops:
+                self._stop_unwanted()
             return decision
+
+    def stop_event(self, resource_id: str, phase: Phase, attempt: int) -> threading.Event:
+        """Return the event that is set when nobody needs this run of a callback any more, or the registrar is closed.
+
+        It is the same one as long as the callback runs.
+        """
+        with self.lock:
+            event = self.stops.setdefault((resource_id, phase, attempt), threading.Event())
+            if self.closed:
+                event.set()
+            else:
+                self._stop_unwanted()
+            return event
+
+    @with_lock
+    def _stop_unwanted(self) -> None:
+        catalog = self.whole()
+        for run, event in list(self.stops.items()):
+            unwanted = is_unwanted(catalog, *run)
+            if unwanted:
+                event.set()
+            if unwanted is not False:
+                del self.stops[run]
+
+    def stop_callbacks(self) -> None:
+        """Tell all callbacks to stop that have asked for their event."""
+        with self.lock:
+            for event in self.stops.values():
+                event.set()
+            self.stops.clear()
 
     def held_at(self, provider: str) -> list[Held] | None:
         """Return the rows held at a provider; None while messages wait that could change them."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
+import threading
 import time
 import typing
 import zlib
@@ -148,6 +149,23 @@ class Current(msgspec.Struct, frozen=True):
             allowed = " and ".join(role.name for role in ROLES.values() if role.reports)
             raise UsageError(f"{what}: only {allowed} callbacks report it")
         self._registrar.progress.report(self.resource_id, number, words)
+
+    @property
+    def stopping(self) -> threading.Event:
+        """The event that tells a load or recover callback that it may give up: nobody needs its result any more.
+
+        It is set when all who waited for the load have withdrawn it, and when the callback is overdue. It is set when
+        the registrar is closed, as when its process stops. The callback is not interrupted: it waits or asks, as in
+        ``while not rr.current().stopping.wait(0.1)``, cleans up, and raises. If the load succeeds, it is not set.
+
+        Raises:
+            UsageError: this is another callback.
+        """
+        phase = self._role.phase
+        if phase is None or not self._role.reports:
+            what = f"{self._registrar.name}/{self.server}: stopping in its {self._role.name} callback"
+            raise UsageError(f"{what}: only load and recover callbacks have it")
+        return self._registrar.stop_event(self.resource_id, phase, self.attempt)
 
     def open_stream(self, name: str = "stream") -> Publisher:
         """Open a stream of the resource, in its load or recover callback: its holders read it with Query.stream().
