@@ -76,8 +76,17 @@ class Cameras(rr.Manager):
                 pass
         picture[0] = 1
 
+    def keep_loan(self, size: int, fill: int) -> None:
+        """Fill half of an array in place, and keep the loan."""
+        self.loan = self.images.loan(size, "u1")
+        self.loan.__enter__()[: size // 2] = fill
+
     def wanted(self) -> bool:
         return self.images.wanted
+
+    def segments(self) -> list[int]:
+        """Return the segments that this process has made or mapped, by their inodes."""
+        return sorted(segments_in(os.getpid()))
 
     def shared_bytes(self) -> int:
         """Return how much memory the segments of this process take."""
@@ -176,6 +185,21 @@ class Watchers(rr.Manager):
         while len(self.held) < frames:
             if isinstance((frame := next(self.reader)).value, memoryview):
                 self.held.append(frame)
+
+
+def segments_in(pid: int) -> set[int]:
+    """Return the segments of shared memory that a process has mapped, by their inodes; none if it has ended."""
+    try:
+        lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    except OSError:
+        return set()
+    return {int(line.split()[4]) for line in lines if "memfd:rr_actors" in line}
+
+
+def users_of(segments: list[int]) -> list[int]:
+    """Return the processes of the machine that have these segments mapped."""
+    pids = [int(name) for name in os.listdir("/proc") if name.isdecimal()]
+    return [pid for pid in pids if segments_in(pid).intersection(segments)]
 
 
 @pytest.fixture(params=["process", "thread"])
@@ -523,6 +547,53 @@ def test_the_memory_of_a_killed_reader_comes_back(start: Start) -> None:
     eventually(lambda: cameras.publish_buffers(3 * MB, 4).get()[0] > 0)
     assert next(reader).value == bytes([4]) * 3 * MB
     reader.close()
+
+
+def test_a_publisher_that_is_killed_with_a_loan_in_hand_leaves_nothing(start: Start) -> None:
+    system, camera = start_cameras(start, 32 * MB)
+    cameras = system.ref("cameras").proxy()
+    reader = read(system, camera, keep="all")
+    cameras.publish_loans(MB, 1).get()
+    frame = next(reader)
+    cameras.keep_loan(MB, 2).get()
+    left = cameras.segments().get()
+    assert os.getpid() in users_of(left)
+
+    reading = Reading(reader)
+    os.kill(camera.response.pid, signal.SIGKILL)
+    eventually(lambda: when_back(lambda: cameras.publish_buffers(MB, 3).get()) == [1])
+
+    eventually(lambda: reading.values)
+    assert [value == bytes([3]) * MB for value in reading.values] == [True]  # and nothing of the loan
+    assert bool((frame.value == 1).all())
+    assert os.getpid() in users_of(left)
+    del frame
+    eventually(lambda: gc.collect() >= 0 and not users_of(left))
+    camera.unload()
+    assert reading.ended()
+    assert reading.error is None
+
+
+def test_a_publisher_goes_on_when_a_reader_with_a_frame_in_hand_is_killed(start: Start) -> None:
+    system, camera = start_cameras(start, 32 * MB)
+    cameras, watchers = system.ref("cameras").proxy(), system.ref("watchers").proxy()
+    pid = system.open_registrar("other").load(Watchers.watch, "a").response
+    holding = watchers.hold(1)
+    eventually(lambda: is_wanted(system))
+    assert cameras.publish_buffers(MB, 1).get() == [1]
+    holding.get()
+    segments = cameras.segments().get()
+    assert pid in users_of(segments)
+
+    os.kill(pid, signal.SIGKILL)
+
+    eventually(lambda: pid not in users_of(segments))
+    with camera.stream("images", keep="all", depth=1000, timeout_s=20) as reader:
+        until_all_read(system, reader)
+        for number in range(20):  # each needs the memory that the one before it had
+            assert cameras.publish_loans(MB, number).get() is None
+            assert bool((next(reader).value == number).all())
+    assert cameras.shared_bytes().get() < 4 * MB
 
 
 @pytest.mark.parametrize(
