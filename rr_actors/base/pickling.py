@@ -77,6 +77,9 @@ class Large(msgspec.Struct, frozen=True, eq=False):
     parts: Sequence[Bytes]
     buffers: Sequence[memoryview]
 
+    def __len__(self) -> int:
+        return sum(map(len, self.parts)) + sum(map(len, self.buffers))
+
     def whole(self) -> bytes:
         """Return a pickle that contains the buffers."""
         return dumps(self.value, self.what) if self.buffers else b"".join(self.parts)

@@ -39,6 +39,8 @@ _AGAIN_S = 0.01  # a reader tries as often to connect to a manager that is being
 _OPENS_S = 30.0  # how long a resource may have no stream at all, as long as a load may take
 _LISTENS = 0x10000  # the flag of a listening socket in /proc/net/unix
 _CREDENTIALS = struct.Struct("3i")
+_MARK_S = 0.1  # a stream's rate is known of so long ...
+_MARKS = 100  # ... times so many
 
 
 class Stream(msgspec.Struct, frozen=True):
@@ -76,6 +78,83 @@ class StreamFrame(msgspec.Struct, frozen=True, eq=False):
         return time.time() - self.published_at
 
 
+class ReaderRow(msgspec.Struct, frozen=True):
+    """A reader of a stream, as the publisher knows it.
+
+    Attributes:
+        registrar: the registrar that holds its query.
+        pid: its process.
+        keep: "latest" or "all".
+        missed: how many frames it did not get since it came.
+    """
+
+    registrar: str
+    pid: int
+    keep: Keep
+    missed: int
+
+
+class StreamRow(msgspec.Struct, frozen=True):
+    """A stream, as its publisher knows it.
+
+    Attributes:
+        name: its name among the streams of the resource.
+        resource_id, server, request: the resource; "registrar/server"; the request as JSON, cut if it is long.
+        frames: how many were published since it was opened.
+        rate: how many were published a second, in the last ten seconds.
+        bytes_s: how many bytes these had; those that nobody reads are not pickled, and have none.
+        age_s: how long ago the last was published; None: there was none.
+        readers: those who read it now.
+    """
+
+    name: str
+    resource_id: str
+    server: str
+    request: str
+    frames: int
+    rate: float
+    bytes_s: float
+    age_s: float | None
+    readers: list[ReaderRow]
+
+    @property
+    def missed(self) -> int:
+        """How many frames its readers missed, all together."""
+        return sum(reader.missed for reader in self.readers)
+
+
+class _Meter:
+    """Counts frames and their bytes, and how many there were in the last seconds. With the publisher's lock."""
+
+    def __init__(self) -> None:
+        self.frames = self._bytes = 0
+        self._at = self._due = 0.0
+        self._marks: deque[tuple[float, int, int]] = deque(maxlen=_MARKS)
+
+    def note(self, size: int) -> int:
+        """Count a frame, and return its number."""
+        self.frames += 1
+        self._bytes += size
+        self._at = now = time.monotonic()
+        if now >= self._due:
+            self._due = now + _MARK_S
+            self._marks.append((now, self.frames, self._bytes))
+        return self.frames
+
+    def read(self) -> tuple[float, float, float | None]:
+        """Return frames a second, bytes a second, and the age of the last frame."""
+        if not self.frames:
+            return 0.0, 0.0, None
+        now = time.monotonic()
+        recent = (mark for mark in self._marks if now - mark[0] <= _MARK_S * _MARKS)
+        began, frames, size = next(recent, (now, self.frames, self._bytes))
+        age_s, count, took_s = now - self._at, self.frames - frames, self._at - began
+        if count and age_s > 2 * took_s / count:  # it publishes no more, or less often
+            took_s = now - began
+        rate, bytes_s = (count / took_s, (self._bytes - size) / took_s) if count and took_s else (0.0, 0.0)
+        return rate, bytes_s, age_s
+
+
 class _Packet(msgspec.Struct, frozen=True, array_like=True):
     number: int
     published_at: float
@@ -95,6 +174,7 @@ class _Frame(NamedTuple):
 class _Hello(msgspec.Struct, frozen=True, array_like=True):
     keep: Keep
     depth: int
+    registrar: str = ""
 
 
 _hello, _packet = msgspec.msgpack.Decoder(_Hello), msgspec.msgpack.Decoder(_Packet)
@@ -164,8 +244,11 @@ class _Consumer:
         self.wanted = 0
         self.turns: deque[int] = deque()
         self.left = self.gone = False
+        self._registrar = ""
+        self._offered = self._sent = 0  # frames
         self._socket = connected
-        self._shares = can_open(_pid_of(connected))
+        self._pid = _pid_of(connected)
+        self._shares = can_open(self._pid)
         self._parcels = parcels
         self._last = 0
         self._waiting: _Packet | None = None  # the newest frame, for when it wants one
@@ -189,6 +272,7 @@ class _Consumer:
                 elif self.keep is None:
                     hello = _hello.decode(raw)
                     self.wanted = min(hello.depth, _MOST_DEPTH) if hello.keep == "all" else 0
+                    self._registrar = hello.registrar
                     self.keep = hello.keep
                 else:
                     self.wanted += len(raw)
@@ -203,6 +287,7 @@ class _Consumer:
         with self.lock:
             if not self.wanted:
                 self.receive()
+            self._offered += 1
             if self.left or frame.number < self._last or not (body := self._body_of(frame)):
                 return False  # _last: of another thread, which was later
             self._drop()
@@ -242,7 +327,19 @@ class _Consumer:
             return False
         self._waiting = None
         self.wanted -= 1
+        self._sent += 1
         return True
+
+    def miss(self) -> None:
+        """Count a frame for which it was too far behind."""
+        with self.lock:
+            self._offered += 1
+
+    def row(self) -> ReaderRow:
+        """Return what is seen of it from outside."""
+        with self.lock:
+            waits = self._waiting is not None
+            return ReaderRow(self._registrar, self._pid, self.keep or "latest", self._offered - self._sent - waits)
 
     def _drop(self) -> None:
         if self._waiting is not None and isinstance(self._waiting.body, Parcel):
@@ -280,7 +377,7 @@ class Publisher:
         self._parcels = segments.parcels(os.getpid())
         self._changed = threading.Condition()  # a consumer has come, gone, or wants a frame
         self._consumers: dict[int, _Consumer] = {}
-        self._number = 0
+        self._meter = _Meter()
         self._closed = False
         self._door = threading.Lock()  # no reader is taken in while the listener is closed
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
@@ -304,6 +401,13 @@ class Publisher:
     def wanted(self) -> bool:
         """Whether somebody reads the stream."""
         return bool(self._readers())
+
+    def row(self, server: str, request: str) -> StreamRow:
+        """Return what is seen of the stream from outside."""
+        readers = [reader.row() for reader in self._readers()]
+        with self._changed:
+            seen = self._meter.frames, *self._meter.read()
+        return StreamRow(self.name, self.stream.resource_id, server, request, *seen, readers)
 
     def _readers(self) -> list[_Consumer]:
         return [reader for reader in list(self._consumers.values()) if reader.keep is not None and not reader.left]
@@ -361,9 +465,9 @@ class Publisher:
         with self._changed:
             if self._closed:
                 return 0
-            self._number += 1
+            number = self._meter.note(len(packed))
             most_bytes = self._limit_bytes // (2 * len(readers) or 1)
-            frame = _Frame(self._number, time.time(), packed, body, most_bytes)
+            frame = _Frame(number, time.time(), packed, body, most_bytes)
             behind = [reader for reader in readers if reader.keep == "all"]
             for reader in behind:
                 reader.turns.append(frame.number)  # so that the frames of several threads stay in order
@@ -379,6 +483,7 @@ class Publisher:
             with self._changed:
                 for reader in behind:
                     reader.turns.remove(frame.number)
+                    reader.miss()
                 self._changed.notify_all()  # those who publish the next frame
         return sent
 
@@ -527,6 +632,11 @@ class Publishers:
             for publisher in self.streams.get(resource_id, {}).values():
                 publisher.let_in()
 
+    def all(self) -> list[Publisher]:
+        """Return the open streams."""
+        with self._lock:
+            return [publisher for streams in self.streams.values() for publisher in streams.values()]
+
     def close(self, resource_id: str) -> None:
         """Close the streams of a resource that is gone."""
         if self.streams:
@@ -577,6 +687,7 @@ class Source(NamedTuple):
     """What a reader asks its query.
 
     Attributes:
+        registrar: the one that holds the query.
         is_over: whether the query is released; raises ResourceLost.
         named: returns the streams that the response names.
         watch: has a Wake set for each status, and at the end.
@@ -584,6 +695,7 @@ class Source(NamedTuple):
     """
 
     resource_id: str
+    registrar: str
     is_over: Callable[[], bool]
     named: Callable[[], list[Stream]]
     watch: Callable[[Wake], None]
@@ -614,7 +726,7 @@ class StreamReader:
         self._name = name
         self._what = what
         self._stream: Stream | None = None
-        self._hello = _Hello(keep, depth)
+        self._hello = _Hello(keep, depth, source.registrar)
         self._timeout_s = timeout_s
         self._line: _Line | None = None
         self._parcels = Segments(0).parcels(None)

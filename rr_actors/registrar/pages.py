@@ -16,6 +16,7 @@ import msgspec
 
 from rr_actors.base.names import named
 from rr_actors.base.values.canonical import json_of, shown_plain, text_of_value
+from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model import failures
@@ -37,10 +38,10 @@ class Wanted(msgspec.Struct, frozen=True):
     """The page to return: `limit` rows from number `offset` on, of the rows that contain the text `match`.
 
     Responses are not searched. With "id", the rows of the resource and the query with this id, or with
-    this beginning or end of an id. With "servers", all servers with their counts.
+    this beginning or end of an id. With "servers", all servers with their counts. With "streams", the open streams.
     """
 
-    what: Literal["resources", "queries", "id", "servers"]
+    what: Literal["resources", "queries", "id", "servers", "streams"]
     match: str = ""
     offset: int = 0
     limit: int = 100
@@ -163,6 +164,7 @@ class Page(msgspec.Struct, frozen=True):
     resources: list[ResourceRow] = []
     queries: list[QueryRow] = []
     servers: list[ServerRow] = []
+    streams: list[StreamRow] = []
 
 
 def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
@@ -185,6 +187,22 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
         case "servers":
             servers = _server_rows(actor)
             return Page(len(servers), servers=servers)
+        case "streams":
+            streams = _stream_rows(actor, wanted.match)
+            return Page(len(streams), streams=streams[wanted.offset : wanted.offset + wanted.limit])
+
+
+def _stream_rows(actor: RegistrarActor, match: str) -> list[StreamRow]:
+    rows: list[StreamRow] = []
+    publishers = actor.publishers.all()
+    ids = {publisher.stream.resource_id for publisher in publishers}
+    resources = _read(actor, lambda catalog: {id: row for id in ids if (row := catalog.find(id)) is not None})
+    for publisher in publishers:
+        if (resource := resources.get(publisher.stream.resource_id)) is not None:
+            server, request = f"{actor.name}/{resource.server}", text_of_value(resource.request)
+            if any(match in text for text in (resource.id, publisher.name, f"{server} {request}")):
+                rows.append(publisher.row(server, request))
+    return sorted(rows, key=lambda row: (row.server, row.request, row.name))
 
 
 def _server_rows(actor: RegistrarActor) -> list[ServerRow]:

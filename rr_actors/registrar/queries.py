@@ -296,7 +296,7 @@ class Query(Generic[Response]):
         self._at_holder()
         if self._is_released:
             raise UnknownQuery(f"{self.server_id}: query {self.id} is released: it has no streams", query_id=self.id)
-        source = Source(self.resource_id, self._is_over, self._named_streams, self._watch, self._unwatch)
+        source = Source(self.resource_id, self.origin, self._is_over, self._named_streams, self._watch, self._unwatch)
         checked = None if name is None else check_name(name, "stream")
         return StreamReader(source, checked, keep, depth, limit_s)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 from rr_actors.base.errors import UnknownQuery, UsageError, few, shown
 from rr_actors.base.names import short_id, short_ids
+from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
 from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
 from rr_actors.system.console.console_client import ConsoleClient
@@ -103,8 +104,18 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
         yield from _of_holder(client, holder, "", {resource.id})
     if resource.holder_count > len(resource.holders):
         yield f"{resource.holder_count - len(resource.holders)} others hold it, too."
+    for stream in client.streams(resource.server.partition("/")[0], resource.id).rows:
+        by = f"is read by {readers_text(stream)}" if stream.readers else "has no reader"
+        yield f"Its stream {stream.name!r} {by}."
     for part in resource.parts:
         yield from _of_part(client, part, "", {resource.id})
+
+
+def readers_text(stream: StreamRow) -> str:
+    """Return who reads a stream: "app (process 12), planner (process 13, missed 4)"."""
+    return ", ".join(
+        f"{one.registrar} (process {one.pid}{f', missed {one.missed}' if one.missed else ''})" for one in stream.readers
+    )
 
 
 def _named(resource: ResourceRow) -> str:

@@ -24,7 +24,12 @@ PLACES = {
     "sqlite3": ("storage/",),
     "psutil": ("managers/",),
     "uvloop": ("runtime/user_loop.py",),
-    "typer": ("tools/cli_commands.py", "tools/console_verbs.py", "tools/recording_verbs.py"),
+    "typer": (
+        "tools/cli_commands.py",
+        "tools/console_verbs.py",
+        "tools/recording_verbs.py",
+        "tools/terminal/stream_verbs.py",
+    ),
     "rich": (
         "registrar/progress_bar.py",
         "tools/cli_commands.py",

@@ -29,6 +29,7 @@ from rr_actors.system.console.console_questions import (
     ListQueries,
     ListRegistrars,
     ListResources,
+    ListStreams,
     ListUsages,
 )
 from rr_actors.system.console.console_view import Verb
@@ -37,7 +38,7 @@ from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_at
 
 _A = TypeVar("_A")
-_Page = TypeVar("_Page", c.Children, c.Registrars, c.Resources, c.Queries, c.Usages)
+_Page = TypeVar("_Page", c.Children, c.Registrars, c.Resources, c.Queries, c.Usages, c.Streams)
 _GREETING_S = 5.0
 _RETRY_S = 0.01
 _IDLE = 8  # connections that are kept for the next call
@@ -121,6 +122,10 @@ class ConsoleClient:
     def usages(self, registrar: str = "", match: str = "") -> c.Usages:
         """Return what the resources use that ListUsages(match) finds, of a registrar, or of all."""
         return self._all(ListUsages(match, registrar=registrar))
+
+    def streams(self, registrar: str = "", match: str = "") -> c.Streams:
+        """Return the open streams that ListStreams(match) finds, of a registrar's resources, or of all."""
+        return self._all(ListStreams(match, registrar=registrar))
 
     def queries(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> c.Queries:
         """Return the queries that a registrar holds, or all, that ListQueries(match) finds; at most `limit`."""

@@ -14,6 +14,7 @@ import msgspec
 from rr_actors.actors.messaging.dead_letters import DeadLetter
 from rr_actors.base.names import named
 from rr_actors.base.values.failure import Failure
+from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.pages import QueryRow, ResourceRow, ServerRow
@@ -198,6 +199,14 @@ class Usages(Message, frozen=True):
 
     total: int
     rows: list[UsageRow]
+    notes: list[str] = []
+
+
+class Streams(Message, frozen=True):
+    """A page of open streams. `notes`: registrars that could not be asked, and why."""
+
+    total: int
+    rows: list[StreamRow]
     notes: list[str] = []
 
 

@@ -67,6 +67,16 @@ class ListUsages(Listing[c.Usages], frozen=True):
         return c.Usages(found.total, rows[: room_for(rows, notes)], notes)
 
 
+class ListStreams(Listing[c.Streams], frozen=True):
+    """A page of the open streams of one registrar's resources, or of all: those with `match` in name or resource."""
+
+    registrar: c.Text = ""
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Streams:
+        found, notes = view.page("streams", self.registrar, self.match, self.offset, self.limit)
+        return c.Streams(found.total, found.streams[: room_for(found.streams, notes)], notes)
+
+
 class ListQueries(Listing[c.Queries], frozen=True):
     """A page of the queries that one registrar holds, or all: the rows with `match` in ids, server or request."""
 

@@ -25,6 +25,7 @@ from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, readable, text_of
+from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.pages import Page, QueryRow, ResourceRow, ServerRow, Wanted
 from rr_actors.registrar.registrar import Registrar, page
@@ -180,7 +181,7 @@ class View:
 
     def page(
         self,
-        what: Literal["resources", "queries", "id", "servers"],
+        what: Literal["resources", "queries", "id", "servers", "streams"],
         registrar: str,
         match: str,
         offset: int = 0,
@@ -188,9 +189,10 @@ class View:
     ) -> tuple[Page, list[str]]:
         """Return a page over several registrars, and notes on registrars that do not answer."""
         total, resources, queries, notes = 0, list[ResourceRow](), list[QueryRow](), list[str]()
-        servers: list[ServerRow] = []
+        servers, streams = list[ServerRow](), list[StreamRow]()
         for name in self.up(registrar):
-            wanted = Wanted(what, match, max(0, offset - total), limit - len(resources) - len(queries))
+            left = limit - len(resources) - len(queries) - len(streams)
+            wanted = Wanted(what, match, max(0, offset - total), left)
             try:
                 found = page(self.registrar(name), wanted)
             except RrError as error:
@@ -200,7 +202,8 @@ class View:
                 resources += found.resources
                 queries += found.queries
                 servers += found.servers
-        return Page(total, resources, queries, servers), notes
+                streams += found.streams
+        return Page(total, resources, queries, servers, streams), notes
 
     def usages(
         self, resources: Sequence[tuple[str, str]], notes: list[str]
@@ -269,7 +272,7 @@ def _rows(node: Mapping[str, Any], depth: int = 0) -> Iterator[c.ChildRow]:
         yield from _rows(child, depth + 1)
 
 
-def room_for(rows: Sequence[ResourceRow | c.UsageRow | Record], notes: Sequence[str] = ()) -> int:
+def room_for(rows: Sequence[ResourceRow | c.UsageRow | StreamRow | Record], notes: Sequence[str] = ()) -> int:
     """Return how many of these rows, from the first on, have room in an answer with the notes: texts may be long."""
     limit = c.RESPONSE_LIMIT_BYTES - len(msgspec.msgpack.encode(notes))
     sizes = itertools.accumulate(len(msgspec.msgpack.encode(row)) for row in rows)
