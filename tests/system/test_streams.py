@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import itertools
 import os
 import pickle
 import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import eventually
+from support import TESTS, eventually
 
 Start = Callable[..., rr.System]
 
@@ -734,6 +737,83 @@ def test_a_reader_goes_on_with_the_stream_that_a_new_response_names(start: Start
         robot.unload()
         assert reading.ended()
         assert reading.error is None
+
+
+@contextlib.contextmanager
+def viewing(system: rr.System) -> Iterator[Callable[[], str]]:
+    """Run a client of the system in a process of its own; yield a function that returns its next line."""
+    arguments = [str(system.state_dir), "cameras/camera", "a", "images"]
+    program = [sys.executable, str(TESTS / "support_stream_client.py"), *arguments]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as client:
+        assert client.stdout is not None
+        try:
+            assert client.stdout.readline() == "reads\n"
+            eventually(lambda: is_wanted(system))
+            yield client.stdout.readline
+        finally:
+            client.kill()
+
+
+def test_a_client_in_a_process_of_its_own_reads_on_after_a_crash_of_the_manager(start: Start) -> None:
+    system, camera = start_cameras(start, 32 * MB)
+    cameras = system.ref("cameras").proxy()
+    with viewing(system) as line:
+        published(system, b"small")
+        assert line() == f"{zlib.crc32(b'small')} 0\n"
+        cameras.publish_buffers(MB, 1).get()
+        assert line() == f"{zlib.crc32(bytes([1]) * MB)} 0\n"
+
+        os.kill(camera.response.pid, signal.SIGKILL)
+        eventually(lambda: when_back(lambda: cameras.publish_buffers(MB, 2).get()) == [1])
+
+        assert line() == f"{zlib.crc32(bytes([2]) * MB)} 0\n"
+        system.registrar("cameras").unload(camera.resource_id, force=True)
+        assert line() == "ResourceLost\n"
+
+
+def test_the_memory_of_a_killed_client_comes_back(start: Start) -> None:
+    system, _ = start_cameras(start, 6 * MB)
+    cameras = system.ref("cameras").proxy()
+    with viewing(system) as line:
+        for fill in (1, 2):  # the second is in its hands: it has dropped the first
+            cameras.publish_buffers(2 * MB, fill).get()
+            assert line() == f"{zlib.crc32(bytes([fill]) * 2 * MB)} 0\n"
+        segments = cameras.segments().get()
+        assert len(users_of(segments)) == 2
+
+    eventually(lambda: len(users_of(segments)) == 1)
+    eventually(lambda: not is_wanted(system))
+    with system.registrar("app").load(Cameras.open_camera, "a").stream("images", keep="all", timeout_s=20) as reader:
+        eventually(lambda: is_wanted(system))
+        eventually(lambda: cameras.publish_buffers(5 * MB, 3).get() == [1])
+        assert next(reader).value == bytes([3]) * 5 * MB
+
+
+def test_a_client_goes_on_with_the_stream_that_a_new_response_names_until_it_releases_it(start: Start) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards"), rr.ChildSpec(Robots, id="robots"))
+    boards = system.ref("boards").proxy()
+    with rr.connect(system.state_dir) as client:
+        robot = client.open_registrar("viewer").load("robots/robot")
+        reading = Reading(robot.stream("eyes", timeout_s=20))
+        eventually(lambda: boards.publish("eyes", "of a").get() == 1)
+        eventually(lambda: reading.values == ["of a"])
+
+        system.ref("robots").proxy().update(robot.resource_id).get()
+
+        eventually(lambda: boards.publish("eyes", "of b").get() == 1)
+        eventually(lambda: reading.values[-1] == "of b")
+        robot.unload()
+        assert reading.ended()
+        assert reading.error is None
+
+
+def test_a_client_that_is_closed_ends_its_streams(system: rr.System) -> None:
+    with rr.connect(system.state_dir) as client:
+        reading = Reading(client.open_registrar("viewer").load("cameras/camera", "a").stream("images"))
+        eventually(lambda: is_wanted(system))
+
+    assert reading.ended()
+    assert reading.error is None
 
 
 def test_close_ends_a_reader_that_waits_in_another_thread(camera: rr.Query[Feed]) -> None:

@@ -1,7 +1,8 @@
 """connect(): a client of a running system, for any other process of the same user: a worker of a pool, a notebook.
 
-The client speaks with the system's console, has no key of the system, and opens no pickle. Registrars in the
-application's process hold its queries. Each registrar has a connection of its own, which ends with the client.
+The client speaks with the system's console, has no key of the system, and opens no pickle but the frames of streams.
+Registrars in the application's process hold its queries. Each registrar has a connection of its own, which ends with
+the client.
 """
 
 from __future__ import annotations
