@@ -93,6 +93,7 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
         MissedEvent,
         ProgressEvent,
         ResourceEvent,
+        StreamEvent,
     )
     from rr_actors.system.recording.recordings import Recording, read_recording
     from rr_actors.system.recording.traces import Trace
@@ -168,6 +169,7 @@ __all__ = [
     "State",
     "Status",
     "Stream",
+    "StreamEvent",
     "StreamFrame",
     "StreamReader",
     "SupervisionError",

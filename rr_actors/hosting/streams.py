@@ -33,6 +33,9 @@ IN_BAND_BYTES = 128 * 1024
 
 Keep = Literal["latest", "all"]
 
+StreamHappening = Literal["stream_opened", "stream_rebound", "stream_closed"]
+"""What may happen to a stream. "stream_rebound": a reader of another stream goes on with this one."""
+
 _PACKET_BYTES = IN_BAND_BYTES + 4096
 _MOST_DEPTH = 1000
 _AGAIN_S = 0.01  # a reader tries as often to connect to a manager that is being respawned
@@ -123,6 +126,15 @@ class StreamRow(msgspec.Struct, frozen=True):
         return sum(reader.missed for reader in self.readers)
 
 
+class StreamNews(msgspec.Struct, frozen=True):
+    """Something that has happened to a stream. `reader`, `before`: the registrar that read another stream before."""
+
+    what: StreamHappening
+    stream: Stream
+    reader: str = ""
+    before: Stream | None = None
+
+
 class _Meter:
     """Counts frames and their bytes, and how many there were in the last seconds. With the publisher's lock."""
 
@@ -175,6 +187,7 @@ class _Hello(msgspec.Struct, frozen=True, array_like=True):
     keep: Keep
     depth: int
     registrar: str = ""
+    before: Stream | None = None  # the stream that it read until now
 
 
 _hello, _packet = msgspec.msgpack.Decoder(_Hello), msgspec.msgpack.Decoder(_Packet)
@@ -238,8 +251,11 @@ class _Consumer:
         left: it reads no more, but may still have values.
     """
 
-    def __init__(self, connected: socket.socket, parcels: Parcels, ready: select.epoll) -> None:
+    def __init__(
+        self, connected: socket.socket, parcels: Parcels, ready: select.epoll, rebound: Callable[[str, Stream], None]
+    ) -> None:
         self.lock = threading.Lock()
+        self._rebound = rebound
         self.keep: Keep | None = None  # until its hello has arrived
         self.wanted = 0
         self.turns: deque[int] = deque()
@@ -274,6 +290,8 @@ class _Consumer:
                     self.wanted = min(hello.depth, _MOST_DEPTH) if hello.keep == "all" else 0
                     self._registrar = hello.registrar
                     self.keep = hello.keep
+                    if hello.before is not None:
+                        self._rebound(hello.registrar, hello.before)
                 else:
                     self.wanted += len(raw)
         except BlockingIOError:
@@ -378,6 +396,7 @@ class Publisher:
         self._changed = threading.Condition()  # a consumer has come, gone, or wants a frame
         self._consumers: dict[int, _Consumer] = {}
         self._meter = _Meter()
+        self._tell: Callable[[StreamNews], None] | None = None  # when readers are let in
         self._closed = False
         self._door = threading.Lock()  # no reader is taken in while the listener is closed
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
@@ -537,17 +556,28 @@ class Publisher:
                 connected, _ = self._listener.accept()
             try:
                 connected.setblocking(False)
-                consumer = _Consumer(connected, self._parcels, self._ready)
+                consumer = _Consumer(connected, self._parcels, self._ready, self._rebound)
             except OSError:
                 connected.close()
                 raise
             self._consumers[connected.fileno()] = consumer
 
-    def let_in(self) -> None:
-        """Let readers in: the callback that opened the stream has returned."""
+    def _rebound(self, reader: str, before: Stream) -> None:
+        if self._tell is not None:
+            self._tell(StreamNews("stream_rebound", self.stream, reader, before))
+
+    def let_in(self, tell: Callable[[StreamNews], None]) -> None:
+        """Let readers in: the callback that opened the stream has returned.
+
+        Args:
+            tell: hears what happens to the stream, in any thread.
+        """
         with self._door:
-            if not self._closed:
-                self._listener.listen(128)
+            if self._closed or self._tell is not None:
+                return
+            self._tell = tell
+            self._listener.listen(128)
+        tell(StreamNews("stream_opened", self.stream))
 
     def close(self) -> None:
         """End the stream, at once: readers wait for it to be opened again, as long as they hold the resource."""
@@ -555,6 +585,9 @@ class Publisher:
             self._closed = True
             self._listener.close()
             self._wake.close()  # the thread hears it, and closes the rest
+            tell, self._tell = self._tell, None
+        if tell is not None:
+            tell(StreamNews("stream_closed", self.stream))
 
 
 class Loan:
@@ -626,11 +659,12 @@ class Publishers:
             publisher = streams[stream.name] = Publisher(stream, self._segments)
         return publisher
 
-    def let_in(self, resource_id: str) -> None:
+    def let_in(self, resource_id: str, tell: Callable[[StreamNews], None]) -> None:
         """Let readers in to the streams of a resource: the callback that opens them has returned."""
         with self._lock:
-            for publisher in self.streams.get(resource_id, {}).values():
-                publisher.let_in()
+            publishers = list(self.streams.get(resource_id, {}).values())
+        for publisher in publishers:
+            publisher.let_in(tell)
 
     def all(self) -> list[Publisher]:
         """Return the open streams."""
@@ -727,6 +761,7 @@ class StreamReader:
         self._what = what
         self._stream: Stream | None = None
         self._hello = _Hello(keep, depth, source.registrar)
+        self._before: Stream | None = None
         self._timeout_s = timeout_s
         self._line: _Line | None = None
         self._parcels = Segments(0).parcels(None)
@@ -852,6 +887,8 @@ class StreamReader:
             stream = next(iter(there.values()), self._stream)
         if stream != self._stream:
             self._disconnect()
+            if self._was_open:
+                self._before = self._stream
             self._stream, self._was_open = stream, False
 
     def _check_known(self, waited_s: float) -> None:
@@ -873,11 +910,11 @@ class StreamReader:
         try:
             connected.connect(_address(self._stream))
             self._parcels = Segments(0).parcels(_pid_of(connected))
-            connected.send(msgspec.msgpack.encode(self._hello))
+            connected.send(msgspec.msgpack.encode(msgspec.structs.replace(self._hello, before=self._before)))
         except OSError:
             connected.close()
             return None
-        self._line, self._was_open = _Line(connected), True
+        self._line, self._was_open, self._before = _Line(connected), True, None
         self._last, self._owes = 0, self._hello.keep == "latest"
         return connected
 

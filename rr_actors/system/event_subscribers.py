@@ -14,6 +14,7 @@ from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
 
 from rr_actors.base.errors import RrError, UsageError, exact_text, shown
 from rr_actors.base.reporting.log import Log
+from rr_actors.hosting.streams import StreamHappening
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.links.recorder import RECORDED
 from rr_actors.registrar.model.effects import Happening
@@ -98,6 +99,29 @@ class ProgressEvent(TypedDict):
     text: str
 
 
+class _StreamEvent(TypedDict):
+    """The keys that every StreamEvent has."""
+
+    event: StreamHappening
+    registrar: str
+    server: str
+    resource_id: str
+    request: str
+    stream: str
+    detail: str
+
+
+class StreamEvent(_StreamEvent, total=False):
+    """Something that happened to a stream, called `stream`. The keys of its resource are as in a ResourceEvent.
+
+    A killed manager closes nothing. Only a "stream_rebound" has the other keys: `reader`, a registrar, reads it now
+    instead of the stream `before`, "RESOURCE_ID/NAME". `detail` says that for people.
+    """
+
+    reader: str
+    before: str
+
+
 class DeadLetterEvent(TypedDict):
     """A message that reached nobody: the attributes of a DeadLetter, and `count`, how many its process has had."""
 
@@ -126,7 +150,7 @@ class MissedEvent(TypedDict):
     count: int
 
 
-Event = ChildEvent | ResourceEvent | ProgressEvent | DeadLetterEvent | EndedEvent | MissedEvent
+Event = ChildEvent | ResourceEvent | ProgressEvent | StreamEvent | DeadLetterEvent | EndedEvent | MissedEvent
 """The argument of a subscriber. A type checker tells the kinds apart by `event["event"]`."""
 
 Facts = dict[str, Any]
@@ -135,7 +159,7 @@ Facts = dict[str, Any]
 
 def kinds_for_all() -> list[str]:
     """Return the kinds of events that every subscriber hears: all but "missed", which goes to one alone."""
-    types = (ChildEvent, ResourceEvent, ProgressEvent, DeadLetterEvent, EndedEvent)
+    types = (ChildEvent, ResourceEvent, ProgressEvent, StreamEvent, DeadLetterEvent, EndedEvent)
     return [kind for cls in types for kind in get_args(get_type_hints(cls)["event"])]
 
 

@@ -679,9 +679,9 @@ class System:
     def subscribe(self, callback: Callable[[Event], Any] | Callable[[dict[str, Any]], Any]) -> Callable[[], None]:
         """Call `callback(event)` in a worker, in order, for each event of the whole system.
 
-        An event is a dict: an rr.ChildEvent, rr.ResourceEvent, rr.ProgressEvent, rr.DeadLetterEvent, rr.EndedEvent or
-        rr.MissedEvent. "event" is its kind ("started", "loaded" ...); docs/supervision.md lists them. The other keys
-        say where ("path", or "registrar", "server" and "resource_id") and how.
+        An event is a dict: an rr.ChildEvent, rr.ResourceEvent, rr.ProgressEvent, rr.StreamEvent, rr.DeadLetterEvent,
+        rr.EndedEvent or rr.MissedEvent. "event" is its kind ("started", "loaded" ...); docs/supervision.md lists them.
+        The other keys say where ("path", or "registrar", "server" and "resource_id") and how.
 
         Returns:
             A function that ends the subscription.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 import typing
 from collections.abc import Callable
 from typing import Any, get_args, get_type_hints
@@ -95,6 +96,50 @@ def pausing(app: rr.Registrar, provider: rr.Registrar) -> None:
     motor.priority = 1
 
 
+def streaming(app: rr.Registrar, provider: rr.Registrar) -> None:
+    """Open and close streams, while a reader goes on with another of them."""
+
+    def open_one(name: str) -> rr.Stream:
+        opened[name] = rr.current().open_stream(name)
+        return opened[name].stream
+
+    opened: dict[str, rr.Publisher] = {}
+    serve(provider, "eyes", load=open_one, request_type=str, response_type=rr.Stream)
+    first, second = (app.load("provider/eyes", name) for name in ("left", "right"))
+    with first.stream() as reader:
+        eventually(lambda: opened["left"].publish("l"))
+        assert next(reader).value == "l"
+        provider.update_response(first.resource_id, rr.Stream(second.resource_id, "right"))
+        thread = threading.Thread(target=next, args=(reader,))
+        thread.start()
+        eventually(lambda: opened["right"].publish("r"))
+        thread.join()
+    first.unload()
+    second.unload()
+
+
+def test_a_rebound_stream_says_who_reads_it_instead_of_which(system: rr.System) -> None:
+    heard = Calls()
+    system.subscribe(heard)
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+
+    streaming(app, provider)
+
+    eventually(lambda: len([one for one in heard if "stream" in one]) >= 5)
+    events = [one for one in heard if "stream" in one]
+    left, right = (one["resource_id"] for one in events[:2])
+    kinds = [(one["event"].removeprefix("stream_"), one["stream"], one["resource_id"]) for one in events]
+    assert kinds == [
+        ("opened", "left", left),
+        ("opened", "right", right),
+        ("rebound", "right", right),
+        ("closed", "left", left),
+        ("closed", "right", right),
+    ]
+    assert (events[2]["reader"], events[2]["before"]) == ("app", f"{left}/left")
+    assert events[2]["detail"].startswith("right, read by app instead of left of resource ")
+
+
 def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop: Workshop) -> None:
     heard = Calls()
     system = start(
@@ -124,6 +169,7 @@ def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop:
     left = app.load("provider/camera", "left")
     provider.revoke(left, "in the way")
     pausing(app, provider)
+    streaming(app, provider)
     app.load("shop/thing", Order("wheel"))
     wait_respawned(system, "shop", kill(system, "shop"))
     worker = system.ref("worker")

@@ -84,6 +84,9 @@ def on_event(event: rr.Event) -> str:
     if event["event"] == "progress":
         assert_type(event["fraction"], float)
         return event["text"]
+    if event["event"] == "stream_opened":
+        assert_type(event, rr.StreamEvent)
+        return event["stream"]
     return event["event"]
 
 

@@ -40,12 +40,12 @@ from rr_actors.base.errors import (
     shown,
     text_of,
 )
-from rr_actors.base.names import check_name, new_id
+from rr_actors.base.names import check_name, new_id, short_id
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.values.canonical import Codec, encode, shown_plain
+from rr_actors.base.values.canonical import Codec, encode, shown_plain, text_of_value
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.base.values.type_shapes import digest_of
-from rr_actors.hosting.streams import Publisher
+from rr_actors.hosting.streams import Publisher, StreamNews
 from rr_actors.registrar.core.callback_runs import running
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.fields import by_fields, field_names, fields_type
@@ -458,23 +458,37 @@ class ServerActor:
         if self.too_long(resource, response) is not None or progress.has_unsent(resource.id):
             return False
         progress.forget(resource.id)
-        self._let_in(resource.id)
+        self._let_in(resource)
         return self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
         self.registrar.progress.end(resource.id)
         error = error or self.too_long(resource, response)
         if error is None:
-            self._let_in(resource.id)
+            self._let_in(resource)
             self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
         else:
             self.registrar.publishers.close(resource.id)
             self.registrar.post(c.LoadErred(resource.id, resource.attempt, self.load_failure(error)))
 
-    def _let_in(self, resource_id: str) -> None:
+    def _let_in(self, resource: Resource) -> None:
         """Let readers in to the streams that a callback has opened."""
         if self.registrar.publishers.streams:  # most registrars have none
-            self.registrar.publishers.let_in(resource_id)
+            self.registrar.publishers.let_in(resource.id, functools.partial(self._tell, resource))
+
+    def _tell(self, resource: Resource, news: StreamNews) -> None:
+        """Tell the watchers of the system what has happened to a stream. From any thread."""
+        node = self.registrar.node
+        if not node.watched:
+            return
+        facts = {"registrar": self.registrar.name, "server": self.origin, "resource_id": resource.id}
+        facts |= {"request": text_of_value(resource.request), "stream": news.stream.name, "detail": news.stream.name}
+        if (before := news.before) is not None:
+            instead = f"{before.name} of resource {short_id(before.resource_id)}"
+            facts["detail"] += f", read by {news.reader} instead of {instead}"
+            facts |= {"reader": news.reader, "before": f"{before.resource_id}/{before.name}"}
+        with contextlib.suppress(Unavailable):  # the loop has ended
+            node.dispatcher.call(functools.partial(node.emit, news.what, **facts))
 
     def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
         """Return the error for a response that, with its request, is too long for a frame; None if it is not."""
@@ -542,7 +556,7 @@ class ServerActor:
         self.registrar.progress.end(resource.id)
         error = error or self.too_long(resource, response)
         if error is None:
-            self._let_in(resource.id)
+            self._let_in(resource)
             self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
             return
         self.registrar.publishers.close(resource.id)
