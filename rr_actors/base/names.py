@@ -11,10 +11,10 @@ import itertools
 import os
 import re
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
-from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
+from rr_actors.base.errors import InvalidName, NotFound, did_you_mean, exact_text, few, is_a, shown
 
 CLIENTS = "client."
 """The prefix of the registrars of clients (rr.connect()); no other registrar has it."""
@@ -62,6 +62,27 @@ _parsed = functools.lru_cache(1024)(parse_server_id)
 def parse_server(server: object) -> ServerId:
     """Split a server id as parse_server_id() does, with a cache for the latest 1024 texts."""
     return _parsed(server) if type(server) is str else parse_server_id(server)
+
+
+def child_meant(name: str, paths: Collection[str]) -> str | None:
+    """Return the one of these paths that a path or an id names; None if there is no such child among them.
+
+    Raises:
+        NotFound: several children have this id.
+    """
+    if name in paths:
+        return name
+    found = [path for path in paths if path.rpartition("/")[2] == name]
+    if len(found) > 1:
+        raise NotFound(f"{shown(name)}: several children have this id: {few(sorted(found))}", id=name)
+    return found[0] if found else None
+
+
+def no_child(name: str, paths: Collection[str]) -> NotFound:
+    """Return the error for a path or an id that names no child of these paths, with the nearest name among them."""
+    known = sorted({path if "/" in name else path.rpartition("/")[2] for path in paths})
+    hint = did_you_mean(name, known) or f"; there are: {few(known) or 'none'}"
+    return NotFound(f"{shown(name)}: there is no child of this path or id{hint}", id=name)
 
 
 _MS_NS = 1_000_000

@@ -4,6 +4,9 @@ In a child, a record that no handler takes is sent up like an event, as plain da
 error. The application's process gives it to its own logger of the same name, with that logger's levels, filters and
 handlers. Code in the child that configures handlers, for instance by basicConfig, keeps its records. A function such as
 logging.warning() calls basicConfig by itself where nothing is configured; in a child that call does nothing.
+
+The system keeps the last lines of each child's process for people who look at it. It keeps them by the child's path. So
+those of a process that has died stand before those of its successor.
 """
 
 from __future__ import annotations
@@ -12,8 +15,12 @@ import functools
 import inspect
 import logging
 import os
+import threading
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any
+
+import msgspec
 
 EVENT = "log"
 
@@ -99,6 +106,88 @@ def _facts_of(record: logging.LogRecord, path: str) -> dict[str, Any]:
     }
 
 
-def _cut(text: str) -> str:
+def _cut(text: str, limit: int = _TEXT_LIMIT) -> str:
     plain = text.encode("utf-8", "backslashreplace").decode()
-    return plain if len(plain) <= _TEXT_LIMIT else f"{plain[:_TEXT_LIMIT]}… ({len(plain)} characters)"
+    return plain if len(plain) <= limit else f"{plain[:limit]}… ({len(plain)} characters)"
+
+
+# -- kept for people -------------------------------------------------------------------------------------------------
+
+LINES_LIMIT = 500
+"""The most lines of a child that are kept."""
+BYTES_LIMIT = 256 * 1024
+"""The most bytes of a child's lines, as MessagePack, that are kept."""
+ALL_BYTES_LIMIT = 32 * 2**20
+"""The most bytes of the lines of all children: above it, the child that has been silent for longest loses its lines."""
+
+_LINE_LIMIT = 32 * 1024  # characters of a line's message, traceback and stack together
+_NAME_LIMIT = 200
+
+
+class LogLine(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A log record of a child's process.
+
+    Attributes:
+        seq: its number among all lines of this run of the system, from 1 on.
+        at: seconds since the epoch.
+        level: "WARNING", for instance.
+        logger: the name of its logger.
+        pid: the process that logged it. Each life of a child has its own.
+        text: the message, in the next lines the traceback, if there is one.
+    """
+
+    seq: int
+    at: float
+    level: str
+    logger: str
+    pid: int
+    text: str
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(LogLine)
+
+
+class KeptLogs:
+    """The last log lines of the children of one system, in memory. From any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._lines: OrderedDict[str, deque[bytes]] = OrderedDict()  # by path; last, the child that logged last
+        self._sizes: dict[str, int] = {}
+        self._size = 0
+        self._seq = 0
+
+    def take(self, facts: dict[str, Any]) -> None:
+        """Keep a record, in the form in which the process of a child sends it."""
+        path: str = facts["processName"]
+        text = "\n".join(part for key in ("msg", "exc_text", "stack_info") if (part := facts[key]))
+        names = str(facts["levelname"])[:_NAME_LIMIT], str(facts["name"])[:_NAME_LIMIT]
+        with self._lock:
+            self._seq += 1
+            line = LogLine(self._seq, facts["created"], *names, facts["process"], _cut(text, _LINE_LIMIT))
+            encoded = _encoder.encode(line)
+            lines = self._lines.setdefault(path, deque())
+            self._lines.move_to_end(path)
+            lines.append(encoded)
+            self._grow(path, len(encoded))
+            while len(lines) > LINES_LIMIT or self._sizes[path] > BYTES_LIMIT:
+                self._grow(path, -len(lines.popleft()))
+            while self._size > ALL_BYTES_LIMIT:
+                silent, _ = self._lines.popitem(last=False)
+                self._size -= self._sizes.pop(silent)
+
+    def _grow(self, path: str, size: int) -> None:
+        self._sizes[path] = self._sizes.get(path, 0) + size
+        self._size += size
+
+    def paths(self) -> list[str]:
+        """Return the paths of the children of which there are lines."""
+        with self._lock:
+            return list(self._lines)
+
+    def lines(self, path: str, after: int = 0) -> list[LogLine]:
+        """Return the kept lines of a child with higher numbers than `after`, oldest first."""
+        with self._lock:
+            kept = list(self._lines.get(path, ()))
+        return [line for line in map(_decoder.decode, kept) if line.seq > after]

@@ -40,6 +40,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.hosting import forwarded_logs
+from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.hosting.process_node import SystemInfo
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.node import Node
@@ -211,6 +212,7 @@ class System:
             try:
                 self._state = state = open_state_dir(path)
                 self._log = TreeLog(state.folder)
+                self._child_logs = KeptLogs()
                 self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
                 place = str(state.path), str(state.run_dir), state.key
                 info = SystemInfo(self.name, *place, self.config, state.place, forwarded_logs.levels())
@@ -288,7 +290,8 @@ class System:
             await give_up_clients(node, dormant)
             if self.config.console:
                 shut_down = weakly(self._shut_down)
-                self._console = Console(self, node, self._subscribers, self._recordings, self._log, shut_down)
+                kept = self._log, self._child_logs
+                self._console = Console(self, node, self._subscribers, self._recordings, *kept, shut_down)
                 await self._console.open()
             self._tree = prepare(node, SupervisorActor, self._top, weakly(self._tree_ended))
             await self._start_tree(self._tree)
@@ -778,6 +781,7 @@ class System:
         self._subscribers.tell(event)
 
     def _take_log(self, workers: Workers, event: Facts) -> None:
+        self._child_logs.take(event)
         if (logs := self._logs) is None:
             logs = self._logs = Backlog(workers, forwarded_logs.take, self._say_missed_logs, _say_log_lost)
         try:

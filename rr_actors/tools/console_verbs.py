@@ -18,6 +18,7 @@ from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotRunning, RrError, UsageError, few, shown
 from rr_actors.base.names import short_ids
+from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.supervision.event_history import Record, left_records, records_of
@@ -42,6 +43,7 @@ from rr_actors.tools.cli_commands import (
 )
 from rr_actors.tools.explanations import explain
 from rr_actors.tools.process_usage import usage_of
+from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
 from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, wait_for
 from rr_actors.tools.tree_runner import run_tree
@@ -421,6 +423,49 @@ def history(
         say(event_line(event_of(record)))
         if record.traceback:
             say_lines(record.traceback.rstrip(), "    ")
+
+
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors logs cameras --previous --lines 20")
+def logs(
+    child: ChildArgument,
+    lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="The newest so many.")] = c.PAGE_LIMIT,
+    previous: Annotated[
+        bool, typer.Option("--previous", "-p", help="Only those of the process before the one that runs.")
+    ] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with new lines, until Ctrl-C.")] = False,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the last log lines of a child, also of the processes that it had before.
+
+    The system keeps 500 lines of each child in memory, and at most 256 KiB of text.
+    """
+    if follow and previous:
+        raise UsageError("--previous: expected no --follow with it, as a process that has ended logs no more")
+    with _client(state) as client:
+        log = log_of(client, child, lines, previous=previous)
+        text = LogText(log.path, [] if as_json else records_of_child(client, log.path))
+        _say_log(log.path, log.lines, text, as_json)
+        if not log.lines:
+            whose = f"{log.path}, of the process before" if previous else log.path
+            say(f"no log lines of {whose}{f': {log.note}' if log.note else ''}", err=True)
+        if not follow:
+            if not as_json:
+                say_lines("\n".join(text.end()))
+            return
+        with contextlib.suppress(NotRunning):
+            for new in new_lines(client, log.path, log.lines[-1].seq if log.lines else 0):
+                _say_log(log.path, new, text, as_json)
+    say("the system has ended", err=True)
+
+
+def _say_log(path: str, lines: list[LogLine], text: LogText, as_json: bool) -> None:
+    if as_json:
+        for line in lines:
+            say_json({"path": path, **msgspec.structs.asdict(line)})
+    else:
+        for one in text.of(lines):
+            say(one)
 
 
 @app.command("dead-letters", rich_help_panel=LOOK, epilog="Example: rr-actors dead-letters --limit 5")

@@ -14,6 +14,7 @@ import msgspec
 from rr_actors.actors.messaging.dead_letters import DeadLetter
 from rr_actors.base.names import named
 from rr_actors.base.values.failure import Failure
+from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.model.rows import State
@@ -223,6 +224,21 @@ class Happenings(Message, frozen=True):
 
     records: list[Record]
     left_out: int = 0
+
+
+class ChildLog(Message, frozen=True):
+    """The last log lines of a child, oldest first, also of processes that it had before.
+
+    Attributes:
+        path: the child's.
+        total: how many lines are kept that the question is about; the newest of them are here.
+        note: why a child has no lines of its own: it has no process of its own; "" for another.
+    """
+
+    path: str
+    total: int
+    lines: list[LogLine]
+    note: str = ""
 
 
 class Letters(Message, frozen=True):

@@ -109,6 +109,19 @@ class ListHistory(Verb[c.Happenings], frozen=True):
         return c.Happenings(records[older:], older)
 
 
+class ListLog(Verb[c.ChildLog], frozen=True):
+    """The newest log lines of a child, which its path or id names, with higher numbers than `after`."""
+
+    child: c.Text
+    after: c.Offset = 0
+    limit: c.Limit = c.PAGE_LIMIT
+
+    def _carry_out(self, view: View, caller: Caller) -> c.ChildLog:
+        path, note = view.logging_child(self.child)
+        lines = view.child_logs.lines(path, self.after)
+        return c.ChildLog(path, len(lines), lines[-self.limit :], note)
+
+
 class ListDeadLetters(Verb[c.Letters], frozen=True):
     """The newest dead letters."""
 

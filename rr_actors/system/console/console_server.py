@@ -19,6 +19,7 @@ from rr_actors.base.errors import ConfigError, MailboxFull, RrError, Unavailable
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.base.values.failure import failure_of
+from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.registrar.engine.node import Node
 from rr_actors.supervision.event_history import TreeLog
 from rr_actors.system.console import console_messages as c
@@ -51,6 +52,7 @@ class Console:
     Args:
         subscribers, recordings: the system's; the console's feed uses them.
         log: the log of the system's tree.
+        child_logs: the last log lines of its children.
         shut_down: stops the system, in a thread of its own.
     """
 
@@ -61,11 +63,12 @@ class Console:
         subscribers: Subscribers,
         recordings: Recordings,
         log: TreeLog,
+        child_logs: KeptLogs,
         shut_down: Callable[[], None],
     ) -> None:
         self.node = node
         self.decoder = decoder_of(REQUESTS)
-        self.view = View(system, node, log, shut_down)
+        self.view = View(system, node, log, child_logs, shut_down)
         self.feed = Feed(subscribers, recordings)
         self.welcome = c.Welcome(c.VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()

@@ -25,6 +25,8 @@ from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, readable, text_of
+from rr_actors.base.names import child_meant, no_child
+from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.pages import Page, QueryRow, ResourceRow, ServerRow, Wanted
@@ -73,16 +75,20 @@ class View:
     Args:
         system: held weakly, so that a dropped system is noticed.
         log: the log of its tree.
+        child_logs: the last log lines of its children.
         shut_down: stops the system, in a thread of its own.
 
     Attributes:
         clients: the registrars of clients.
     """
 
-    def __init__(self, system: Viewed, node: Node, log: TreeLog, shut_down: Callable[[], None]) -> None:
+    def __init__(
+        self, system: Viewed, node: Node, log: TreeLog, child_logs: KeptLogs, shut_down: Callable[[], None]
+    ) -> None:
         self._system = weakref.ref(system)
         self.node = node
         self._log = log
+        self.child_logs = child_logs
         self.shut_down = shut_down
         self.clients = ClientRegistrars()
         self._opening = threading.Lock()
@@ -131,6 +137,22 @@ class View:
         if path is None:
             raise NotFound(f"{child}: it is not in the tree", id=child)
         return path
+
+    def logging_child(self, child: str) -> tuple[str, str]:
+        """Return the path of a child that a path or id names, also of one that has left, and why it has no log lines.
+
+        Raises:
+            NotFound: there is no such child, or several have the id.
+        """
+        logged = self.child_logs.paths()
+        if (path := child_meant(child, logged)) is not None:
+            return path, ""
+        rows = {row.path: row for row in self._walk()}
+        if (path := child_meant(child, rows)) is None:
+            raise no_child(child, {*rows, *logged})
+        if not self.system.config.logging:
+            return path, "with SystemConfig(logging=False) a child's records go to its standard error"
+        return path, _no_log(path, rows)
 
     # -- registrars --------------------------------------------------------------------------------------------------
 
@@ -253,6 +275,16 @@ def _last_seen(records: list[Record], root: str, why: str) -> Iterator[c.ChildRo
         if newest[path].state is not None:
             kind = "supervisor" if newest[path].kind == "supervisor" else "worker"
             yield c.ChildRow(path, path.count("/"), kind, "stopped", restarts=restarts[path])
+
+
+def _no_log(path: str, rows: Mapping[str, c.ChildRow]) -> str:
+    """Say in which process a child runs that has none of its own; "" for another."""
+    hosts = [above for above in rows if f"{path}/".startswith(f"{above}/") and rows[above].pid == rows[path].pid]
+    if rows[path].pid is None or hosts == [path]:
+        return ""
+    if "/" in hosts[0]:
+        return f"it runs in the process of {hosts[0]}, whose log has its records"
+    return "it runs in the application's process, whose own logging has its records"
 
 
 def _rows(node: Mapping[str, Any], depth: int = 0) -> Iterator[c.ChildRow]:

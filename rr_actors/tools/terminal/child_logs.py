@@ -1,0 +1,86 @@
+"""Log lines of a child as text: one life after the other, each with its process and its end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+
+from rr_actors.hosting.forwarded_logs import LogLine
+from rr_actors.supervision.event_history import Record
+from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_messages import PAGE_LIMIT, ChildLog
+from rr_actors.system.console.console_questions import ListChildren, ListHistory, ListLog
+
+_TICK_S = 0.3  # between two questions for new lines
+
+
+class LogText:
+    """The text of a child's log lines. A heading stands where a life begins, and where one has ended.
+
+    Args:
+        path: the child's.
+        records: of its history, which say how its processes ended.
+    """
+
+    def __init__(self, path: str, records: Sequence[Record] = ()) -> None:
+        self._path = path
+        self._records = [record for record in records if record.path == path]
+        self._pid = 0
+
+    def of(self, lines: Iterable[LogLine]) -> Iterator[str]:
+        """Yield the lines of text for further log lines."""
+        for line in lines:
+            if line.pid != self._pid:
+                yield from self.end()
+                yield f"-- {self._path}, process {line.pid} --"
+                self._pid = line.pid
+            yield from text_of(line)
+
+    def end(self) -> Iterator[str]:
+        """Yield a heading with the end of the last life, if it is known."""
+        for record in self._records:
+            if record.pid == self._pid and record.reason:
+                how = ": ".join(dict.fromkeys(filter(None, (record.reason, record.detail))))
+                yield f"-- process {record.pid} ended at {_clock(record.at)}: {how} --"
+
+
+def text_of(line: LogLine) -> Iterator[str]:
+    """Yield the text of a log line; the further lines of its message and traceback are indented."""
+    first, *more = line.text.splitlines() or [""]
+    yield f"{_clock(line.at)} {line.level:<8} {line.logger}: {first}"
+    yield from (f"    {one}" for one in more)
+
+
+def _clock(at: float) -> str:
+    return f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at % 1 * 1000):03d}"
+
+
+def log_of(client: ConsoleClient, child: str, count: int, *, previous: bool = False) -> ChildLog:
+    """Return the last `count` lines of a child; with `previous` those of the process before the one that runs."""
+    log = client.ask(ListLog(child))
+    lines = log.lines
+    if previous:
+        rows = client.ask(ListChildren(log.path)).rows
+        runs = {row.pid for row in rows if row.path == log.path}
+        before = [line.pid for line in lines if line.pid not in runs]
+        lines = [line for line in lines if line.pid == before[-1]] if before else []
+    return ChildLog(log.path, log.total, lines[-count:], log.note)
+
+
+def records_of_child(client: ConsoleClient, path: str) -> list[Record]:
+    """Return the newest records of a child's history."""
+    return client.ask(ListHistory(path, PAGE_LIMIT)).records
+
+
+def new_lines(client: ConsoleClient, path: str, after: int) -> Iterator[list[LogLine]]:
+    """Yield the lines of a child with higher numbers than `after` as they come, without end.
+
+    Raises:
+        NotRunning: the system has ended.
+    """
+    while True:
+        lines = client.ask(ListLog(path, after)).lines
+        if lines:
+            after = lines[-1].seq
+            yield lines
+        time.sleep(_TICK_S)
