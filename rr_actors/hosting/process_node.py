@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import InvalidName, NotFound, Unavailable, shown
 from rr_actors.base.folder import Place
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import ProcessStacks, stacks_here
 from rr_actors.base.steps import Steps
 from rr_actors.hosting.run_files import Keeper, Watched
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
@@ -46,6 +47,48 @@ class SystemInfo(msgspec.Struct, frozen=True):
 
 def _unheard(_text: str) -> None:
     """Do nothing: no supervisor of another process hears it."""
+
+
+Ask = Callable[[str, float], Awaitable[ProcessStacks]]
+"""A function that asks the process of a child, or one below it: by the path of that child, within so many seconds."""
+
+
+class Stacks:
+    """The way to the stacks of this process and of all processes below it. On the loop, except for paths().
+
+    The loop of a process answers, so a thread of a user may be busy or wait for ever. The process that started it asks,
+    over the control channel. So each process knows the way to those directly below it, and passes on a question for one
+    further down.
+    """
+
+    def __init__(self) -> None:
+        self._below: dict[str, Ask] = {}
+
+    def paths(self) -> list[str]:
+        """Return the paths of the children that have processes directly below this one. From any thread."""
+        return list(self._below)
+
+    def add(self, path: str, ask: Ask) -> None:
+        """Add the process of a child, in the place of the one that it had before."""
+        self._below[path] = ask
+
+    def remove(self, path: str, ask: Ask) -> None:
+        """Remove the process of a child, which has ended, unless another has its place already."""
+        if self._below.get(path) == ask:
+            del self._below[path]
+
+    async def of(self, path: str, limit_s: float) -> ProcessStacks:
+        """Return the stacks of the process in which the child at this path runs.
+
+        Raises:
+            Unavailable: the process has ended, or did not answer in time.
+        """
+        above = path
+        while above:
+            if (ask := self._below.get(above)) is not None:
+                return await ask(path, limit_s)
+            above = above.rpartition("/")[0]
+        return stacks_here()
 
 
 class ProcessNode(abc.ABC):
@@ -89,6 +132,7 @@ class ProcessNode(abc.ABC):
         """Called with the callbacks that ran when the process died that a registrar of this one had before."""
         self.on_resumed: Callable[[str], None] = _unheard
         """Called with each callback that goes on with such work before its registrar serves."""
+        self.stacks = Stacks()
         self.spawner = Spawner(info.config.preload, info.run_dir)
         self.keeper.also.append(self.spawner.reap)
         self.hub = ActorHub(

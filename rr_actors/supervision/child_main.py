@@ -16,7 +16,7 @@ from typing import Any
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
-from rr_actors.base.errors import NotSerializable, Unavailable
+from rr_actors.base.errors import NotSerializable, Unavailable, text_of
 from rr_actors.base.reporting import log
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
@@ -91,6 +91,7 @@ class ChildProcess:
         self._told_to_stop: asyncio.Future[None] = loop.create_future()
         self._stop: control.Stop | None = None
         self._is_limited = False  # the parent limits the stops that it asks for
+        self._looking: set[asyncio.Task[None]] = set()
         self._report: asyncio.Future[ExitReport] = loop.create_future()  # of an actor that has ended by itself
 
     async def live(self) -> int:
@@ -192,8 +193,19 @@ class ChildProcess:
                 self._stop_as(message)
             case control.Ping():
                 self._say(control.Pong(self._health.trouble()))
+            case control.AskStacks():
+                task = self.node.dispatcher.loop.create_task(self._find_stacks(message))
+                self._looking.add(task)  # the loop itself keeps only weak references
+                task.add_done_callback(self._looking.discard)
             case _:
                 logger.error("%s: unexpected on the control channel: %r", self._path, message)
+
+    async def _find_stacks(self, asked: control.AskStacks) -> None:
+        try:
+            found = control.FoundStacks(asked.number, await self.node.stacks.of(asked.path, asked.limit_s))
+        except Exception as error:
+            found = control.FoundStacks(asked.number, None, text_of(error).partition(": ")[2])
+        self._say(found)
 
     def _directories(self) -> list[Path]:
         """Return the directories this process works in: the system's, and those of its registrars that write."""

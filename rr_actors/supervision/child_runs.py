@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import os
 import signal
 import time
@@ -19,9 +20,9 @@ from msgspec.structs import replace
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
-from rr_actors.base.errors import StartFailed, text_of
+from rr_actors.base.errors import StartFailed, Unavailable, text_of
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.reporting.tracebacks import add_note, trace_of
+from rr_actors.base.reporting.tracebacks import ProcessStacks, add_note, trace_of
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.node import Node
@@ -39,6 +40,7 @@ logger = Log("rr_actors.supervision")
 
 ENTRY = "rr_actors.supervision.child_main:main"
 _LAST_WORDS_S = 0.05  # the longest wait for a dead process's last messages
+_PASSED_ON = 0.8  # of a time limit, what a process below has of it: it says why one further down is silent
 _LEAVE_S = 2.0  # the longest time from a process's last answer to its end
 
 OnEnd = Callable[[Exit], None]
@@ -109,6 +111,8 @@ class ProcessRun:
         self._resumed = ""  # a callback of a resource that went on with such work during its start
         self._stopping = False
         self._heartbeat: Heartbeat | None = None
+        self._asked: dict[int, asyncio.Future[control.FoundStacks]] = {}
+        self._numbers = itertools.count(1)
 
     # -- Run -------------------------------------------------------------------------------------------------------
 
@@ -180,6 +184,7 @@ class ProcessRun:
             self._process = self.pid = None
             process.close()
             raise
+        self._node.stacks.add(self._path, self.ask_stacks)
         if self._exited is not None:
             self._await_last_words()
 
@@ -234,6 +239,9 @@ class ProcessRun:
                     self._heartbeat.heard(message.trouble)
             case control.Resumed():
                 self._resumed = message.run
+            case control.FoundStacks():
+                if (asked := self._asked.get(message.number)) is not None and not asked.done():
+                    asked.set_result(message)
             case control.DiedInCallback():
                 if not (self._up or self._died_before):
                     self._died_before = True
@@ -259,6 +267,34 @@ class ProcessRun:
 
     def _starved_s(self) -> float:
         return 0.0 if self._process is None else lifeline.starved_s(self._process.pid)
+
+    async def ask_stacks(self, path: str, limit_s: float) -> ProcessStacks:
+        """Return the stacks of the process of the child at `path`: of this child, or of one below it.
+
+        Raises:
+            Unavailable: the process has ended, or did not answer in time.
+        """
+        number = next(self._numbers)
+        asked = self._asked[number] = self._loop.create_future()
+        try:
+            if self._channel is not None:
+                self._channel.send(control.AskStacks(number, path, limit_s * _PASSED_ON))
+            await asyncio.wait((asked,), timeout=limit_s)
+        finally:
+            del self._asked[number]
+        if not asked.done():
+            silent = f"{self._path}: process {self.pid} did not answer within {limit_s:g} s"
+            raise Unavailable(f"{silent}: {self._why_silent()}")
+        found = asked.result()
+        if found.stacks is None:
+            raise Unavailable(found.error)
+        return found.stacks
+
+    def _why_silent(self) -> str:
+        paused = "" if self.pid is None else lifeline.stopped(self.pid)
+        if paused:
+            return f"it is {paused}"
+        return "its loop does not turn: code that is not Python may hold the interpreter"
 
     # -- its end ---------------------------------------------------------------------------------------------------
 
@@ -304,6 +340,10 @@ class ProcessRun:
         if self._channel is not None:
             steps.take("closing the channel", self._channel.close)
         steps.take("ending what it started", self._on_died)
+        self._node.stacks.remove(self._path, self.ask_stacks)
+        for number, asked in self._asked.items():
+            if not asked.done():
+                asked.set_result(control.FoundStacks(number, None, f"{self._path}: its process has ended meanwhile"))
         steps.take("giving its descriptors back", self._process.close)
         steps.report(logger, self._path)
         code = self._exited.code

@@ -1,7 +1,7 @@
 """Control: the messages between a supervisor and the process of one of its children, over their own socket pair.
 
-Parent to child: Start, Stop, Ping. Child to parent: Ready, Ignored or Failed, once; Pong; News; Exiting, last. Messages
-are decoded by type. Pickled values of users stay bytes here; a worker unpickles them.
+Parent to child: Start, Stop, Ping, AskStacks. Child to parent: Ready, Ignored or Failed, once; Pong; FoundStacks; News;
+Exiting, last. Messages are decoded by type. Pickled values of users stay bytes here; a worker unpickles them.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, cast
 import msgspec
 
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import ProcessStacks
 from rr_actors.wire.frames import FrameReader, framed
 
 logger = Log("rr_actors")
@@ -41,6 +42,25 @@ class Pong(msgspec.Struct, tag=True, array_like=True, frozen=True):
     """The loop is alive. `trouble`: why the process cannot work any more, "" if it can."""
 
     trouble: str = ""
+
+
+class AskStacks(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """Answer with FoundStacks of this number: where the threads are of the process in which the child at `path` runs.
+
+    It is this process, or one below it, which has `limit_s` seconds to answer.
+    """
+
+    number: int
+    path: str
+    limit_s: float
+
+
+class FoundStacks(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """The answer to AskStacks. `error`: why there are none."""
+
+    number: int
+    stacks: ProcessStacks | None
+    error: str = ""
 
 
 class Ready(msgspec.Struct, tag=True, array_like=True, frozen=True):
@@ -89,7 +109,9 @@ class News(msgspec.Struct, tag=True, array_like=True, frozen=True):
     event: dict[str, Any]
 
 
-Message = Start | Stop | Ping | Pong | Ready | Ignored | Failed | Exiting | News | DiedInCallback | Resumed
+Message = (Start | Stop | Ping | AskStacks) | (
+    Ready | Ignored | Failed | DiedInCallback | Resumed | Pong | FoundStacks | News | Exiting
+)
 
 
 def send_first(end: socket.socket, message: Message) -> None:

@@ -468,6 +468,27 @@ def _say_log(path: str, lines: list[LogLine], text: LogText, as_json: bool) -> N
             say(one)
 
 
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors stack cameras --timeout 10")
+def stack(
+    child: ChildArgument, timeout_s: Timeout = 5.0, state: StateOption = None, as_json: JsonOption = False
+) -> None:
+    """Show where each thread of a child's process is now, also if the child is stuck."""
+    with _client(state, timeout_s) as client:
+        found = client.ask(questions.ListStacks(child, timeout_s))
+    if as_json:
+        say_json({"path": found.path, **msgspec.to_builtins(found.stacks)})
+        return
+    left_out = f", {found.stacks.left_out} of them left out" if found.stacks.left_out else ""
+    count = len(found.stacks.threads) + found.stacks.left_out
+    say(f"{found.path}: process {found.stacks.pid}, {count} threads{left_out}")
+    for one in found.stacks.threads:
+        say(f"{one.thread}:")
+        for frame in one.frames:
+            place, *source = frame.splitlines()
+            say(f"    {place}")
+            say_lines("\n".join(source), "        ")
+
+
 @app.command("dead-letters", rich_help_panel=LOOK, epilog="Example: rr-actors dead-letters --limit 5")
 def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
     """Show how many messages could not be delivered, and the newest of them."""

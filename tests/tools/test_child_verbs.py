@@ -1,18 +1,21 @@
-"""`rr-actors logs`: what a child has said, seen from a shell."""
+"""`rr-actors logs` and `stack`: what a child has said, and what it is stuck in, seen from a shell."""
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 
 import pytest
 
 import rr_actors as rr
-from support import LIMIT_S, eventually, kill, pid_of, wait_respawned
+from support import LIMIT_S, Workshop, eventually, hang, kill, pid_of, wait_respawned
 from support_cli import run_cli
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
@@ -42,6 +45,21 @@ class Talker(rr.Manager):
         except ValueError:
             log.exception("it failed")
         return text
+
+
+class Stuck(rr.Actor):
+    """Does not return from its start before its step is opened; then it counts for ever when it is asked to."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    def on_start(self) -> None:
+        self.work.step("start")
+
+    def on_receive(self, message: object) -> None:
+        self.work.note("counts")
+        while True:
+            pass
 
 
 def said(*arguments: object) -> list[str]:
@@ -174,3 +192,61 @@ def test_several_children_of_one_id_are_named(start: Start) -> None:
     there = rr.Supervisor([rr.ChildSpec(rr.Actor, id="same")], id="inner")
     start(rr.ChildSpec(rr.Actor, id="same"), there)
     assert "'same': several children have this id: root/inner/same, root/same" in refused("logs", "same")
+
+
+# -- stack -----------------------------------------------------------------------------------------------------------
+
+
+def frames(*arguments: object) -> str:
+    """What `stack` shows of a child."""
+    return "\n".join(said("stack", *arguments))
+
+
+def test_the_stack_of_a_child_is_shown_while_it_starts_and_while_its_thread_is_busy(
+    start: Start, workshop: Workshop
+) -> None:
+    workshop.shut("start")
+    spec = rr.ChildSpec(Stuck, id="stuck", args=(str(workshop.root),), shutdown_s="brutal_kill")
+    started: list[rr.System] = []
+    starting = threading.Thread(target=lambda: started.append(start(spec)))
+    starting.start()
+    workshop.wait("start")
+    assert re.search(r'test_child_verbs.py", line \d+, in Stuck.on_start\n +self.work.step', frames("stuck"))
+    workshop.open("start")
+    starting.join(LIMIT_S)
+    (system,) = started
+
+    system.ref("stuck").tell("count")
+    workshop.wait("counts")
+    shown = frames("root/stuck")
+    assert shown.startswith(f"root/stuck: process {pid_of(system, 'stuck')}, ")
+    assert re.search(r"in Stuck.on_receive\n +(pass|while True:)", shown)
+    facts = json.loads(said("stack", "stuck", "--json")[0])
+    assert facts["pid"] == pid_of(system, "stuck")
+    assert any("Stuck.on_receive" in frame for one in facts["threads"] for frame in one["frames"])
+
+
+def test_the_stacks_of_processes_further_below_and_of_the_application_are_shown(start: Start) -> None:
+    deep = rr.Supervisor([rr.ChildSpec(Talker, id="deep")], id="inner", placement="process")
+    system = start(rr.Supervisor([deep]))
+    pid = system.supervisor("inner").which_child("deep").pid
+    assert pid is not None
+    assert frames("deep").startswith(f"root/inner/deep: process {pid}, ")
+    assert frames("root").startswith(f"root: process {os.getpid()}, ")
+    assert "test_child_verbs.py" in frames("root")
+
+    hang(pid)
+    ran = run_cli("stack", "deep", "--timeout", "1")
+    assert (ran.returncode, ran.stdout) == (4, "")
+    told = rf"rr-actors: root/inner/deep: process {pid} did not answer within 0.8 s: it is stopped by a signal, .*\n"
+    assert re.fullmatch(told, ran.stderr)
+    os.kill(pid, signal.SIGCONT)
+    assert frames("deep")
+
+
+def test_a_child_that_does_not_run_has_no_stack(system: rr.System) -> None:
+    said("terminate", "talker")
+    ran = run_cli("stack", "talker")
+    assert (ran.returncode, ran.stderr) == (4, "rr-actors: root/talker: it has no process now: it is stopped\n")
+    assert "did you mean 'near'?" in refused("stack", "neer")
+    assert frames("near").startswith(f"root/inner/near: process {os.getpid()}, ")

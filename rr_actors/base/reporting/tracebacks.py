@@ -1,15 +1,25 @@
-"""Traces: the traceback of any exception as text. It is made without fail, and has an end."""
+"""Traces: the traceback of any exception as text, and the stacks of all threads.
+
+They are made without fail, and have an end.
+"""
 
 from __future__ import annotations
 
+import linecache
+import os
 import sys
+import threading
 import traceback
 from types import FrameType, TracebackType
+
+import msgspec
 
 from rr_actors.base.errors import Described, is_a, name_of_class, readable, text_of
 
 _LONGEST = 50_000  # characters
-_FRAMES = 100
+_FRAMES = 100  # of a traceback or of a thread
+_ALL_STACKS = 1_000_000  # characters of the stacks of all threads
+_LONGEST_LINE = 300
 
 _traceback: property = BaseException.__dict__["__traceback__"]
 
@@ -55,3 +65,56 @@ def add_note(error: BaseException, note: str) -> None:
 def stacks_of_threads() -> dict[int, FrameType]:
     """Return the innermost frame of each thread of this process, by the thread's ident."""
     return sys._current_frames()  # pyright: ignore[reportPrivateUsage]  # documented
+
+
+class ThreadStack(msgspec.Struct, frozen=True):
+    """The stack of one thread: its frames, the innermost one last, each with its line of source if that is known."""
+
+    thread: str
+    frames: list[str]
+
+
+class ProcessStacks(msgspec.Struct, frozen=True):
+    """The stacks of the threads of a process. `left_out`: of how many threads there was no room."""
+
+    pid: int
+    threads: list[ThreadStack]
+    left_out: int = 0
+
+
+def stacks_here() -> ProcessStacks:
+    """Return the stacks of this process's threads. It runs no code of users."""
+    frames = stacks_of_threads()
+    names = {thread.ident: thread.name for thread in threading.enumerate()}
+    found: list[ThreadStack] = []
+    size = 0
+    for ident, frame in sorted(frames.items(), key=lambda item: item[0] not in names):
+        lines = _lines_of(frame)
+        size += sum(map(len, lines))
+        if size > _ALL_STACKS:
+            break
+        found.append(ThreadStack(readable(names.get(ident, f"thread {ident}"), _LONGEST_LINE), lines))
+    return ProcessStacks(os.getpid(), found, len(frames) - len(found))
+
+
+def _lines_of(innermost: FrameType) -> list[str]:
+    lines: list[str] = []
+    frame: FrameType | None = innermost
+    while frame is not None and len(lines) < _FRAMES:
+        code, number = frame.f_code, frame.f_lineno
+        source = _source_of(code.co_filename, number)
+        place = f'File "{code.co_filename}", line {number}, in {code.co_qualname}'
+        lines.append(readable(place + source, 2 * _LONGEST_LINE))
+        frame = frame.f_back
+    if frame is not None:
+        lines.append("... further frames above are left out")
+    return lines[::-1]
+
+
+def _source_of(file: str, number: int | None) -> str:
+    """Return a line of a file, without its module: that may have a loader of its own, which is a user's code."""
+    try:
+        line = linecache.getline(file, number or 0).strip()
+    except Exception as error:
+        line = f"({name_of_class(type(error))}: {text_of(error)})"
+    return f"\n{line[:_LONGEST_LINE]}" if line else ""

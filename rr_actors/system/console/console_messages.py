@@ -13,6 +13,7 @@ import msgspec
 
 from rr_actors.actors.messaging.dead_letters import DeadLetter
 from rr_actors.base.names import named
+from rr_actors.base.reporting.tracebacks import ProcessStacks
 from rr_actors.base.values.failure import Failure
 from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.hosting.streams import StreamRow
@@ -239,6 +240,13 @@ class ChildLog(Message, frozen=True):
     total: int
     lines: list[LogLine]
     note: str = ""
+
+
+class ChildStacks(Message, frozen=True):
+    """Where the threads are of the process in which a child runs."""
+
+    path: str
+    stacks: ProcessStacks
 
 
 class Letters(Message, frozen=True):

@@ -122,6 +122,17 @@ class ListLog(Verb[c.ChildLog], frozen=True):
         return c.ChildLog(path, len(lines), lines[-self.limit :], note)
 
 
+class ListStacks(Verb[c.ChildStacks], frozen=True):
+    """The stacks of all threads of the process of a child, which its path or id names."""
+
+    child: c.Text
+    limit_s: c.Seconds = 5.0
+
+    def _carry_out(self, view: View, caller: Caller) -> c.ChildStacks:
+        path = view.running_child(self.child)
+        return c.ChildStacks(path, view.node.dispatcher.run(view.node.stacks.of(path, self.limit_s)))
+
+
 class ListDeadLetters(Verb[c.Letters], frozen=True):
     """The newest dead letters."""
 

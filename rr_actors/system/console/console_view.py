@@ -154,6 +154,22 @@ class View:
             return path, "with SystemConfig(logging=False) a child's records go to its standard error"
         return path, _no_log(path, rows)
 
+    def running_child(self, child: str) -> str:
+        """Return the path of a child that runs or starts, which a path or id names.
+
+        Raises:
+            NotFound: there is no such child, or several have the id.
+            Unavailable: it does not run.
+        """
+        if (path := child_meant(child, self.node.stacks.paths())) is not None:
+            return path
+        rows = {row.path: row for row in self._walk()}
+        if (path := child_meant(child, rows)) is None:
+            raise no_child(child, rows)
+        if rows[path].pid is None:
+            raise Unavailable(f"{path}: it has no process now: it is {rows[path].state}")
+        return path
+
     # -- registrars --------------------------------------------------------------------------------------------------
 
     def up(self, registrar: str) -> list[str]:
