@@ -20,8 +20,9 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import NotFound, readable
+from rr_actors.base.errors import readable
 from rr_actors.base.folder import Folder
+from rr_actors.base.names import child_meant, no_child
 from rr_actors.base.notebook import bundle, table
 from rr_actors.base.reporting.log import Log
 
@@ -251,11 +252,6 @@ def records_of(records: list[Record], child: str) -> list[Record]:
     if not child:
         return records
     paths = {record.path for record in records}
-    found = [path for path in paths if child in (path, path.rpartition("/")[2])]
-    if child in paths:
-        found = [child]
-    if len(found) != 1:
-        there = ", ".join(sorted(found or paths))
-        text = "several children have this id" if found else "no such child has lived"
-        raise NotFound(f"{child}: {text}: {there}", id=child)
-    return [record for record in records if f"{record.path}/".startswith(f"{found[0]}/")]
+    if (found := child_meant(child, paths)) is None:
+        raise no_child(child, paths)
+    return [record for record in records if f"{record.path}/".startswith(f"{found}/")]

@@ -16,7 +16,7 @@ import typer
 
 from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import NotRunning, RrError, UsageError, few, shown
+from rr_actors.base.errors import NotRunning, RrError, UsageError, shown
 from rr_actors.base.names import short_ids
 from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
@@ -45,7 +45,7 @@ from rr_actors.tools.explanations import explain
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
-from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, wait_for
+from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
 from rr_actors.tools.tree_runner import run_tree
 
 __all__ = ["app"]
@@ -738,14 +738,10 @@ def status(
 def _show_status(state: Path | None, target: str, as_json: bool) -> None:
     """Show a child with its latest history, or explain a resource; exit code 1 if a child does not run."""
     with _client(state) as client:
-        rows = [row for row in client.children().rows if target in (row.path, row.id)]
-        if not rows:
+        if (row := child_of(client, target)) is None:
             lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
             say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
             return
-        if len(rows) > 1:
-            raise UsageError(f"{shown(target)}: several children have this id: {few(row.path for row in rows)}")
-        (row,) = rows
         served = [one for one in client.registrars().rows if one.name == row.id]
         records = client.ask(questions.ListHistory(row.path, _LATEST)).records
     facts = _child_facts(row, {row.pid: usage_of(row.pid)} if row.pid is not None else {})

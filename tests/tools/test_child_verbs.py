@@ -191,7 +191,8 @@ def test_an_unknown_child_is_refused_with_the_nearest_name_and_one_without_a_pro
 def test_several_children_of_one_id_are_named(start: Start) -> None:
     there = rr.Supervisor([rr.ChildSpec(rr.Actor, id="same")], id="inner")
     start(rr.ChildSpec(rr.Actor, id="same"), there)
-    assert "'same': several children have this id: root/inner/same, root/same" in refused("logs", "same")
+    for verb in ("logs", "stack", "status", "wait"):
+        assert "'same': several children have this id: root/inner/same, root/same" in refused(verb, "same")
 
 
 # -- stack -----------------------------------------------------------------------------------------------------------

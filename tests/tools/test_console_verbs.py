@@ -488,7 +488,7 @@ def test_after_a_tree_has_given_up_its_exits_are_still_shown_and_looking_counts_
 
     system.stop()
     assert "ValueError: enough" in said("history", "loud", "--state", state_dir)
-    told = "nobody: no such child has lived: root, root/inner, root/inner/loud"
+    told = "'nobody': there is no child of this path or id; there are: inner, loud, root"
     assert told in refused(2, "history", "nobody", "--state", state_dir)
 
 

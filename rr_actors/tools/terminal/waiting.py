@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 
 from rr_actors.base.errors import NotRunning, UsageError, few, shown
+from rr_actors.base.names import child_meant
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_questions import Find
@@ -31,7 +32,7 @@ def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, tim
 
     Raises:
         NotRunning: no system ran until the time limit; or it has ended meanwhile, and `wanted` is not GONE.
-        UsageError: no such state is known, or several children or resources have this name.
+        UsageError: no such state is known, or several children (NotFound) or resources have this name.
     """
     known = (*CHILD_STATES, *RESOURCE_STATES, GONE)
     if wanted and wanted.lower() not in map(str.lower, known):
@@ -79,13 +80,21 @@ def _looks(hearing: ConsoleClient, deadline: float) -> Iterator[None]:
     raise NotRunning(f"the system in {hearing.welcome.state_dir} has ended")
 
 
+def child_of(asking: ConsoleClient, target: str) -> c.ChildRow | None:
+    """Return the child of this path or id; None if there is none.
+
+    Raises:
+        NotFound: several children have this id.
+    """
+    rows = {row.path: row for row in asking.children().rows}
+    path = child_meant(target, rows)
+    return None if path is None else rows[path]
+
+
 def _states_of(asking: ConsoleClient, target: str) -> list[str]:
     """Return the state of the child of this name, or the last status and the phase of the resource; else GONE."""
-    children = [row for row in asking.children().rows if target in (row.path, row.id)]
-    if len(children) > 1:
-        raise UsageError(f"{shown(target)}: several children have this id: {few(row.path for row in children)}")
-    if children:
-        return [children[0].state]
+    if (child := child_of(asking, target)) is not None:
+        return [child.state]
     resources = asking.ask(Find(target)).resources
     if len(resources) > 1:
         several = few(f"{row.name} ({row.id})" for row in resources)
