@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import shlex
 import shutil
@@ -99,6 +100,27 @@ def test_the_tree_shows_the_children_and_the_chosen_ones_history(shop: rr.System
         assert str(pid_of(shop, "shop")) in person.chosen
         assert person.tree.splitlines()[0].startswith("root")
         assert "@shop" in person.tree
+
+    sit_down(state_dir, scene)
+
+
+class Talker(rr.Actor):
+    """Logs what it is sent."""
+
+    def on_receive(self, message: Any) -> None:
+        logging.getLogger("talk").error("%s", message)
+
+
+def test_what_a_child_logs_stands_between_its_events(start: Start, state_dir: Path) -> None:
+    system = start(rr.ChildSpec(Talker, id="talker"))
+    system.ref("talker").tell("no such \x1b[31mdevice")
+
+    async def scene(person: Person) -> None:
+        await person.chooses("  talker")
+        await person.sees(lambda: "ERROR    talk: no such ·[31mdevice" in person.chosen)
+        before, _, after = person.chosen.partition("talk: no such")
+        assert "started" not in before
+        assert "started" in after
 
     sit_down(state_dir, scene)
 

@@ -101,6 +101,8 @@ class Stage(ConsoleLink):
                 return c.Resources(len(served), served[offset : offset + limit])
             case questions.ListHistory(path, _):
                 return c.Happenings([record for record in HISTORY if record.path.startswith(path)])
+            case questions.ListLog(path):
+                return c.ChildLog(path, 0, [])
             case questions.Find(id):
                 part = QueryRow(id, "cameras", "lenses/lens", LENS, FRONT, '"front"', "held", "WARNING")
                 found = [row for rows in SERVED.values() for row in rows if row.id == id]

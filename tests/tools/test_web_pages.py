@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib.machinery
 import json
+import logging
 import os
 import shutil
 import subprocess
@@ -83,7 +84,7 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.S
 
 
 @pytest.mark.slow
-def test_a_child_that_fails_shows_its_traceback(start: Start, tab: Tab) -> None:
+def test_a_child_that_fails_shows_its_traceback_and_what_it_logged(start: Start, tab: Tab) -> None:
     system = start(rr.ChildSpec(Fragile, id="fragile"))
     with system.serve_web() as page:
         tab.goes_to(page.url)
@@ -91,10 +92,12 @@ def test_a_child_that_fails_shows_its_traceback(start: Start, tab: Tab) -> None:
         system.ref("fragile").tell("break")
         tab.sees(node("root/fragile"), "↻1")
         tab.sees(".rr-rows", "ValueError: broken on purpose", "Traceback", "on_receive")
+        tab.sees(".rr-rows", "ERROR    fragile: <img src=x onerror=alert(1)> told to break")
 
 
 class Fragile(rr.Actor):
     def on_receive(self, message: object) -> None:
+        logging.getLogger("fragile").error("<img src=x onerror=alert(1)> told to %s", message)
         raise ValueError("broken on purpose")
 
 

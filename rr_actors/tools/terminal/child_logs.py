@@ -34,7 +34,9 @@ class LogText:
                 yield from self.end()
                 yield f"-- {self._path}, process {line.pid} --"
                 self._pid = line.pid
-            yield from text_of(line)
+            first, *more = line_texts(line)
+            yield first
+            yield from (f"    {one}" for one in more)
 
     def end(self) -> Iterator[str]:
         """Yield a heading with the end of the last life, if it is known."""
@@ -44,11 +46,10 @@ class LogText:
                 yield f"-- process {record.pid} ended at {_clock(record.at)}: {how} --"
 
 
-def text_of(line: LogLine) -> Iterator[str]:
-    """Yield the text of a log line; the further lines of its message and traceback are indented."""
+def line_texts(line: LogLine) -> list[str]:
+    """Return the text of a log line with its time, and the further lines of its message and traceback."""
     first, *more = line.text.splitlines() or [""]
-    yield f"{_clock(line.at)} {line.level:<8} {line.logger}: {first}"
-    yield from (f"    {one}" for one in more)
+    return [f"{_clock(line.at)} {line.level:<8} {line.logger}: {first}", *more]
 
 
 def _clock(at: float) -> str:

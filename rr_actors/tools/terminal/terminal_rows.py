@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
-from rr_actors.base.errors import RrError, UnknownQuery
+from rr_actors.base.errors import NotFound, RrError, UnknownQuery
 from rr_actors.base.names import named, short_id
+from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
+from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
@@ -19,6 +21,7 @@ from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.explanations import name_of_resource, since
 from rr_actors.tools.process_usage import usage_of
+from rr_actors.tools.terminal.child_logs import line_texts
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_of
 
 WORST = (
@@ -28,6 +31,8 @@ WORST = (
 """The states of resources, the worst first."""
 LOOK_S = 10.0  # for the answer to a question
 _HISTORY = 100  # records
+_LOGGED = 50  # lines of a child's log
+_LEVEL_STYLES = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red"}
 _A = TypeVar("_A")
 
 
@@ -63,6 +68,10 @@ class Row:
     query: str = ""
     name: str = ""
     columns: str = ""
+
+
+Lines: TypeAlias = list[Row]
+"""Rows, as a class with a method `list` calls the type."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +152,7 @@ class Served:
 
 @dataclass(frozen=True)
 class Past:
-    """A child's state, and the history of it and of all children below it, newest first."""
+    """A child's state, the history of it and of all children below it, and its log lines, newest first."""
 
     path: str
 
@@ -153,14 +162,18 @@ class Past:
         return f"{self.path}: history"
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask the system for the child's state and history."""
+        """Ask the system for the child's state, history and log."""
         records = link.ask(questions.ListHistory(self.path, _HISTORY), LOOK_S).records
         rows = [row for place in _places(link, self.path) for row in _wrapped(_as_it_is(place), window.width, "bold")]
-        for record in reversed(records):
-            line = EventLine.of(event_of(record), self.path)
-            rows += _wrapped(str(line), window.width, style_of(line))
-            rows += [Row("", f"    {line}", style="dim") for line in record.traceback.rstrip().splitlines()]
+        happened = [(record.at, self._happened(record, window.width)) for record in records]
+        happened += [(line.at, _logged(line, window.width)) for line in _log(link, self.path)]
+        for _, shown in sorted(happened, key=lambda one: one[0])[::-1]:
+            rows += shown
         return _cut(rows, window)
+
+    def _happened(self, record: Record, width: int) -> Lines:
+        line = EventLine.of(event_of(record), self.path)
+        return [*_wrapped(str(line), width, style_of(line)), *_indented(record.traceback.rstrip().splitlines())]
 
 
 @dataclass(frozen=True)
@@ -253,6 +266,23 @@ def _cut(rows: list[Row], window: Window) -> Listed:
 def _wrapped(text: str, width: int, style: str = "") -> list[Row]:
     lines = textwrap.wrap(text, max(20, width), subsequent_indent="    ")
     return [Row("", line, style=style) for line in lines]
+
+
+def _indented(lines: Iterable[str]) -> list[Row]:
+    return [Row("", f"    {line}", style="dim") for line in lines]
+
+
+def _logged(line: LogLine, width: int) -> list[Row]:
+    first, *more = line_texts(line)
+    return [*_wrapped(first, width, _LEVEL_STYLES.get(line.level, "")), *_indented(more)]
+
+
+def _log(link: Asks, path: str) -> list[LogLine]:
+    """Return the newest log lines of a child; none if neither it nor its lines are there any more."""
+    try:
+        return link.ask(questions.ListLog(path, limit=_LOGGED), LOOK_S).lines
+    except NotFound:
+        return []
 
 
 def _places(link: Asks, path: str) -> list[c.ChildRow]:
