@@ -55,6 +55,7 @@ _UNLOAD_S = 60.0  # for the unload callbacks, after a grace
 _LATEST = 10  # records of a child that its status shows
 _SHOWN = 200  # rows of a list, unless more are asked for
 _COMPLETED = 50
+_WATCH_S = 2.0
 _TICK_S = 0.1  # while nothing happens, lines that are settled are printed so often
 
 
@@ -122,6 +123,23 @@ Output = Annotated[
 ]
 
 
+Watch = Annotated[bool, typer.Option("--watch", "-w", help="Show it again every two seconds, until Ctrl-C.")]
+
+
+def _shown_again(watch: bool, show: Callable[[], None]) -> None:
+    """Show a list; with `watch` again and again, until the system has ended, on a terminal in the same place."""
+    show()
+    while watch:
+        time.sleep(_WATCH_S)
+        try:
+            if sys.stdout.isatty():
+                typer.echo("\x1b[2J\x1b[H", nl=False)
+            show()
+        except NotRunning:
+            say("the system has ended", err=True)
+            return
+
+
 def _client(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleClient:
     return ConsoleClient(find_console(state), timeout_s=timeout_s + _GRACE_S)
 
@@ -146,10 +164,15 @@ def ps(
     sort_by: Annotated[
         Literal["up", "restarts", "cpu", "memory"] | None, typer.Option("--sort-by", help="The most first.")
     ] = None,
+    watch: Watch = False,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its start) and memory."""
+    _shown_again(watch, lambda: _show_children(state, sort_by, output, as_json))
+
+
+def _show_children(state: Path | None, sort_by: str | None, output: str | None, as_json: bool) -> None:
     with _client(state) as client:
         rows = client.children().rows
     usages = {row.pid: usage_of(row.pid) for row in rows if row.pid is not None}
@@ -206,10 +229,38 @@ def resources(
     ] = None,
     wide: Annotated[bool, typer.Option("--wide", help="Shorten no request to fit the terminal.")] = False,
     output: Output = None,
+    watch: Watch = False,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the resources of the running system, and who holds each."""
+    _shown_again(
+        watch,
+        lambda: _show_resources(
+            state,
+            match,
+            registrar,
+            limit,
+            status,
+            holder,
+            sort_by,
+            "wide" if wide and output is None else output,
+            as_json,
+        ),
+    )
+
+
+def _show_resources(
+    state: Path | None,
+    match: str,
+    registrar: str,
+    limit: int,
+    status: list[str] | None,
+    holder: str,
+    sort_by: str | None,
+    output: str | None,
+    as_json: bool,
+) -> None:
     chooses = bool(status or holder or sort_by)
     with _client(state) as client:
         page = client.resources(registrar, match, sys.maxsize if chooses else limit)
@@ -232,7 +283,7 @@ def resources(
         table.append((name, shown_state, row.needed, str(row.holder_count), row.held_by, ids[row.id]))
     if table:
         heads = ("resource", "state", "priority", "holders", "held by", "id")
-        say_table(heads, table, gives_way=("resource",), right=("priority", "holders"), wide=wide or output == "wide")
+        say_table(heads, table, gives_way=("resource",), right=("priority", "holders"), wide=output == "wide")
     if page.total > len(page.rows):
         say(f"{page.total - len(page.rows)} more: choose with MATCH, or raise --limit", err=True)
     for note in page.notes:
@@ -268,10 +319,17 @@ def usage(
     ] = "",
     limit: Limit = _SHOWN,
     output: Output = None,
+    watch: Watch = False,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show what each resource uses now, CPU and memory for instance, of servers that can say it."""
+    _shown_again(watch, lambda: _show_usages(state, match, registrar, sort_by, limit, output, as_json))
+
+
+def _show_usages(
+    state: Path | None, match: str, registrar: str, sort_by: str, limit: int, output: str | None, as_json: bool
+) -> None:
     with _client(state) as client:
         page = client.usages(registrar, match)
     rows = [row for row in page.rows if row.usage or row.failure]

@@ -1,7 +1,8 @@
-"""`rr-actors logs` and `stack`: what a child has said, and what it is stuck in, seen from a shell."""
+"""`rr-actors logs`, `stack` and `ps --watch`: what children say, what they are stuck in, how they are, from a shell."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -10,7 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -251,3 +252,40 @@ def test_a_child_that_does_not_run_has_no_stack(system: rr.System) -> None:
     assert (ran.returncode, ran.stderr) == (4, "rr-actors: root/talker: it has no process now: it is stopped\n")
     assert "did you mean 'near'?" in refused("stack", "neer")
     assert frames("near").startswith(f"root/inner/near: process {os.getpid()}, ")
+
+
+# -- tables that are shown again -------------------------------------------------------------------------------------
+
+
+def test_a_table_is_shown_again_until_the_system_ends(system: rr.System, app: rr.Registrar) -> None:
+    app.load("talker/line", "here")
+    verbs = [("ps", "-o", "name"), ("resources", "--json"), ("usage", "--json")]
+    with contextlib.ExitStack() as ends:
+        watching = [ends.enter_context(watched(*verb)) for verb in verbs]
+        names, resources, _ = (one.stdout for one in watching)
+        assert names is not None
+        assert resources is not None
+        children = [names.readline().strip() for _ in range(4)]
+        assert children == ["root", "root/talker", "root/inner", "root/inner/near"]
+        assert len(json.loads(resources.readline())) == 1
+        system.start_child(rr.ChildSpec(Talker, id="third"))
+        app.unload_all()
+        while "root/third\n" not in (line := names.readline()):
+            assert line
+        while json.loads(resources.readline()):
+            pass
+        system.stop()
+        for one in watching:
+            _, told = one.communicate(timeout=LIMIT_S)
+            assert (one.returncode, told.splitlines()[-1]) == (0, "the system has ended")
+
+
+@contextlib.contextmanager
+def watched(*verb: str) -> Iterator[subprocess.Popen[str]]:
+    """A command that shows a table again and again."""
+    command = [sys.executable, "-m", "rr_actors", *verb, "--watch"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
