@@ -790,13 +790,29 @@ def test_no_page_is_wider_than_the_screen_and_no_child_is_cut_off(start: Start, 
     inner = rr.Supervisor([rr.ChildSpec(rr.Actor, id="somewhat-long-name")], id="inner")
     with start(rr.ChildSpec(rr.Actor, id="a"), inner).serve_web() as page, chromium.tab(width, 900) as tab:
         tab.goes_to(page.url)
-        for path in ("", "timeline", "resources", "sequence"):
+        for path in ("", "timeline", "resources", "figures", "sequence"):
             tab.do(tab.page.goto(page.url.partition("?")[0] + path))
             tab.sees(".rr-status", "pid")
             assert tab.do(tab.page.evaluate("document.documentElement.scrollWidth")) <= width, path
             if path in ("", "resources"):
                 tab.sees(node("root/inner/somewhat-long-name"), "running")
                 assert tab.do(tab.page.evaluate(CUT)) == []
+
+
+def test_the_figures_of_each_child_are_drawn_as_curves(shop: rr.System, tab: Tab) -> None:
+    app = shop.open_registrar("app")
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.page.goto(page.url.partition("?")[0] + "figures"))
+        tab.sees("body", "The last ten minutes of 2 children.")
+        for number in range(3):
+            app.load("shop/thing", Order(f"lamp {number}"))
+        tab.sees('[data-child="root/shop"]', "CPU", " %", "MiB", "mailbox", "resources", "loads", "/s")
+        tab.sees('[data-child="root/shop"] div:nth-of-type(4)', "resources", "3")
+        drawn = tab.do(tab.page.get_attribute('[data-child="root/shop"] svg', "aria-label"))
+        assert str(drawn).startswith("CPU of root/shop: now ")
+        tab.do(tab.page.get_by_label("only children with this text").fill("sho"))
+        tab.sees("body", "The last ten minutes of 1 child.")
 
 
 def test_the_page_is_dark_where_the_system_is(shop: rr.System, tab: Tab) -> None:

@@ -29,6 +29,7 @@ from rr_actors.system.recording.timeline_lanes import Lanes
 from rr_actors.system.recording.timelines import Timeline
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.event_lines import EventLines, event_of
+from rr_actors.tools.terminal.figure_curves import FigureCurves
 
 GROUPED_FROM = 300
 """From so many resources on, a picture shows servers in place of resources."""
@@ -86,6 +87,7 @@ class Watch:
         events, lines: the newest events, and their lines for people.
         heard: the number of all events.
         version: grows with each change that a page could show.
+        figures: the figures of the children over the last minutes.
     """
 
     state_dir: str | os.PathLike[str] | None
@@ -103,6 +105,7 @@ class Watch:
         self._closed = threading.Event()
         self._versions = itertools.count(1)
         self._lanes, self._lanes_lock = Lanes(), threading.Lock()
+        self.figures = FigureCurves()
         self._latest = 0.0  # the time of the newest record in the lanes
         self._timeline: tuple[int, Timeline] | None = None  # and the version that it shows
         self._threads = [
@@ -179,6 +182,7 @@ class Watch:
             for event in part.events:
                 self.lines.take(event)
             self._note(*part.events)
+            self.figures.loaded(str(one.facts.get("registrar")) for one in part.events if one.event == "loaded")
             self.heard += len(part.events)
             self._news.set()
             if any("path" in event.facts for event in part.events):  # an event of the tree
@@ -228,6 +232,7 @@ class Watch:
             for row in children if self._latest else ():  # after the records of what was before
                 self._lanes.sees(row.path, row.pid or 0, time.time())
         registrars = self._ask(questions.ListRegistrars()).rows
+        self.figures.take(children, registrars)
         pages = read_pages(self._ask, questions.ListResources(), GROUPED_FROM)
         found = next(pages)
         resources, servers = list[ResourceRow](), list[ServerRow]()

@@ -13,7 +13,7 @@ import asyncio
 import contextlib
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,12 +21,14 @@ from typing import Any
 from nicegui import background_tasks, ui
 
 from rr_actors.base.errors import RrError
+from rr_actors.base.notebook import escape
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_view import Command
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.terminal.event_lines import EventFilter
+from rr_actors.tools.terminal.figure_curves import Curve
 from rr_actors.tools.terminal.terminal_rows import Neighbours, Past, Row, Rows, Window, refused
 from rr_actors.tools.web import graph_picture, tree_picture
 from rr_actors.tools.web.resource_table import ResourceTable
@@ -36,12 +38,19 @@ from rr_actors.tools.web.watch import CHILDREN, Moment, Watch
 _LOOK_S = 0.2
 _LINES = 14  # events
 _ROWS = 300  # of the panel
+_CURVES = 50  # children of which curves are drawn
 _WIDTH = 110
 _STEP_S = 0.5
 """How long a status takes in the picture from one resource to the next. In the system it is too fast to see."""
 _STEPS = 30  # statuses
 _NONE: dict[str, int] = {}
-_PAGES = (("Tree", "/"), ("Timeline", "/timeline"), ("Resources", "/resources"), ("Sequence", "/sequence"))
+_PAGES = (
+    ("Tree", "/"),
+    ("Timeline", "/timeline"),
+    ("Resources", "/resources"),
+    ("Figures", "/figures"),
+    ("Sequence", "/sequence"),
+)
 
 CSS = (
     tree_picture.CSS
@@ -62,6 +71,14 @@ CSS = (
 .rr-line.rr-yellow { color: var(--rr-amber); }
 .rr-rows .q-btn { flex: none; white-space: nowrap; overflow-wrap: normal; }
 .rr-note { color: var(--rr-dim); }
+.rr-figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 380px), 1fr)); gap: 10px 22px; }
+.rr-figures section { min-width: 0; } .rr-figures h2 { font: 600 13px/1.6 sans-serif; margin: 0;
+  overflow-wrap: anywhere; }
+.rr-figures div { display: grid; grid-template-columns: 5.5em 1fr 5.5em; gap: 8px; align-items: center;
+  font-size: 12px; color: var(--rr-fact); }
+.rr-figures b { text-align: right; color: var(--rr-text); }
+.rr-figures svg { width: 100%; height: 26px; background: var(--rr-unknown-paper); margin: 1px 0; border-radius: 3px; }
+.rr-figures path { fill: none; stroke: var(--rr-focus); stroke-width: 1.5; vector-effect: non-scaling-stroke; }
 .rr-banner { width: 100%; padding: 6px 14px; background: var(--rr-warm-paper); color: var(--rr-text);
   font-weight: 600; }
 .rr-banner.rr-bad { background: var(--rr-bad-paper); }
@@ -294,6 +311,43 @@ class TreePage(Page):
             buttons["stop"] = commands.Terminate(path)
             buttons["restart"] = commands.Restart(path)
         await self._panel.show(Past(path), buttons)
+
+
+class FiguresPage(Page):
+    """The page with the figures of the children over the last ten minutes, as curves."""
+
+    goes_back = False
+
+    def __init__(self, watch: Watch) -> None:
+        super().__init__(watch, "/figures")
+
+    def build(self) -> None:
+        """Put the filter and the curves on the page."""
+        with ui.element("div").classes("rr-panel w-full"):
+            self._match = ui.input("only children with this text in their path").classes("w-full")
+            self._match.props("dense outlined clearable debounce=200")
+            self._said = ui.label().classes("rr-note")
+            self._curves = ui.html("", sanitize=False).classes("rr-figures")
+
+    def draw(self, moment: Moment) -> None:
+        """Show the curves as they are now."""
+        match = self._match.value or ""
+        found = self.watch.figures.curves(match)
+        shown = dict(list(found.items())[:_CURVES])
+        self._curves.content = "".join(_section(path, curves) for path, curves in shown.items())
+        first = f"the first {_CURVES} of " if len(found) > _CURVES else ""
+        self._said.text = f"The last ten minutes of {first}{len(found)} child{'' if len(found) == 1 else 'ren'}."
+
+    def step(self) -> tuple[int, str]:
+        """Return the number of the newest step, and the filter."""
+        return self.watch.figures.step, self._match.value or ""
+
+
+def _section(path: str, curves: Sequence[Curve]) -> str:
+    rows = "".join(
+        f"<div><span>{curve.kind.name}</span>{curve.svg(path)}<b>{escape(curve.now)}</b></div>" for curve in curves
+    )
+    return f'<section data-child="{escape(path)}"><h2>{escape(path)}</h2>{rows}</section>'
 
 
 class ResourcesPage(Page):

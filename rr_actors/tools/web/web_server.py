@@ -28,7 +28,7 @@ from rr_actors.tools.web.sequence_page import SequencePage
 from rr_actors.tools.web.timeline_page import TimelinePage
 from rr_actors.tools.web.watch import Watch
 from rr_actors.tools.web.web_access import Access, Keys
-from rr_actors.tools.web.web_pages import ResourcesPage, TreePage
+from rr_actors.tools.web.web_pages import FiguresPage, ResourcesPage, TreePage
 
 _CLOSE_S = 1
 _LOOK_S = 20.0
@@ -68,6 +68,7 @@ def serve(
         ui.page("/", title="rr-actors: tree")(partial(TreePage, watch))
         ui.page("/timeline", title="rr-actors: timeline")(partial(TimelinePage, watch))
         ui.page("/resources", title="rr-actors: resources")(partial(ResourcesPage, watch))
+        ui.page("/figures", title="rr-actors: figures")(partial(FiguresPage, watch))
         ui.page("/sequence", title="rr-actors: sequence")(partial(SequencePage, watch))
         add_rows(watch)
         _add_metrics(watch)
