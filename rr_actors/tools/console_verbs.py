@@ -16,7 +16,7 @@ import typer
 
 from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import NotRunning, RrError, UsageError, shown
+from rr_actors.base.errors import NotRunning, RrError, UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.base.names import short_ids
 from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
@@ -797,7 +797,11 @@ def _show_status(state: Path | None, target: str, as_json: bool) -> None:
     """Show a child with its latest history, or explain a resource; exit code 1 if a child does not run."""
     with _client(state) as client:
         if (row := child_of(client, target)) is None:
-            lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
+            try:
+                lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
+            except UnknownQuery as error:
+                hint = did_you_mean(target, _children(client, target))
+                raise UnknownQuery(f"{error}{hint}", query_id=target) from error
             say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
             return
         served = [one for one in client.registrars().rows if one.name == row.id]

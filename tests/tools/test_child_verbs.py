@@ -182,6 +182,7 @@ def test_an_unknown_child_is_refused_with_the_nearest_name_and_one_without_a_pro
         "rr-actors: 'talkre': there is no child of this path or id; did you mean 'talker'?"
     )
     assert "did you mean 'root/inner/near'?" in refused("logs", "root/iner/near")
+    assert refused("status", "talkre").endswith("; did you mean 'talker'?")
     assert "--previous: expected no --follow" in refused("logs", "talker", "-p", "-f")
     ran = run_cli("logs", "near")
     told = "no log lines of root/inner/near: it runs in the application's process, whose own logging has its records\n"
