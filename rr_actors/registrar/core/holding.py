@@ -165,14 +165,15 @@ def asked_anew(held: Held) -> Held:
 def load_refused(decision: Decision, message: LoadRefused) -> None:
     """Remove the row of a query that does not exist. If it is held, it was taken away since, and a notice says so.
 
-    Such a notice may also wait for a query whose answer was lost with its link: the entry in `acked` has a link opened
-    for it. While its caller's own connection has neither answered nor broken (`direct`), nothing is decided: its answer
-    may say that the query is loaded.
+    Such a notice may also wait for a query whose answer was lost with its link, or come behind the refusal of a query
+    that was being released: the entry in `acked` has a link opened for it, also when this one is lost. While its
+    caller's own connection has neither answered nor broken (`direct`), nothing is decided: its answer may say that the
+    query is loaded.
     """
     held = decision.catalog.held.get(message.query_id)
     if held is None:
         return
-    if held.registrar not in decision.catalog.up:
+    if held.registrar not in decision.catalog.up or held.hold is OWED:
         decision.note(decision.catalog.acked, held.registrar, True)
     if held.hold is PENDING and not decision.catalog.direct.get(held.id):
         decision.drop_later(held)
