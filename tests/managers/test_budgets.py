@@ -14,6 +14,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.managers import Budgets, OverCapacity, Pool, PoolInfo, Reserve, Share, Supply
 from support import Calls, eventually, kill, wait_respawned
+from support_cli import run_cli
 
 Start = Callable[..., rr.System]
 
@@ -123,6 +124,27 @@ def test_who_waits_gets_room_when_others_give_theirs_back(house: House) -> None:
     eventually(lambda: house.pool().waiting == 1)
     heater.unload()
     assert oven.get(timeout=30).response == "oven"
+
+
+def test_a_load_that_waits_for_room_says_for_which_pool_and_how_much_is_free(house: House) -> None:
+    heater = house.run("heater", 60)
+    oven = house.run("oven", 50, wait_s=60, block=False)
+
+    def said(*command: str) -> bool:
+        return "pool 'watts': asked 50, free 40 of 100" in run_cli(*command, "--state", house.system.state_dir).stdout
+
+    def share() -> str | None:
+        infos = house.system.registrar("budgets").resources()
+        return next((info.id for info in infos if info.phase == "loading"), None)
+
+    id = eventually(share)
+    assert id is not None
+    assert eventually(lambda: said("why", id))
+    assert said("resources")
+    assert any(said("why", info.id) for info in house.devices.resources() if info.phase == "loading")
+    heater.unload()
+    oven.get(timeout=30)
+    assert not said("resources")
 
 
 def test_who_has_waited_long_enough_is_refused(house: House) -> None:

@@ -108,6 +108,9 @@ class _Book(msgspec.Struct):
     def used(self) -> float:
         return math.fsum(self.shares.values())
 
+    def free(self) -> float:
+        return max(0.0, self.total() - self.used())
+
 
 class Budgets(Manager):
     """Serves `share` and `supply`: admits shares while they fit, and makes room for those of higher priority.
@@ -225,7 +228,10 @@ class Budgets(Manager):
             self._admit(book, id)  # without a look at the priorities
             return
         self._settle(pool)
+        said = ""
         while one.admitted is None:
+            if said != (said := self._room(book, one.share)):
+                current().progress(0.0, said)  # `rr-actors why`, `resources` and `top` show it
             self._changed.wait(_POLL_S)
             if one.admitted is None and time.monotonic() - book.looked >= _POLL_S:
                 self._settle(pool)
@@ -243,13 +249,13 @@ class Budgets(Manager):
             one.error = LoadFailed(f"share of {one.share.pool!r}: its load was withdrawn", server=self._share_id())
             return
         holders = tuple(name for id in book.shares if id in infos for name in infos[id].holders)
-        free = max(0.0, book.total() - book.used())
-        text = (
-            f"pool {one.share.pool!r}: asked {one.share.amount:g}, free {free:g} of {book.total():g}; "
-            f"held by {', '.join(sorted(set(holders))) or 'nobody'}"
-        )
-        details = {"pool": one.share.pool, "asked": one.share.amount, "free": free, "holders": holders}
+        text = f"{self._room(book, one.share)}; held by {', '.join(sorted(set(holders))) or 'nobody'}"
+        details = {"pool": one.share.pool, "asked": one.share.amount, "free": book.free(), "holders": holders}
         one.error = OverCapacity(text, server=self._share_id(), **details)
+
+    @staticmethod
+    def _room(book: _Book, share: Share) -> str:
+        return f"pool {shown(share.pool)}: asked {share.amount:g}, free {book.free():g} of {book.total():g}"
 
     def _share_id(self) -> str:
         return f"{self.registrar.name}/share"
