@@ -56,6 +56,11 @@ EXPECTED = {
         "60 W                 arm, pump",
         "100 W again          camera, map, arm, pump",
     ],
+    "generator": [
+        "100 of 100 W, 0 W too much: arm, camera, lamp, radio",
+        "140 of 140 W, 0 W too much: arm, camera, lamp, pump, radio",
+        "140 of 140 W, 0 W too much: alarm, arm, camera, pump",
+    ],
     "run_time_registration": ["twice 21 is 42", "it ran in another process: True", "after a respawn, twice 4 is 8"],
     "async_load": [
         "ten loads at once: [0, 1, 4, 9, 16, 25, 36, 49, 64, 81]",
