@@ -204,6 +204,19 @@ def test_a_reserve_starts_before_anybody_gives_way_and_stops_when_it_is_not_need
     assert eventually(lambda: house.pool() == PoolInfo("watts", 100, 100, 0))
 
 
+def test_a_reserve_without_a_request_is_loaded_as_one_that_takes_none(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/battery", 50),)))
+
+    def connect() -> None:
+        house.devices.load("budgets/supply", Supply("watts", 50))
+
+    house.devices.register_server("battery", connect)
+    house.run("heater", 100, priority=1)
+    house.run("lamp", 50, priority=9)
+    assert house.pool() == PoolInfo("watts", 150, 150, 0)
+    assert house.ended.items == []
+
+
 def test_after_a_reserve_that_fails_others_give_way(start: Start) -> None:
     house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, -1.0),)))
     house.run("heater", 100, priority=1)

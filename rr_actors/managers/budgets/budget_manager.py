@@ -27,6 +27,7 @@ from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import Phase, State
 from rr_actors.registrar.queries import ResourceInfo
+from rr_actors.registrar.registrar import NO_FIELDS
 
 logger = Log("rr_actors.managers.budgets")
 
@@ -316,8 +317,9 @@ class Budgets(Manager):
 
     def _start_reserve(self, book: _Book, key: str) -> None:
         reserve = self._reserve(book, key)
+        request = NO_FIELDS if reserve.request is None else reserve.request
         try:
-            query = self.registrar.load(reserve.server, reserve.request, timeout_s=_RESERVE_S)
+            query = self.registrar.load(reserve.server, request, timeout_s=_RESERVE_S)
         except RrError as error:
             logger.warning("pool %s: reserve %s cannot be loaded: %s", book.pool.name, reserve.server, error)
             query = None

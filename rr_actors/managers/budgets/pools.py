@@ -31,7 +31,10 @@ POLICY: tuple[Step, ...] = get_args(Step)
 
 
 class Reserve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A resource that adds `amount` to the capacity by a supply of its own, and is loaded when that is needed."""
+    """A resource that adds `amount` to the capacity by a supply of its own, and is loaded when that is needed.
+
+    Without a `request` it is loaded as `load(server)` does: each field of its request has its default.
+    """
 
     server: str
     amount: float
