@@ -585,33 +585,6 @@ OWED_AT_A_PROVIDER_THAT_IS_DELETED: list[Step] = [
     ("delete", "r0"),
 ]
 
-# A holder that was releasing its query passed over a status, which filled the window; so the word that the query was
-# taken away waited behind that, and the release was owed until the next link.
-TAKEN_AWAY_BEHIND_WHAT_IS_PASSED_OVER: list[Step] = [
-    ("serve", "r0"),
-    ("register", "r0", "s0"),
-    ("load", "q1", "r0", "r0", "s0", b"p", True),
-    ("dial", "r0", "r0"),
-    ("net", "r0", "r0", 0),
-    ("net", "r0", "r0", 1),
-    ("load", "q8", "r0", "r0", "s0", b"q", True),
-    ("line", "q8", 0, "", "", ""),
-    ("call", "r0", "load", "q8", 1, "ok"),
-    ("line", "q8", 1, "", "", ""),
-    ("save", "r0"),
-    ("owe", "r0", "q8", "after"),
-    ("up", "r0"),
-    ("serve", "r0"),
-    ("dial", "r0", "r0"),
-    ("net", "r0", "r0", 0),
-    ("net", "r0", "r0", 1),
-    ("net", "r0", "r0", 0),
-    ("own", "r0", "status", "q8", "FATAL"),
-    ("register", "r0", "s0"),
-    ("call", "r0", "unload", "q8", 2, "raise"),
-    ("own", "r0", "force", "q8"),
-]
-
 # The owner unloaded by force what could not be unloaded, and then the whole server, which was not registered any more.
 CLEARED_WHILE_IT_IS_UNLOADED_BY_FORCE: list[Step] = [
     ("serve", "r0"),
@@ -659,7 +632,6 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "what is from before a crash let go by line": (7628463471197, LISTED_BEFORE_IT_WAS_LET_GO),
     "a priority given between two links lost": (1125899906843199, GIVEN_A_PRIORITY_BEFORE_THE_LIST),
     "providers that were away forgotten at the closing": (1125899906843174, CLOSED_WITHOUT_A_LINK),
-    "taken away behind a status that is passed over": (281796104698359, TAKEN_AWAY_BEHIND_WHAT_IS_PASSED_OVER),
     "cleared while it is unloaded by force": (2124356231658425, CLEARED_WHILE_IT_IS_UNLOADED_BY_FORCE),
     "queries of a provider that is gone forgotten": (1125899906842699, OWED_AT_A_PROVIDER_THAT_IS_DELETED),
 }

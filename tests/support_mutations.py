@@ -532,18 +532,6 @@ def keeps_what_is_owed(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
-def leaves_what_is_passed_over(patch: Patch) -> type[SimRegistrar]:
-    """A query that is being released is taken away, and what its holder passes over stays before the word of that."""
-
-    def drop(decision: Decision, origin: str, query_id: str) -> None:
-        if query_id not in decision.catalog.queries:
-            original(decision, origin, query_id)
-
-    original: Any = unloading.drop_notices
-    patch(unloading, "drop_notices", drop)
-    return SimRegistrar
-
-
 def tells_holders_first(patch: Patch) -> type[SimRegistrar]:
     """What the owner says goes to the holders at once, and to its own server as well."""
     start_status: Any = status_changes.start_status
@@ -855,7 +843,6 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "what was decided for a link sent over the next, to the same run": (sends_to_the_same_run, "links"),
     "a load told to be held that was given up": (_in_place(TellsWhoHasGivenUp), "acknowledged"),
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
-    "taken away behind a status that is passed over": (leaves_what_is_passed_over, "stuck"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
     "no dedupe of query ids": (no_dedupe, "disagree"),
     "an update that waits taken for the first row": (takes_unsaved_for_new, "false loss"),

@@ -1294,6 +1294,18 @@ def test_who_releases_a_resource_whose_server_is_missing_hears_how_the_unload_en
     assert registrar.catalog.unanswered == {}
 
 
+def test_what_a_holder_passed_over_does_not_wait_before_the_word_that_its_query_was_taken_away() -> None:
+    registrar = provider("loaded").again()
+    registrar.decide(Fetch("app", True))
+    registrar.decide(Unload("q", "app"))  # there is no server: the release stays owed, and its holder passes over
+    registrar.obey(c.SetStatus("q", "lost", State.FATAL, "", None))
+    assert [notice.event for notice in registrar.catalog.notices.values()] == ["lost"]
+
+    registrar.obey(c.Unregister("cam", "cleared", None))
+    assert [(notice.event, notice.released) for notice in registrar.catalog.notices.values()] == [("cleared", True)]
+    assert registrar.phase() is None
+
+
 @pytest.mark.parametrize("phase", ["queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering"])
 def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
     registrar = provider(phase, has_status=True)
