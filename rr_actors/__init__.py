@@ -70,7 +70,7 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
         UsageError,
     )
     from rr_actors.base.values.codecs import codec
-    from rr_actors.hosting.streams import Publisher, Stream, StreamFrame, StreamReader
+    from rr_actors.hosting.streams import Publisher, Stream, StreamFrame, StreamInfo, StreamReader
     from rr_actors.registrar.declarations import Declared, server
     from rr_actors.registrar.engine.progress import Progress
     from rr_actors.registrar.engine.server import Current, current
@@ -171,6 +171,7 @@ __all__ = [
     "Stream",
     "StreamEvent",
     "StreamFrame",
+    "StreamInfo",
     "StreamReader",
     "SupervisionError",
     "Supervisor",

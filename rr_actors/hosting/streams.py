@@ -126,6 +126,38 @@ class StreamRow(msgspec.Struct, frozen=True):
         return sum(reader.missed for reader in self.readers)
 
 
+class StreamInfo(msgspec.Struct, frozen=True):
+    """An open stream at one moment.
+
+    Attributes:
+        id: the resource's id, a slash, and the name.
+        name: its name among the streams of the resource.
+        server: the server of its resource, as "registrar/server".
+        resource_id: its resource.
+        rate_hz: how many frames were published a second, in the last ten seconds.
+        bytes_per_s: how many bytes these had; those that nobody reads are not pickled, and have none.
+        consumers: how many readers it has.
+        missed: how many frames its readers missed, all together.
+        age_s: how many seconds ago the last frame was published; None: there was none.
+    """
+
+    id: str
+    name: str
+    server: str
+    resource_id: str
+    rate_hz: float
+    bytes_per_s: float
+    consumers: int
+    missed: int
+    age_s: float | None
+
+
+def info_of(row: StreamRow) -> StreamInfo:
+    """Return what users see of a stream, from what its publisher knows."""
+    place = (f"{row.resource_id}/{row.name}", row.name, row.server, row.resource_id)
+    return StreamInfo(*place, row.rate, row.bytes_s, len(row.readers), row.missed, row.age_s)
+
+
 class StreamNews(msgspec.Struct, frozen=True):
     """Something that has happened to a stream. `reader`, `before`: the registrar that read another stream before."""
 

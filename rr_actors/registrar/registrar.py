@@ -29,6 +29,7 @@ from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode
 from rr_actors.base.values.failure import error_of
+from rr_actors.hosting.streams import StreamInfo, info_of
 from rr_actors.registrar.arguments import (
     DEFAULTS,
     GroupKeywords,
@@ -111,6 +112,7 @@ _KEPT = (
 )
 
 NO_FIELDS: dict[str, object] = {}
+_ALL_STREAMS = Wanted("streams", limit=sys.maxsize)
 """The request of a load that gives none."""
 
 _SHOWN = 50  # rows of a picture in a notebook
@@ -970,6 +972,10 @@ class Registrar(Consumer):
         holders, ids = tuple(query.origin for query in queries), tuple(query.id for query in queries)
         priority = priority_of(max((query.priority for query in queries), default=STANDBY))
         return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, ids, priority)
+
+    def streams(self) -> list[StreamInfo]:
+        """Return every open stream of the resources served here, by server, request and name."""
+        return [info_of(row) for row in self._page(_ALL_STREAMS).streams]
 
     def usage(self, *, of: Iterable[str] | None = None, timeout_s: float = 5.0) -> Usages:
         """Return what each loaded resource served here uses now, as the usage callback of its server says.

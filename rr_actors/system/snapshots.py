@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,7 @@ import msgspec
 import pykka
 
 from rr_actors.base.errors import NotFound, RrError, shown
+from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.registrar.registrar import Registrar
@@ -104,6 +106,16 @@ def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
             except RrError as error:
                 described[name]["error"] = str(error)
     return described
+
+
+def streams_of(node: Node) -> list[StreamInfo]:
+    """Return the open streams of every registrar that answers."""
+    streams: list[StreamInfo] = []
+    for name, status in node.statuses().items():
+        if status is Presence.UP:
+            with contextlib.suppress(RrError):  # it has ended just now, or does not answer
+                streams += registrar_in(node, name, patient=False).streams()
+    return streams
 
 
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:

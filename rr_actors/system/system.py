@@ -42,6 +42,7 @@ from rr_actors.base.steps import Steps
 from rr_actors.hosting import forwarded_logs
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.hosting.process_node import SystemInfo
+from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import check_not_own, serving
@@ -78,7 +79,7 @@ from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings
 from rr_actors.system.registrar_lookup import give_up_clients, left_behind, open_registrar, registrar_in, take_over
-from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
+from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to, streams_of
 from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import Presence, StateDir, absolute_path, actor_key, open_state_dir, registrar_key
 
@@ -661,6 +662,10 @@ class System:
         node = self._running()
         registrars = describe_registrars(node)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
+
+    def streams(self) -> list[StreamInfo]:
+        """Return the open streams of the whole system. A registrar that does not answer is left out."""
+        return streams_of(self._running())
 
     def tree(self, path: str | None = None) -> Tree:
         """Return a picture of the child at `path` and everything below it; without a path, of the whole tree.

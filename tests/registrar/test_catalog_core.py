@@ -1759,3 +1759,37 @@ def test_a_probe_that_comes_back_ends_the_load_in_flight_that_closes_the_ring() 
     assert told.kind == "CircularDependency"
     assert hold_of(registrar) is Hold.OWED
     assert registrar.catalog.direct == {}
+
+
+# -- what simulated worlds found once in tens of thousands -----------------------------------------------------------
+
+
+def test_a_refusal_of_a_query_that_is_being_released_has_a_lost_link_opened_again() -> None:
+    registrar = consumer("owed")
+    registrar.decide(LoadRefused("q", FAILURE), "p")
+    assert hold_of(registrar) is None
+
+    registrar.obey(c.LinkLost("p"))
+    assert registrar.catalog.needs("p")  # its notice may have been behind the refusal
+
+
+def test_a_priority_that_is_set_after_its_provider_has_ended_for_good_is_forgotten_with_the_query() -> None:
+    registrar = consumer("held")
+    registrar.obey(c.LinkLost("p"))
+    lost = registrar.together((c.PeerGone("p", FAILURE, True, "gone", True), None), (c.SetPriority("q", 9, 1), None))
+    (notice,) = [effect.message for effect in lost if isinstance(effect, e.Receive)]
+    registrar.decide(notice, "")
+    registrar.obey(c.Heard("q", "gone", handled=False))
+    assert hold_of(registrar) is None
+    assert registrar.catalog.unsent == {}
+
+
+def test_a_resource_that_could_not_be_unloaded_wants_the_same_of_its_parts_without_its_server_and_with_it() -> None:
+    cam = Server("cam", pauses=True)
+    registrar = provider("loaded", pauses=True)
+    registrar.obey(c.Unregister("cam", "event", 1))
+    registrar.obey(c.UnloadErred("q", 1, FAILURE))
+    assert registrar.phase() is Phase.UNLOAD_FAILED
+    without = registrar.catalog.inherited("q")
+    registrar.obey(c.Register(cam, "event"))
+    assert registrar.catalog.inherited("q") == without

@@ -129,6 +129,20 @@ def test_streams_lists_what_is_open_and_who_reads_it(
     assert "no frame" in ran
 
 
+def test_a_program_sees_the_same_streams(system: rr.System, camera: rr.Query, reader: rr.StreamReader) -> None:
+    images, notes = system.streams()
+    assert (images.id, images.name, images.server) == (f"{camera.resource_id}/images", "images", "cameras/camera")
+    assert (images.resource_id, images.consumers, notes.consumers) == (camera.resource_id, 1, 0)
+    assert images.age_s is not None
+    assert (notes.rate_hz, notes.bytes_per_s, notes.missed, notes.age_s) == (0.0, 0.0, 0, None)
+
+    cameras = system.ref("cameras").proxy()
+    assert eventually(lambda: cameras.publish("images", 0, 1).get() and system.streams()[0].rate_hz > 0)
+    assert [stream.name for stream in system.registrar("cameras").streams()] == ["images", "notes"]
+    camera.unload()
+    assert eventually(lambda: system.streams() == [])
+
+
 def test_streams_chooses_and_says_when_there_is_none(system: rr.System, camera: rr.Query) -> None:
     assert [row["name"] for row in json.loads(said("streams", "notes", "--json", "--registrar", "cameras"))] == [
         "notes"
