@@ -21,7 +21,7 @@ from rr_actors.base.errors import MailboxFull, Unavailable
 from rr_actors.runtime import thread_pool
 from rr_actors.runtime.callback_errors import described
 from rr_actors.runtime.event_loop import Dispatcher
-from rr_actors.runtime.thread_wakeup import EventBell
+from rr_actors.runtime.thread_pool import EventBell
 from rr_actors.runtime.user_loop import is_coroutine, start_task
 from rr_actors.runtime.workers import Workers, is_async
 from support import Calls, Gate, eventually

@@ -15,7 +15,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.runtime.thread_wakeup import EventBell
+from rr_actors.runtime.thread_pool import EventBell
 from support import Calls, Workshop, eventually, serve
 from support_inside import actor_of
 from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
