@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from types import FunctionType
-from typing import Any, Generic, Literal, TypeVar, cast, overload
+from typing import Any, Generic, Literal, Protocol, TypeVar, cast, overload
 
 from msgspec.structs import replace
 
-from rr_actors.base.checks import examined
+from rr_actors.base.checks import check_number, examined
 from rr_actors.base.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
+from rr_actors.base.names import check_name
 from rr_actors.registrar.engine.server import (
     RECOVER_S,
     ROLES,
@@ -19,14 +20,20 @@ from rr_actors.registrar.engine.server import (
     checked_callback,
     checked_spec,
     checked_whole,
+    current,
 )
 from rr_actors.registrar.model.health import Health
+from rr_actors.runtime.workers import is_async
 from rr_actors.wire.name_service import Directory, Presence, registrar_key
 
 Request = TypeVar("Request")
 Returned = TypeVar("Returned")
 Response = TypeVar("Response")
 F = TypeVar("F", bound=Callable[..., Any])
+
+Cost = Mapping[str, float] | Callable[..., Mapping[str, float]]
+
+_SHARE_S = 60.0  # for a share of a server without a load_timeout_s
 
 
 class server:  # noqa: N801 - used as a decorator
@@ -40,7 +47,15 @@ class server:  # noqa: N801 - used as a decorator
 
     ``status``, ``recover``, ``upgrade``, ``usage``, ``health``, ``pause`` and ``resume`` work in the same way. A method
     with several parameters, or none, takes the fields of the request: ``def load_range(self, name: str, rate: float)``.
-    The options are those of Registrar.register_server().
+    The options are those of Registrar.register_server(), and two more.
+
+    Keyword Args:
+        cost: the amounts that each resource holds of pools, as ``{"watts": 4}``; or a function that takes what the load
+            callback takes, without `self`, and returns such a dict. Shares of these amounts are loaded as parts of the
+            resource, before the load callback runs. Default: None, nothing. Give it where Budgets limits what there is:
+            see docs/planning.md, "Budgets".
+        cost_from: the child of the system that runs Budgets. Default: budgets. Name another if it has another id.
+
     ``Cameras.load_camera`` then names the server in Registrar.load().
 
     Raises:
@@ -58,6 +73,8 @@ class server:  # noqa: N801 - used as a decorator
         idle: Literal["unload", "pause"] = "unload",
         paused_s: float | None = None,
         health: Health | None = None,
+        cost: Cost | None = None,
+        cost_from: str = "budgets",
         request_type: Any = None,
         response_type: Any = None,
     ) -> None:
@@ -68,6 +85,7 @@ class server:  # noqa: N801 - used as a decorator
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s, health=health)
         self._spec = checked_spec(spec)
+        self._cost = None if cost is None else _Cost(self._spec, cost, check_name(cost_from, "cost_from"))
 
     # The first overload that fits is meant: two parameters, of which one may have a default; one; any number.
     @overload
@@ -104,7 +122,7 @@ class server:  # noqa: N801 - used as a decorator
             expected = "a method to decorate"
             text = f"@rr.server({self._spec.name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
             raise InvalidSpec(text, field="load", expected=expected, got=load)
-        return Declared(self._spec, load)
+        return Declared(self._spec, load, self._cost)
 
 
 class Declared(Generic[Request, Returned, Response]):
@@ -115,10 +133,11 @@ class Declared(Generic[Request, Returned, Response]):
     On an instance the attribute is still the method. On the class it names the server in Registrar.load().
     """
 
-    def __init__(self, spec: ServerSpec, load: Callable[..., Any]) -> None:
+    def __init__(self, spec: ServerSpec, load: Callable[..., Any], cost: _Cost | None) -> None:
         with examined(f"@rr.server({spec.name!r})"):
             functools.update_wrapper(cast("Callable[..., Any]", self), load)
         self._load = load
+        self._cost = cost
         self._owner: type | None = None
         self._others: dict[str, Callable[..., Any]] = {}
         self._spec = checked_spec(replace(spec, load=_without_self(load)))
@@ -203,10 +222,13 @@ class Declared(Generic[Request, Returned, Response]):
         of_subclass._owner = owner
         return of_subclass
 
-    def _spec_for(self, manager: object) -> ServerSpec:
+    def _spec_for(self, manager: _Manager) -> ServerSpec:
         """Return the spec of one manager's server. Its callbacks are bound; a subclass may override all but `load`."""
         roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
-        return checked_whole(checked_spec(replace(self._spec, load=functools.partial(self._load, manager), **roles)))
+        load: Callable[..., Any] = functools.partial(self._load, manager)
+        if self._cost is not None:
+            load = self._cost.paid_before(load, manager)
+        return checked_whole(checked_spec(replace(self._spec, load=load, **roles)))
 
     def _id_in(self, directory: Directory) -> str:
         """Return "registrar/server". The registrar is that of the one child of the system that has the declaring class.
@@ -234,6 +256,75 @@ class Declared(Generic[Request, Returned, Response]):
 # For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
 id_in = Declared[Any, Any, Any]._id_in  # pyright: ignore[reportPrivateUsage]
+
+
+# -- what a resource costs -----------------------------------------------------------------------------------------
+
+
+class _Loading(Protocol):
+    """The part of a Registrar by which shares are loaded."""
+
+    @overload
+    def load(self, server: str, request: object, *, timeout_s: float) -> object: ...
+    @overload
+    def load(self, server: str, request: object, *, block: Literal[False], timeout_s: float) -> Awaitable[object]: ...
+
+
+class _Manager(Protocol):
+    """A manager, as declarations know it."""
+
+    @property
+    def registrar(self) -> _Loading: ...
+
+
+class _Cost:
+    """What each resource of a server holds of pools.
+
+    Raises:
+        InvalidSpec: the cost is neither a function nor a dict of amounts.
+    """
+
+    def __init__(self, spec: ServerSpec, cost: Cost, budgets: str) -> None:
+        self._who = f"server {spec.name!r}"
+        self._share = f"{budgets}/share"
+        self._timeout_s = spec.load_timeout_s or _SHARE_S
+        self._amounts = cost if callable(cost) else self._checked(cost)
+
+    def _checked(self, cost: object) -> Mapping[str, float]:
+        expected = "a dict of pools and the amounts of them, or a function that returns one"
+        if not is_a(cost, Mapping):
+            text = f"{self._who}: cost: expected {expected}, got {shown(cost)} ({type(cost).__name__})"
+            raise InvalidSpec(text, field="cost", expected=expected, got=cost)
+        amounts: dict[str, float] = {}
+        for pool, amount in cast("Mapping[object, Any]", cost).items():
+            check_number(amount, self._who, f"cost of {shown(pool)}", least=0)
+            amounts[check_name(pool, f"{self._who}: cost: pool")] = amount
+        return dict(sorted(amounts.items()))
+
+    def paid_before(self, load: Callable[..., Any], manager: _Manager) -> Callable[..., Any]:
+        """Return a load callback that loads the shares, one after another by the pools' names, and then runs `load`."""
+        if not is_async(load):
+
+            @functools.wraps(load)
+            def pay(*given: Any, **fields: Any) -> Any:
+                for request in self._requests(given, fields):
+                    manager.registrar.load(self._share, request, timeout_s=self._timeout_s)
+                return load(*given, **fields)
+
+            return pay
+
+        @functools.wraps(load)
+        async def pay_async(*given: Any, **fields: Any) -> Any:
+            for request in self._requests(given, fields):
+                await manager.registrar.load(self._share, request, block=False, timeout_s=self._timeout_s)
+            return await load(*given, **fields)
+
+        return pay_async
+
+    def _requests(self, given: tuple[Any, ...], fields: dict[str, Any]) -> list[dict[str, object]]:
+        amounts = self._checked(self._amounts(*given, **fields)) if callable(self._amounts) else self._amounts
+        whose = current().resource_id
+        return [{"pool": pool, "amount": amount, "instance": whose} for pool, amount in amounts.items()]
 
 
 def class_name(cls: type) -> str:
