@@ -1773,6 +1773,20 @@ def test_a_refusal_of_a_query_that_is_being_released_has_a_lost_link_opened_agai
     assert registrar.catalog.needs("p")  # its notice may have been behind the refusal
 
 
+def test_an_answer_of_a_run_whose_catalog_was_deleted_does_not_end_a_load_that_the_link_asks_for_again() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", [], "r0", run=1))
+    ask_directly(registrar)
+    registrar.obey(c.LinkLost("p"))
+    registrar.obey(c.Reconcile("p", [], "r1", link=2, run=2))
+    assert [type(message) for message in requests(registrar)] == [Load]
+
+    assert registrar.obey(c.Got("q", "old", b"old", run=1)) == []
+    registrar.decide(Loaded("q", "new", b"new"), "p")
+    assert registrar.catalog.held["q"].resource_id == "new"
+    assert [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)] == [None]
+
+
 def test_a_priority_that_is_set_after_its_provider_has_ended_for_good_is_forgotten_with_the_query() -> None:
     registrar = consumer("held")
     registrar.obey(c.LinkLost("p"))

@@ -92,6 +92,8 @@ def got(decision: Decision, command: Got) -> None:
     if held.registrar not in catalog.up:
         decision.note(catalog.fresh, id, command.run)
         decision.cause(Connect(held.registrar))
+    elif held.hold is PENDING and 0 < command.run < catalog.listed.get(held.registrar, 0):
+        return  # an earlier run has said it, whose catalog was deleted: the link has asked for the query again
     if held.hold is not HELD:  # else reconciling has made it HELD before
         answer = Loaded(id, command.resource_id, command.response, state=command.state)
         loaded(decision, held.registrar, answer)

@@ -29,6 +29,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     catalog = decision.catalog
     add_all_in_flight(decision, command.registrar)  # the provider may have dropped those sent before this link
     decision.note(catalog.up, command.registrar, command.link)
+    decision.note(catalog.listed, command.registrar, command.run)
     theirs = {query.query_id for query in command.queries}
     for held in catalog.unsettled_at(command.registrar):
         if held.hold is Hold.PENDING and held.resource_id:

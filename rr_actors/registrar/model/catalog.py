@@ -146,6 +146,7 @@ class Catalog:
       `idle`: resources that idle since the timer was set that pauses or unloads them. `rising`: resources to be resumed
       when their parts are: the parts that have not said so, or None before they were asked.
       `unsent`: queries whose priority has changed while the provider's link was not reconciled.
+      `listed`: by provider, the epoch of its run that made the last list.
     - `shut`: why this registrar loads nothing any more for others (False), or for itself (True): it is being closed.
 
     Args:
@@ -207,6 +208,7 @@ class Catalog:
         self.agreed: dict[str, bool] = {}
         self.touched: dict[str, int | None] = {}
         self.unsent: dict[str, bool] = {}
+        self.listed: dict[str, int] = {}
         self.idle: dict[str, bool] = {}
         self.rising: dict[str, tuple[str, ...] | None] = {}
         self.shut: dict[bool, Failure] = {}
