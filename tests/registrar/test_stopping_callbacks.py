@@ -18,7 +18,7 @@ LONG_S = 30.0
 
 
 class Load:
-    """A load callback that waits until it is told to stop, or the test lets it end."""
+    """A load callback that waits until its event `stopping` is set, or the test lets it end."""
 
     def __init__(self) -> None:
         self.began = Calls()

@@ -212,7 +212,7 @@ def test_a_registrar_that_cannot_be_opened_for_want_of_descriptors_says_so(syste
             except rr.CatalogError as error:
                 refusals.append(str(error))
                 refused.append(spare)
-    assert refused == list(range(len(refused)))  # whoever has enough opens it
+    assert refused == list(range(len(refused)))  # with enough descriptors it opens
     assert len(refused) > 1
     assert all(EMFILE in refusal for refusal in refusals)
 
