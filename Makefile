@@ -10,13 +10,16 @@
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
 #   make breakages  the product broken on purpose in twenty places and more, each noticed by chaos within a minute
 #   make simulate  simulated worlds with crashes at every step, each checked (ARGS="--help" for how many)
-#   make explore  small worlds in every interleaving, not a sample, as far as ARGS="--seconds 3600" allows (two minutes)
+#   make explore  small worlds in every interleaving, not a sample, as far as ARGS="--seconds 3600" allows (two minutes
+#               for registrars, one for the slots of streams)
+#   make streams  a million frames with checksums, while publisher and readers are killed (two minutes); thirty pictures
+#               a second, and whether memory grows: ARGS="--steady 3600"
 #   make fuzz   bad bytes, guided by the code they reach, into whatever reads bytes (atheris, which it installs in an
 #               environment of its own; ARGS="--runs 1000000 --only frames")
 #   make fuzz-quick  each of these tools, and the fuzz targets without atheris, for some seconds; on another Python, too
 #               (PYTHON=... VENV=.venv-3.13 EXTRAS=test,cli)
 #   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions; bench-peers: beside
-#               xoscar, Thespian and Ray, which it installs in an environment of their own)
+#               xoscar, Thespian and Ray, pictures beside iceoryx2 and Zenoh; it installs them in an environment of their own)
 # PYTHON=... chooses the interpreter (3.11 or later); VENV=... where the environment goes; EXTRAS=... what goes into it.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
@@ -33,7 +36,7 @@ CORES := $(shell getconf _NPROCESSORS_ONLN)
 SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 2 ? 2 : 4)))
 SLOW_SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 
-.PHONY: demo lab docs names test test-slow test-all lint format chaos breakages simulate explore fuzz fuzz-quick bench bench-quick bench-peers figures clean
+.PHONY: demo lab docs names test test-slow test-all lint format chaos breakages simulate explore streams fuzz fuzz-quick bench bench-quick bench-peers figures clean
 .DELETE_ON_ERROR:
 
 # Where nothing is set up yet, these two do not wait for what the tests need.
@@ -82,6 +85,10 @@ simulate: $(STAMP)
 
 explore: $(STAMP)
 	cd tests && ../$(BIN)/python -m simulation.small_worlds $(ARGS)
+	cd tests && ../$(BIN)/python -m simulation.slot_worlds $(ARGS)
+
+streams: $(STAMP)
+	cd tests && ../$(BIN)/python -m support_stream_soak $(ARGS)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m fuzz $(ARGS)
@@ -102,6 +109,7 @@ bench-quick: $(STAMP)
 
 bench-peers: $(STAMP)
 	$(BIN)/python -m benchmarks.peers $(ARGS)
+	$(BIN)/python -m benchmarks.peers.frames
 
 define INSTALL
 	@test -n "$(PYTHON)" || { echo "rr_actors needs Python 3.11 or later: none found. Try: make PYTHON=/path/to/python3" >&2; exit 1; }

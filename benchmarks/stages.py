@@ -31,7 +31,7 @@ from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.messages import Load, Loaded, Message
-from rr_actors.registrar.model.rows import Query
+from rr_actors.registrar.model.rows import ServedQuery
 from rr_actors.wire import frames
 
 A_ROUND = 500
@@ -185,7 +185,7 @@ def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
     taken: dict[str, list[float]] = {"provider: decide": [], "provider: commit": [], "provider: answer": []}
     line = FramingLink()
 
-    def answer(query: Query) -> None:
+    def answer(query: ServedQuery) -> None:
         response = actor.catalog.resources[query.resource_id].response or b""
         line.send(Loaded(query.id, query.resource_id, response))
         line.flush()

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing.connection import Connection
 from typing import Any
 
 import psutil
@@ -48,18 +48,28 @@ def crashes(times: int, held: int) -> list[Row]:
 
 
 def children(count: int, times: int) -> list[Row]:
-    """A system with so many children, each in a process of its own, from start() until all are ready."""
-    seconds: list[float] = []
+    """Children in processes of their own: started, and killed at once; beside as many bare forkserver children."""
+    seconds: dict[str, list[float]] = {"bare": [], "started": [], "back": []}
+    specs = [rr.ChildSpec(Empty, id=f"child{number}") for number in range(count)]
     for _ in range(times):
-        specs = [rr.ChildSpec(Empty, id=f"child{number}") for number in range(count)]
+        with _bare() as start_bare:
+            seconds["bare"].append(start_bare(count))
         with tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir:
-            system = rr.System(specs, state_dir=state_dir)
+            system = rr.System(rr.Supervisor(specs, max_restarts=2 * count), state_dir=state_dir)
             start = time.perf_counter()
             with system:
-                seconds.append(time.perf_counter() - start)
-    taken = Samples(tuple(seconds))
-    aim = 1.5 * count / 100
-    return [Row(f"{count} children started and ready", taken.median, "s", max(taken.seconds), at_most=aim)]
+                seconds["started"].append(time.perf_counter() - start)
+                seconds["back"].append(_kill_all(system))
+    bare, started, back = (Samples(tuple(taken)) for taken in seconds.values())
+    return [
+        Row(f"{count} bare forkserver children started and ready", bare.median, "s", max(bare.seconds)),
+        Row(
+            f"{count} children started and ready", started.median, "s", max(started.seconds), at_most=1.5 * count / 100
+        ),
+        Row("  beside the bare children", started.median / bare.median, "times", at_most=1.2),
+        Row(f"{count} children killed at once, until all are back", back.median, "s", max(back.seconds)),
+        Row("  beside the bare children", back.median / bare.median, "times", at_most=1.5),
+    ]
 
 
 def memory() -> list[Row]:
@@ -106,27 +116,67 @@ def _kill(system: rr.System, id: str) -> tuple[float, float]:
     return at["exited"] - start, at["restarted"] - start
 
 
+def _kill_all(system: rr.System) -> float:
+    """SIGKILL to all children at once: seconds until the last was ready again."""
+    children = system.supervisor().which_children()
+    missing = {f"root/{child.id}" for child in children}
+    back = threading.Event()
+
+    def heard(event: dict[str, Any]) -> None:
+        if event["event"] == "restarted":
+            missing.discard(event["path"])
+            if not missing:
+                back.set()
+
+    unsubscribe = system.subscribe(heard)
+    start = time.perf_counter()
+    for child in children:
+        os.kill(child.pid or 0, signal.SIGKILL)
+    if not back.wait(_LIMIT_S):
+        raise TimeoutError(f"{len(missing)} of {len(children)} were not restarted within {_LIMIT_S:g} s")
+    taken = time.perf_counter() - start
+    unsubscribe()
+    return taken
+
+
+_BARE = """
+import multiprocessing, sys, time
+context = multiprocessing.get_context("forkserver")
+context.set_forkserver_preload(["rr_actors"])  # with what a child of rr_actors has at hand, too
+for line in sys.stdin:
+    pipes = [context.Pipe() for _ in range(int(line))]
+    children = [context.Process(target=there.send_bytes, args=(b"ready",)) for _, there in pipes]
+    began = time.perf_counter()
+    for child in children:
+        child.start()
+    for here, _ in pipes:
+        here.recv_bytes()
+    print(time.perf_counter() - began, flush=True)
+    for child in children:
+        child.join()
+"""
+"""Starts as many children of multiprocessing's own fork server as each line says, and prints the seconds.
+
+It is no file, as each child would import its main program again.
+"""
+
+
 @contextmanager
-def _bare() -> Iterator[Any]:
-    """A call that starts a child of multiprocessing's own fork server and waits for its first word; seconds."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])  # with what a child of rr_actors has at hand, too
+def _bare() -> Iterator[Callable[..., float]]:
+    """A call that starts so many bare children and waits for the first word of each; seconds."""
+    process = subprocess.Popen([sys.executable, "-c", _BARE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin
+    assert process.stdout
+    asked, answers = process.stdin, process.stdout
 
-    def start() -> float:
-        here, there = context.Pipe()
-        process = context.Process(target=_say_ready, args=(there,))
-        began = time.perf_counter()
-        process.start()
-        here.recv()
-        taken = time.perf_counter() - began
-        process.join()
-        here.close()
-        there.close()
-        return taken
+    def start(count: int = 1) -> float:
+        print(count, file=asked, flush=True)
+        return float(answers.readline())
 
-    start()  # the fork server itself
-    yield start
-
-
-def _say_ready(connection: Connection) -> None:
-    connection.send(True)
+    try:
+        start()  # the fork server itself
+        yield start
+    finally:
+        asked.close()
+        process.wait()
+        answers.close()

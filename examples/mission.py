@@ -7,7 +7,8 @@
 
 It ends with a table beside the figures of the thesis, and writes path.png, distance.png and a timeline of each run to
 the output directory.
-What happens in it is in mission/action.py; the programs of the robot are beside that.
+The graph of its actions is mission/mission.json, and what they do is in mission/action.py; the programs of the robot
+are beside that.
 """
 
 from __future__ import annotations

@@ -11,7 +11,19 @@ from pathlib import Path
 
 from fuzz.target import Feed, Target
 from rr_actors.base.errors import CatalogDamaged, CatalogVersion
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State, rows_of
+from rr_actors.registrar.model.rows import (
+    Held,
+    Hold,
+    Notice,
+    Peer,
+    Phase,
+    Put,
+    Resource,
+    Row,
+    ServedQuery,
+    State,
+    rows_of,
+)
 from rr_actors.storage.opening import open_store, read_rows
 
 _Files = dict[str, bytes]
@@ -44,7 +56,7 @@ def _rows() -> list[Row]:
     rows: list[Row] = [Peer("maker")]
     for n in range(12):
         rows.append(Resource(f"r{n:02}", "thing", b"q" * n, b"a", Phase.LOADED, State.OK, "", 1))
-        rows.append(Query(f"q{n:02}", f"r{n:02}", "app", "", 1, n))
+        rows.append(ServedQuery(f"q{n:02}", f"r{n:02}", "app", "", 1, n))
         rows.append(Held(f"h{n:02}", "maker", "thing", b"q" * n, b"a", f"r{n:02}", "", 1, n, Hold.HELD, State.OK))
         rows.append(Notice(f"n{n:02}", "q00", "app", "r00", "e", State.UPDATE, "x" * 100 * n, "r00", False, b"a"))
     return rows

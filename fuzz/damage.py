@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.model.rows import Change, Drop, Peer, Phase, Put, Query, Resource, Row, State, rows_of
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Phase, Put, Resource, Row, ServedQuery, State, rows_of
 from rr_actors.registrar.model.store import Store
 from rr_actors.storage.opening import Durability, open_store
 from rr_actors.storage.sqlite_store import SqliteStore, segments_among
@@ -58,7 +58,7 @@ class Hurt(NamedTuple):
 def _changes(registrar: str, number: int) -> list[Change]:
     id_ = f"{registrar}-{number}"
     puts: list[Change] = [
-        Put(Query(id_, "r", "app", "", 1, number)),
+        Put(ServedQuery(id_, "r", "app", "", 1, number)),
         Put(Resource(id_, "thing", id_.encode() * 20, None, Phase.LOADED, State.OK, "", 1)),
         Put(Peer(f"peer-{registrar}-{number % 5}")),
     ]

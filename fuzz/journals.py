@@ -19,9 +19,9 @@ from rr_actors.registrar.model.rows import (
     Peer,
     Phase,
     Put,
-    Query,
     Resource,
     Row,
+    ServedQuery,
     State,
     apply,
     content_of,
@@ -38,10 +38,14 @@ _Segments = list[bytes | None]
 _HEADER = 56
 _RECORD = struct.Struct("<III")
 _PARTS: list[list[list[Change]]] = [
-    [[Put(Query("a", "r", "app", "", 1, 1)), Put(Peer("maker"))], [Put(Query("a", "r", "app", "", 1, 2))]],
+    [[Put(ServedQuery("a", "r", "app", "", 1, 1)), Put(Peer("maker"))], [Put(ServedQuery("a", "r", "app", "", 1, 2))]],
     [[Put(Resource("r", "thing", b"q" * 40, None, Phase.LOADED, State.OK, "", 1)), Drop("queries", "a")]],
-    [[Put(Query("b", "r", "app", "", 1, 2**62))], [Drop("peers", "maker")], [Put(Query("c", "", "", "", 1, -1))]],
-    [[Drop("resources", "r"), Put(Query("b", "r", "app", "", 2, 7))]],
+    [
+        [Put(ServedQuery("b", "r", "app", "", 1, 2**62))],
+        [Drop("peers", "maker")],
+        [Put(ServedQuery("c", "", "", "", 1, -1))],
+    ],
+    [[Drop("resources", "r"), Put(ServedQuery("b", "r", "app", "", 2, 7))]],
 ]
 """Commits, by segment."""
 
@@ -224,7 +228,7 @@ def _open(path: Path, segments: _Segments, expected: list[set[Row]] | None) -> N
 def _seeds() -> list[bytes]:
     kinds = range(len(_DAMAGES))
     some = [bytes([first, 0, kind, 0, n, 0, 3, 0, 9]) for first in (0, 2, 255) for kind in kinds for n in range(4)]
-    body = msgspec.msgpack.encode([("queries", Query("x", "r", "app", "", 1, 1)), ("peers", "maker")])
+    body = msgspec.msgpack.encode([("queries", ServedQuery("x", "r", "app", "", 1, 1)), ("peers", "maker")])
     forged = [bytes([255, 0, 5, 0, n, 0, len(body) - 1]) + body for n in range(4)]
     return [b"\0", b"\4", b"\xff", *some, *forged]
 

@@ -21,6 +21,9 @@ from rr_actors.base import __version__ as __version__
 from rr_actors.runtime.garbage import left_alone as _left_alone
 
 with _left_alone():  # saves a tenth of the time: these objects stay until the process ends
+    import importlib as _importlib
+    import typing as _typing
+
     from rr_actors.actors.actor import IGNORE, Actor, ExitReport
     from rr_actors.actors.messaging.dead_letters import DeadLetter, DeadLetters
     from rr_actors.actors.messaging.exit_reports import Down
@@ -41,6 +44,7 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
         CircularDependency,
         ConfigError,
         Frame,
+        GraphError,
         InvalidName,
         InvalidRequest,
         InvalidResponse,
@@ -101,6 +105,7 @@ with _left_alone():  # saves a tenth of the time: these objects stay until the p
 
 __all__ = [
     "IGNORE",
+    "Action",
     "Actor",
     "ActorDeadError",
     "ActorRef",
@@ -133,6 +138,8 @@ __all__ = [
     "Event",
     "ExitReport",
     "Frame",
+    "GraphError",
+    "GraphResult",
     "Health",
     "InvalidName",
     "InvalidRequest",
@@ -195,6 +202,7 @@ __all__ = [
     "read_recording",
     "ref",
     "render",
+    "run_graph",
     "send_after",
     "server",
 ]
@@ -203,3 +211,18 @@ __all__ = [
 def __dir__() -> list[str]:
     """Return the public names, which completion shows of the package."""
     return __all__
+
+
+if _typing.TYPE_CHECKING:
+    from rr_actors import managers as managers
+    from rr_actors.managers import Action, GraphResult, run_graph
+else:
+    _OF_MANAGERS = {"Action", "GraphResult", "run_graph"}
+
+    def __getattr__(name: str) -> object:
+        """Import the ready-made managers when `rr.managers` or one of these names is asked for: most need none."""
+        if name == "managers":
+            return _importlib.import_module("rr_actors.managers")
+        if name in _OF_MANAGERS:
+            return getattr(_importlib.import_module("rr_actors.managers"), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=_sys.modules[__name__])

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import threading
 import uuid
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,25 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Where a change is judged, the examples are the same each time (docs/decisions/0033-a-gate-that-repeats.md).
 settings.register_profile("busy machine", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("busy machine")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item], config: pytest.Config) -> None:
+    """With RR_ACTORS_SLOW_PART=2/3, keep the second third of the slow tests.
+
+    The same test is always in the same part, whatever others there are.
+    """
+    part = os.environ.get("RR_ACTORS_SLOW_PART")
+    if part is None:
+        return
+    number, _, parts = part.partition("/")
+    others = [item for item in items if _part_of(item, int(parts)) != int(number) and item.get_closest_marker("slow")]
+    config.hook.pytest_deselected(items=others)
+    left_out = set(others)
+    items[:] = [item for item in items if item not in left_out]
+
+
+def _part_of(item: pytest.Item, parts: int) -> int:
+    return zlib.crc32(item.nodeid.encode()) % parts + 1
 
 
 def pytest_collection_finish() -> None:

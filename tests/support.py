@@ -10,6 +10,8 @@ import os
 import resource
 import signal
 import sqlite3
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -360,3 +362,19 @@ class NoDescriptors:
 
     def __exit__(self, *exc: object) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, self._before)
+
+
+def run_example(folder: Path, *arguments: str | Path, limit_s: float, may_log_errors: bool = False) -> str:
+    """Run Python with these arguments in a folder; return what it prints. It must end well, and within a time limit."""
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=limit_s,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert may_log_errors or "Traceback" not in done.stderr  # that a process was killed may be logged
+    return done.stdout

@@ -17,12 +17,18 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.config import SystemConfig
+from rr_actors.managers import Choices, Keeper
+from rr_actors.managers.actions.graph_engine import GraphEngine
+from rr_actors.managers.actions.graph_runs import OVER, Ended, GraphRun
+from rr_actors.managers.choices import choice_manager
+from rr_actors.managers.choices.trials import Trials
+from rr_actors.managers.keeper import comparing
 from rr_actors.registrar.core import holding, notices, reconciliation, recovery, releasing, status_delivery, unloading
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import Reconcile
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Unloaded
-from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Query, Resource
+from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Resource, ServedQuery
 from rr_actors.runtime.processes import lifeline
 from rr_actors.storage.journaled_store import Found, JournaledStore, Segment
 from rr_actors.supervision.child_main import ChildProcess
@@ -32,6 +38,7 @@ from rr_actors.system.system import System
 from rr_actors.testing import __main__ as chaos
 from rr_actors.testing import load_threads, victim_managers, victim_system
 from rr_actors.testing import run as runs
+from rr_actors.testing.mission import mission_managers, mission_threads
 from rr_actors.testing.monkey import Monkey
 
 VARIABLE = "RR_ACTORS_TEST_BREAKAGE"
@@ -191,7 +198,7 @@ def _nothing_is_agreed() -> None:
 
 
 def _released_by_the_first() -> None:
-    def broken(decision: Decision, query: Query) -> None:
+    def broken(decision: Decision, query: ServedQuery) -> None:
         resource = decision.catalog.resources[query.resource_id]
         if resource.phase is Phase.LOADED:
             unloading.begin_unload(decision, resource)
@@ -200,7 +207,7 @@ def _released_by_the_first() -> None:
 
 
 def _forgotten_without_its_callback() -> None:
-    def broken(decision: Decision, query: Query) -> None:
+    def broken(decision: Decision, query: ServedQuery) -> None:
         resource = decision.catalog.resources[query.resource_id]
         last = len(decision.catalog.holders[resource.id]) == 1
         unloading.drop_query(decision, query)
@@ -247,6 +254,65 @@ def _never_restarted() -> None:
     replace(restarts.needs_restart, lambda restart, reason: False)
 
 
+# -- the ready-made managers ------------------------------------------------------------------------------------------
+
+
+def _planners_are_killed() -> None:
+    override(Monkey, "_kill_manager", lambda kill: Monkey._kill_planner)
+
+
+def _ends_of_actions_are_not_written() -> None:
+    def wrap(commit: Any) -> Any:
+        def broken(self: GraphEngine, run: GraphRun, event: Any) -> None:
+            if not isinstance(event, Ended) or run.state in OVER:
+                commit(self, run, event)
+
+        return broken
+
+    override(GraphEngine, "_commit", wrap)
+    _planners_are_killed()
+
+
+def _loads_of_actions_are_kept() -> None:
+    override(GraphEngine, "_release", lambda release: lambda self, query: None)
+
+
+def _failed_alternatives_stay() -> None:
+    def broken(self: Choices, id: str, held: Any, status: Any, part: Any) -> None:
+        status.handled()
+
+    override(Choices, "_replace", lambda replace: broken)
+
+
+def _trials_stay() -> None:
+    override(Trials, "release", lambda release: lambda self, query: None)
+
+
+def _no_reasons() -> None:
+    nothing: Any = vars(choice_manager)["_nothing"]
+    replace(nothing, lambda request, why: nothing(request, why[1:]))
+    mission_managers.UNLUCKY_ARMS = 200  # so that choices are lost
+
+
+def _replicas_are_doubled() -> None:
+    def wrap(release: Any) -> Any:
+        return lambda self, one: threading.Timer(0.3, release, (self, one)).start()  # so that it is seen
+
+    replace(vars(comparing)["_is_in_the_way"], lambda other, one: False)
+    override(Keeper, "_release", wrap)
+
+
+def _held_replicas_are_not_known() -> None:
+    override(Keeper, "_is_own", lambda is_own: lambda self, query: False)
+
+
+def _lost_replicas_stay() -> None:
+    def broken(one: Any, found: Any) -> Any:
+        return next((other for other in found if other.what == one.what), None)
+
+    replace(vars(comparing)["_right"], broken)
+
+
 _LOST = (
     "journal:",
     "catalog",
@@ -254,6 +320,9 @@ _LOST = (
     "does not exist",
     "was told",
     "held by nobody",
+    "keeper: ",
+    "choices: ",
+    "actions: ",
     "standstill",
     "is left",
 )
@@ -318,6 +387,36 @@ BREAKAGES = {
         _never_restarted,
         ("standstill", "does not come back", "hangs", "it is stopped"),
     ),
+    "ends of actions are not written": Breakage(
+        "actions",
+        "GraphEngine._commit leaves them out",
+        _ends_of_actions_are_not_written,
+        ("after its end was on disk",),
+    ),
+    "what actions have loaded is kept": Breakage(
+        "actions", "GraphEngine._release does nothing", _loads_of_actions_are_kept, ("is held by nobody",)
+    ),
+    "an alternative that has failed stays": Breakage(
+        "choices", "Choices._replace does nothing", _failed_alternatives_stay, ("no working alternative",)
+    ),
+    "trials are not released": Breakage(
+        "choices", "Trials.release does nothing", _trials_stay, ("is held by nobody", "trials of", "is left")
+    ),
+    "a choice that is lost does not say why": Breakage(
+        "choices", "_nothing leaves out the first reason", _no_reasons, ("does not say why",)
+    ),
+    "a replica is loaded beside the one before": Breakage(
+        "keeper", "_is_in_the_way says no", _replicas_are_doubled, ("replicas of",)
+    ),
+    "a keeper does not know what it holds": Breakage(
+        "keeper", "_is_own says no", _held_replicas_are_not_known, ("is held", "replicas of")
+    ),
+    "a lost replica is not loaded again": Breakage(
+        "keeper",
+        "_right takes it for one that is there",
+        _lost_replicas_stay,
+        (" ready: failing", " ready: all failing"),
+    ),
 }
 
 
@@ -326,7 +425,7 @@ def main(name: str, seed: str, state_dir: str, report: str) -> int:
     os.environ[VARIABLE] = name
     if name:
         BREAKAGES[name].apply()
-    load_threads.PATIENCE_S = victim_managers.PATIENCE_S = 6.0
+    load_threads.PATIENCE_S = victim_managers.PATIENCE_S = mission_threads.LIMIT_S = 6.0
     victim_system._SETTLE_S = 5.0
     victim_system._ABANDON_S = runs._STALLED_S = 7.0
     config = SystemConfig(preload=("support_breakages",))

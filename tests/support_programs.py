@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from rr_actors.managers.process_marks import VARIABLE, find_processes
+from rr_actors.runtime.processes.control_groups import group_of
 
 _MARK = "RR_ACTORS_TESTS"  # set in conftest.py, inherited by every process of the tests
 
@@ -13,3 +15,9 @@ def running_programs(resource_id: str = "") -> dict[int, str]:
     """Pids of all programs that run for these tests, with their allocations; of one resource, if it is named."""
     ours = find_processes(_MARK, os.environ[_MARK])
     return {pid: value for pid, value in find_processes(VARIABLE, resource_id).items() if pid in ours}
+
+
+def group_of_program(pid: int) -> Path | None:
+    """The control group that a program has been given; None if it has none."""
+    group = group_of(pid)
+    return group if group is not None and group.name.startswith("rr-") else None

@@ -36,8 +36,8 @@ from rr_actors.registrar.model.rows import (
     Notice,
     Peer,
     Put,
-    Query,
     Resource,
+    ServedQuery,
     State,
     content_of,
 )
@@ -219,7 +219,7 @@ def row_text(row: Any) -> str:
             attempt = f", attempt {row.attempt}" if row.attempt > 1 else ""
             state = f", {row.state.name}" if row.state is not State.OK else ""
             return f"resource {row.id} of {row.server}: {row.phase.value}{attempt}{state}"
-        case Query():
+        case ServedQuery():
             return f"query {row.id} of {row.origin} on {row.resource_id}{priority_text(row.priority)}"
         case Held():
             parent = f" for {row.parent}" if row.parent else ""

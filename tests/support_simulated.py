@@ -19,7 +19,7 @@ from rr_actors.supervision.core.state import (
     StartChild,
     StopChild,
     SupervisorStarted,
-    Tree,
+    SupervisorState,
 )
 
 Outcome = Literal["ok", "fail", "ignore"]
@@ -34,7 +34,7 @@ class World:
     """
 
     def __init__(self, spec: Supervisor, chance: float = 0.0) -> None:
-        self.tree = Tree.of(spec)
+        self.tree = SupervisorState.of(spec)
         self.now = 0.0
         self.chance = chance
         self.log: list[str] = []

@@ -22,9 +22,9 @@ from rr_actors.registrar.model.rows import (
     Int64,
     Phase,
     Put,
-    Query,
     Resource,
     Row,
+    ServedQuery,
     State,
 )
 from rr_actors.storage.sqlite_store import segments_among
@@ -64,8 +64,8 @@ Rows = dict[tuple[str, str], Row]
 """By table and id."""
 
 
-def query(id_: str, seq: int = 1) -> Query:
-    return Query(id_, "r1", "app", "", 1, seq)
+def query(id_: str, seq: int = 1) -> ServedQuery:
+    return ServedQuery(id_, "r1", "app", "", 1, seq)
 
 
 def part(id_: str, request: bytes = b"\x01") -> Resource:

@@ -24,7 +24,7 @@ def main() -> None:
     for _ in every(PERIOD_S / options.speed):
         for order in orders.poll():
             go = order["go"]
-            if lidar is None or order["lidar"] != lidar.path:
+            if go and (lidar is None or order["lidar"] != lidar.path):
                 lidar = _look_through(order["lidar"], lidar)
         driver.poll()
         if lidar:

@@ -206,7 +206,7 @@ class ActorRef(pykka.ActorRef[A]):
             reply.set_exception()
             _note_dead(self, message, error)
 
-    def _stop(self, reply: Reply[bool], reason: StopReason, *, final: bool) -> None:
+    def _stop(self, reply: StopReply, reason: StopReason, *, final: bool) -> None:
         self._send(Stop(reason, final=final), reply, ())
 
     def __str__(self) -> str:
@@ -402,7 +402,7 @@ class DistantRef(ActorRef[A]):
             _note_dead(self, message, error)
         return None
 
-    def _stop(self, reply: Reply[bool], reason: StopReason, *, final: bool) -> None:
+    def _stop(self, reply: StopReply, reason: StopReason, *, final: bool) -> None:
         if self._local() is not None:
             super()._stop(reply, reason, final=final)
             return

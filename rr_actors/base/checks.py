@@ -7,8 +7,8 @@ import functools
 import inspect
 import math
 import os
-from collections.abc import Callable, Generator, Sequence
-from typing import Any, TypeGuard, cast
+from collections.abc import Callable, Generator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeGuard, cast
 
 from msgspec import Struct
 
@@ -65,6 +65,31 @@ def check_number(
     expected += also
     if not is_number(value) or value < least or (most is not None and value > most):
         raise invalid(who, field, expected, value)
+
+
+RELIABILITY = "reliability"
+"""The label that says how far something is trusted, from 0 to 1."""
+
+
+class WrongLabel(NamedTuple):
+    """A label that cannot be. `key` is its name; "" if the name is wrong."""
+
+    key: str
+    expected: str
+    got: object
+
+
+def wrong_label(labels: Mapping[str, object]) -> WrongLabel | None:
+    """Return the first of some labels, values by name, that is wrong; None if there is none."""
+    for name, value in labels.items():
+        if not is_a(name, str) or not name or name.startswith("-"):  # "-cost" in prefer= means less of it
+            return WrongLabel("", "names that do not begin with '-'", name)
+        if not is_a(value, (str, bool)) and not is_number(value):
+            return WrongLabel(name, "a finite number, a text or a truth value", value)
+    reliability = labels.get(RELIABILITY, 1)
+    if not is_number(reliability) or not 0 <= reliability <= 1:
+        return WrongLabel(RELIABILITY, "a number from 0 to 1", reliability)
+    return None
 
 
 def check_positive(value: object, who: str, field: str) -> None:

@@ -6,7 +6,7 @@
     ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
     │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
     │                       NotFound ChildRunning ChildRestarting NotForDynamic TooManyChildren
-    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring), OverCapacity;  LoadTimeout
+    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring), OverCapacity, GraphError;  LoadTimeout
     ├─ UnloadFailed(.trace)
     ├─ ResourceLost
     ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull NotRunning
@@ -334,6 +334,19 @@ class OverCapacity(LoadFailed):
     asked: float
     free: float
     holders: tuple[str, ...] = ()
+
+
+class GraphError(LoadFailed, UsageError, ValueError):
+    """A graph of actions is wrong, or something that it needs is not there. Nothing of it has run.
+
+    `.file`: None if it came from no file; `.path`: the place in the JSON object, "actions[0].parents[1]"; `.expected`,
+    `.got`
+    """
+
+    file: str | None
+    path: str
+    expected: str
+    got: Any
 
 
 class LoadTimeout(LoadError, TimeoutError):

@@ -15,7 +15,7 @@ import os
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args, get_origin
+from typing import Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 
@@ -65,8 +65,13 @@ def file_name(path: object) -> str:
 
 def read_toml(file: str) -> dict[str, Any]:
     """Return the content of the TOML file at this path; raise ConfigError if it cannot be read, or parsed."""
+    return parse_toml(read_bytes(file), file)
+
+
+def read_bytes(file: str) -> bytes:
+    """Return the bytes of the TOML file at this path; raise ConfigError if it cannot be read."""
     try:
-        data = Path(file).read_bytes()
+        return Path(file).read_bytes()
     except (OSError, ValueError) as error:  # ValueError: no file has such a name
         problem = getattr(error, "strerror", None) or str(error)
         raise ConfigError(
@@ -76,7 +81,6 @@ def read_toml(file: str) -> dict[str, Any]:
             expected="a TOML file",
             got=problem,
         ) from error
-    return parse_toml(data, file)
 
 
 def parse_toml(data: bytes, file: str) -> dict[str, Any]:
@@ -126,25 +130,37 @@ def read_typed(file: str, kind: type[_T]) -> _T:
         ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or of the wrong type. `.file`,
             `.key`, `.expected`, `.got`
     """
-    table = read_toml(file)
+    return parse_typed(read_bytes(file), file, kind)
+
+
+def parse_typed(data: bytes, file: str, kind: type[_T]) -> _T:
+    """Return the bytes of a TOML file called `file` as a `kind`; raise ConfigError as read_typed() does."""
+    return convert_typed(parse_toml(data, file), file, kind)
+
+
+def convert_typed(value: object, file: str, kind: type[_T], key: str = "") -> _T:
+    """Return a value that stands at `key` in a file as a `kind`; raise ConfigError as read_typed() does."""
     try:
-        return msgspec.convert(table, kind)
+        return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
-        raise _wrong_at(table, kind, file, str(error)) from error
+        raise _wrong_at(value, kind, file, str(error), key) from error
 
 
-def _wrong_at(table: dict[str, Any], kind: Any, file: str, said: str) -> ConfigError:
+def _wrong_at(whole: Any, kind: Any, file: str, said: str, at: str) -> ConfigError:
     """Return the error for msgspec's text, such as "Expected `int`, got `str` - at `$.component[0].reliability`"."""
     problem, _, place = said.removesuffix("`").partition(" - at `$")
-    key = place.removeprefix(".")
+    key = (at + place).removeprefix(".")
     in_toml = problem.removeprefix("Expected ").replace("`object`", "a table").replace("`array`", "a list")
     expected, _, got = in_toml.partition(", got ")
     if "[...]" in key:  # msgspec does not say which key of a mapping, so its value is not known
         return wrong(file, key, expected, got, said=got)
-    value: Any = table
-    for index, name in _STEP.findall(key):
+    value: Any = whole
+    for index, name in _STEP.findall(place):
         value = value[int(index) if index else name]
         kind = _kind_below(kind, name)
+    if problem.startswith("Invalid enum value"):  # msgspec does not say which there are
+        literal = next((one for one in (kind, *get_args(kind)) if get_origin(one) is Literal), None)
+        expected = f"one of {', '.join(map(str, get_args(literal)))}" if literal else expected
     field = _FIELD.match(problem if place else said)
     if field is None:
         return wrong(file, key, expected, value)
@@ -155,16 +171,16 @@ def _wrong_at(table: dict[str, Any], kind: Any, file: str, said: str) -> ConfigE
 
 
 def _kind_below(kind: Any, name: str) -> Any:
-    """Return the type of a field of a Struct, or of the items of a list or mapping."""
+    """Return the type of a field of a Struct, or of the items of a list, a tuple or a mapping."""
     struct = _struct_in(kind)
     if struct is None:
-        return get_args(kind)[-1]
+        return [one for one in get_args(kind) if one is not ...][-1]
     return next(one.type for one in msgspec.structs.fields(struct) if one.encode_name == name)
 
 
 def _struct_in(kind: Any) -> Any:
-    """Return the Struct that a type is, or allows beside None; None for a list or a mapping."""
-    if get_origin(kind) in (list, dict):
+    """Return the Struct that a type is, or allows beside None; None for a list, a tuple or a mapping."""
+    if get_origin(kind) in (list, tuple, dict):
         return None
     kinds = [one for one in (kind, *get_args(kind)) if isinstance(one, type)]
     return next((one for one in kinds if issubclass(one, msgspec.Struct)), None)

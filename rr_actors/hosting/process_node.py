@@ -20,7 +20,7 @@ from rr_actors.base.folder import Place
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import ProcessStacks, stacks_here
 from rr_actors.base.steps import Steps
-from rr_actors.hosting.run_files import Keeper, Watched
+from rr_actors.hosting.run_files import RunKeeper, Watched
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.wire.local_transport import LocalTransport
@@ -124,7 +124,7 @@ class ProcessNode(abc.ABC):
             frame_limit_bytes=info.config.frame_limit_bytes,
             segments_limit_bytes=info.config.segments_limit_bytes,
         )
-        self.keeper = Keeper(self.directory, self.transport, self.watched, info.place)
+        self.keeper = RunKeeper(self.directory, self.transport, self.watched, info.place)
         self.stopping = ""  # why all registrars here are being closed
         self.owner: object | None = None  # kept alive while a registrar is open that the application uses
         self.on_event = on_event

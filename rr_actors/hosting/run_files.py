@@ -91,7 +91,7 @@ _TOUCH_S = 3600.0  # most cleaners of temporary files remove old ones
 logger = Log("rr_actors")
 
 
-class Keeper:
+class RunKeeper:
     """Looks after one process's names and socket, and the byte that all processes share. On the loop.
 
     It makes removed files again, logs that, and touches the others each hour.

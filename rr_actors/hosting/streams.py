@@ -19,14 +19,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, cast
+from typing import Any, Literal, NamedTuple, Protocol, Self, cast
 
 import msgspec
 
 from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, NameTaken, NotFound, Unavailable, UsageError, did_you_mean, few, shown
 from rr_actors.base.names import check_name
-from rr_actors.wire.segments import Lie, Parcel, Parcels, Segments, can_open
+from rr_actors.wire.segments import Lie, Parcel, Segments, can_open
 
 IN_BAND_BYTES = 128 * 1024
 """The longest frame that goes over the socket if there is no shared memory for it."""
@@ -97,35 +97,6 @@ class ReaderRow(msgspec.Struct, frozen=True):
     missed: int
 
 
-class StreamRow(msgspec.Struct, frozen=True):
-    """A stream, as its publisher knows it.
-
-    Attributes:
-        name: its name among the streams of the resource.
-        resource_id, server, request: the resource; "registrar/server"; the request as JSON, cut if it is long.
-        frames: how many were published since it was opened.
-        rate: how many were published a second, in the last ten seconds.
-        bytes_s: how many bytes these had; those that nobody reads are not pickled, and have none.
-        age_s: how long ago the last was published; None: there was none.
-        readers: those who read it now.
-    """
-
-    name: str
-    resource_id: str
-    server: str
-    request: str
-    frames: int
-    rate: float
-    bytes_s: float
-    age_s: float | None
-    readers: list[ReaderRow]
-
-    @property
-    def missed(self) -> int:
-        """How many frames its readers missed, all together."""
-        return sum(reader.missed for reader in self.readers)
-
-
 class StreamInfo(msgspec.Struct, frozen=True):
     """An open stream at one moment.
 
@@ -152,10 +123,20 @@ class StreamInfo(msgspec.Struct, frozen=True):
     age_s: float | None
 
 
-def info_of(row: StreamRow) -> StreamInfo:
-    """Return what users see of a stream, from what its publisher knows."""
-    place = (f"{row.resource_id}/{row.name}", row.name, row.server, row.resource_id)
-    return StreamInfo(*place, row.rate, row.bytes_s, len(row.readers), row.missed, row.age_s)
+class StreamRow(msgspec.Struct, frozen=True):
+    """A stream, as the console shows it.
+
+    Attributes:
+        info: what programs see of it.
+        request: that of its resource as JSON, cut if it is long.
+        frames: how many were published since it was opened.
+        readers: those who read it now.
+    """
+
+    info: StreamInfo
+    request: str
+    frames: int
+    readers: list[ReaderRow]
 
 
 class StreamNews(msgspec.Struct, frozen=True):
@@ -205,7 +186,7 @@ class _Packet(msgspec.Struct, frozen=True, array_like=True):
     body: bytes | Parcel
 
 
-class _Frame(NamedTuple):
+class PublishedFrame(NamedTuple):
     """What is published. `body`: the value for all readers that can open segments; b"": there is no memory for it."""
 
     number: int
@@ -273,8 +254,42 @@ class _Line:
         self.socket.close()
 
 
-class _Consumer:
-    """A reader, as its publisher knows it.
+class Connected(Protocol):
+    """The publisher's end of a reader's socket, which does not block."""
+
+    def recv(self, size: int, /) -> bytes: ...
+
+    def send(self, packet: bytes, /) -> int: ...
+
+    def fileno(self) -> int: ...
+
+    def close(self) -> None: ...
+
+
+class PollSet(Protocol):
+    """Tells the publisher's thread of what happens to sockets."""
+
+    def register(self, connected: Connected, events: int, /) -> None: ...
+
+    def modify(self, connected: Connected, events: int, /) -> None: ...
+
+
+class Shared(Protocol):
+    """Lets others have a value that is in shared memory."""
+
+    def share(self, parcel: Parcel, holder: object, most_bytes: int) -> Parcel | None: ...
+
+    def discard(self, parcel: Parcel) -> None: ...
+
+    def take_back(self, holder: object) -> None: ...
+
+
+class Consumer:
+    """A reader, as its publisher knows it: what it is sent, and when, and how long what it has is in use.
+
+    Args:
+        pid: its process.
+        rebound: hears of the registrar whose reader goes on with this stream, and of the stream before.
 
     Attributes:
         lock: for all that follows, and to send, so that no other reader waits for that.
@@ -284,7 +299,7 @@ class _Consumer:
     """
 
     def __init__(
-        self, connected: socket.socket, parcels: Parcels, ready: select.epoll, rebound: Callable[[str, Stream], None]
+        self, connected: Connected, pid: int, parcels: Shared, ready: PollSet, rebound: Callable[[str, Stream], None]
     ) -> None:
         self.lock = threading.Lock()
         self._rebound = rebound
@@ -295,8 +310,8 @@ class _Consumer:
         self._registrar = ""
         self._offered = self._sent = 0  # frames
         self._socket = connected
-        self._pid = _pid_of(connected)
-        self._shares = can_open(self._pid)
+        self._pid = pid
+        self._shares = can_open(pid)
         self._parcels = parcels
         self._last = 0
         self._waiting: _Packet | None = None  # the newest frame, for when it wants one
@@ -332,7 +347,7 @@ class _Consumer:
         except (OSError, msgspec.MsgspecError):
             self.leave()
 
-    def give(self, frame: _Frame) -> bool:
+    def give(self, frame: PublishedFrame) -> bool:
         """Give it a frame in place of one that it has not wanted yet; return whether it gets it."""
         with self.lock:
             if not self.wanted:
@@ -346,7 +361,7 @@ class _Consumer:
                 self.hear(True)
             return not self.left
 
-    def _body_of(self, frame: _Frame) -> bytes | Parcel | None:
+    def _body_of(self, frame: PublishedFrame) -> bytes | Parcel | None:
         """Return what its packet carries; nothing: it keeps too many frames, or there is no memory for this one."""
         if self._shares or isinstance(frame.value, bytes):
             if isinstance(frame.body, bytes):
@@ -426,7 +441,7 @@ class Publisher:
         self._limit_bytes = segments.limit_bytes
         self._parcels = segments.parcels(os.getpid())
         self._changed = threading.Condition()  # a consumer has come, gone, or wants a frame
-        self._consumers: dict[int, _Consumer] = {}
+        self._consumers: dict[int, Consumer] = {}
         self._meter = _Meter()
         self._tell: Callable[[StreamNews], None] | None = None  # when readers are let in
         self._closed = False
@@ -456,11 +471,14 @@ class Publisher:
     def row(self, server: str, request: str) -> StreamRow:
         """Return what is seen of the stream from outside."""
         readers = [reader.row() for reader in self._readers()]
+        missed = sum(reader.missed for reader in readers)
         with self._changed:
-            seen = self._meter.frames, *self._meter.read()
-        return StreamRow(self.name, self.stream.resource_id, server, request, *seen, readers)
+            frames, (rate_hz, bytes_per_s, age_s) = self._meter.frames, self._meter.read()
+        place = (f"{self.stream.resource_id}/{self.name}", self.name, server, self.stream.resource_id)
+        info = StreamInfo(*place, rate_hz, bytes_per_s, len(readers), missed, age_s)
+        return StreamRow(info, request, frames, readers)
 
-    def _readers(self) -> list[_Consumer]:
+    def _readers(self) -> list[Consumer]:
         return [reader for reader in list(self._consumers.values()) if reader.keep is not None and not reader.left]
 
     def publish(self, value: object, *, timeout_s: float | None = None) -> int:
@@ -511,14 +529,14 @@ class Publisher:
         self._publish(self._readers(), value, parcel, None)
 
     def _publish(
-        self, readers: list[_Consumer], packed: bytes | pickling.Large, body: bytes | Parcel, deadline: float | None
+        self, readers: list[Consumer], packed: bytes | pickling.Large, body: bytes | Parcel, deadline: float | None
     ) -> int:
         with self._changed:
             if self._closed:
                 return 0
             number = self._meter.note(len(packed))
             most_bytes = self._limit_bytes // (2 * len(readers) or 1)
-            frame = _Frame(number, time.time(), packed, body, most_bytes)
+            frame = PublishedFrame(number, time.time(), packed, body, most_bytes)
             behind = [reader for reader in readers if reader.keep == "all"]
             for reader in behind:
                 reader.turns.append(frame.number)  # so that the frames of several threads stay in order
@@ -544,7 +562,7 @@ class Publisher:
         except (MailboxFull, Unavailable):
             return b""
 
-    def _wait_for(self, behind: list[_Consumer], number: int, deadline: float | None) -> list[_Consumer]:
+    def _wait_for(self, behind: list[Consumer], number: int, deadline: float | None) -> list[Consumer]:
         """Wait for readers of all frames; return those that can take this one, or none at the end of the wait."""
         with self._changed:
             while not self._closed:
@@ -588,7 +606,7 @@ class Publisher:
                 connected, _ = self._listener.accept()
             try:
                 connected.setblocking(False)
-                consumer = _Consumer(connected, self._parcels, self._ready, self._rebound)
+                consumer = Consumer(connected, _pid_of(connected), self._parcels, self._ready, self._rebound)
             except OSError:
                 connected.close()
                 raise
@@ -669,10 +687,14 @@ class Publishers:
 
     Attributes:
         streams: the streams, by the ids of their resources and their names.
+
+    Args:
+        loop: gives the memory of frames that nobody has any more back to the machine.
     """
 
-    def __init__(self, segments_limit_bytes: int | None) -> None:
+    def __init__(self, segments_limit_bytes: int | None, loop: asyncio.AbstractEventLoop) -> None:
         self._segments = Segments(segments_limit_bytes, IN_BAND_BYTES)
+        self._segments.loop = loop
         self._lock = threading.Lock()
         self.streams: dict[str, dict[str, Publisher]] = {}
 

@@ -1,21 +1,45 @@
-"""Ready-made managers: for programs, components made of programs, robots made of components, and budgets."""
+"""Ready-made managers: programs, components, pipes and robots of these, budgets, choices, what is kept, actions."""
 
 from __future__ import annotations
 
-from rr_actors.base.errors import OverCapacity
+from rr_actors.base.errors import GraphError, OverCapacity
+from rr_actors.managers.actions.action import Action
+from rr_actors.managers.actions.action_manager import ActionEnd, Actions, RunAction, RunGraph
+from rr_actors.managers.actions.graph_pictures import draw_graph
+from rr_actors.managers.actions.graph_results import GraphResult, run_graph
 from rr_actors.managers.budgets.budget_manager import Budgets, PoolInfo, Share, Supply
+from rr_actors.managers.budgets.measures import Measure
 from rr_actors.managers.budgets.pools import Pool, Reserve
+from rr_actors.managers.choices.alternatives import Alternative
+from rr_actors.managers.choices.choice_manager import Choices, Choose, Chosen
 from rr_actors.managers.components import Component, Components, LoadComponent
+from rr_actors.managers.keeper.keep_manager import Keeper, Kept
+from rr_actors.managers.pipes.pipe_manager import BuiltPipe, Pipe, Pipes
 from rr_actors.managers.programs import Program, Programs, Ready, RunProgram
 from rr_actors.managers.robots import LoadRobot, Robot, Robots
 
 __all__ = [
+    "Action",
+    "ActionEnd",
+    "Actions",
+    "Alternative",
     "Budgets",
+    "BuiltPipe",
+    "Choices",
+    "Choose",
+    "Chosen",
     "Component",
     "Components",
+    "GraphError",
+    "GraphResult",
+    "Keeper",
+    "Kept",
     "LoadComponent",
     "LoadRobot",
+    "Measure",
     "OverCapacity",
+    "Pipe",
+    "Pipes",
     "Pool",
     "PoolInfo",
     "Program",
@@ -24,7 +48,11 @@ __all__ = [
     "Reserve",
     "Robot",
     "Robots",
+    "RunAction",
+    "RunGraph",
     "RunProgram",
     "Share",
     "Supply",
+    "draw_graph",
+    "run_graph",
 ]

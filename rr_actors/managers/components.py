@@ -6,6 +6,7 @@ The registry is a TOML file::
     name = "front-lidar"
     type = "lidar"
     reliability = 0.9                                    # 0 to 1; a failure halves it
+    defaults = { run = "/run/robot" }                    # for what the request does not give
     parameters = { scans = "${run}/front-lidar.sock" }   # ${...}: from the request, and `here`, `python`, `name`
 
     [component.program]                                  # as RunProgram, see programs.py
@@ -42,7 +43,7 @@ from rr_actors.registrar.queries import Query
 
 logger = Log("rr_actors.managers.components")
 
-_LOAD_MARGIN_S = 20.0  # added to the program's own limit: its manager may be restarting after a crash
+LOAD_MARGIN_S = 20.0  # added to the program's own limit: its manager may be restarting after a crash
 
 
 class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -53,6 +54,7 @@ class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     program: RunProgram
     reliability: Annotated[float, msgspec.Meta(ge=0, le=1)] = 1.0
     parameters: dict[str, Parameter] = {}
+    defaults: dict[str, Parameter] = {}
 
 
 class RegistryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -112,10 +114,13 @@ class Components(Manager):
             ConfigError: the registry cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
         self._path = Path(registry).absolute()
-        self._registry = read_registry(self._path)
+        self._registry = self._read()
         self._programs = programs
         self._replace = replace
         self._lock = threading.Lock()
+
+    def _read(self) -> list[ComponentDescription]:
+        return read_registry(self._path)
 
     @server("component")
     def load_component(self, request: LoadComponent) -> Component:
@@ -184,9 +189,9 @@ class Components(Manager):
         failures: list[str] = []
         for candidate in self.candidates(request.type):
             program, parameters = self._filled(candidate, request)
-            made = functools.partial(_component, candidate, parameters)
+            made = functools.partial(component_of, candidate, parameters)
             try:
-                return run(program, made, program.ready.timeout_s + _LOAD_MARGIN_S)
+                return run(program, made, program.ready.timeout_s + LOAD_MARGIN_S)
             except LoadFailed as error:
                 failures.append(f"{candidate.name}: {error}")
                 self._lower(candidate, new_id())
@@ -206,7 +211,8 @@ class Components(Manager):
         """Fill the component's templates; return its program and parameters."""
         where = f"{self._path}: component {component.name!r}"
         given: Parameters = {"here": str(self._path.parent), "python": sys.executable, "name": component.name}
-        parameters = fill_all(component.parameters, {**given, **request.parameters}, f"{where}: parameters")
+        given = {**given, **component.defaults, **request.parameters}
+        parameters = fill_all(component.parameters, given, f"{where}: parameters")
         program = component.program
         name = component.name.replace("%", "%25").replace(":", "%3A")  # so the first ":" below is the one in between
 
@@ -225,7 +231,8 @@ class Components(Manager):
         ), parameters
 
 
-def _component(description: ComponentDescription, parameters: dict[str, str], query: Query) -> Component:
+def component_of(description: ComponentDescription, parameters: dict[str, str], query: Query) -> Component:
+    """Return the component whose program the query has."""
     return Component(description.name, description.type, query.response.pid, parameters)
 
 

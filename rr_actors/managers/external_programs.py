@@ -18,21 +18,25 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, wait
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import psutil
 
 from rr_actors.base.errors import RrError
+from rr_actors.base.reporting.log import Log
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.process_marks import VARIABLE, kill_allocation
 from rr_actors.managers.program_directory import Home, shim_of
 from rr_actors.managers.program_usage import ProgramUsage
 from rr_actors.runtime import interpreter
+from rr_actors.runtime.processes.control_groups import ControlGroups
 from rr_actors.runtime.processes.process import signal_name
+
+logger = Log("rr_actors.managers.external_programs")
 
 TAIL_LINES = 10
 _SHIM = str(Path(__file__).with_name("shim.py"))
@@ -74,7 +78,10 @@ class Exit:
 
 @dataclass(frozen=True)
 class Order:
-    """The order that the shim gets. `environment` is the program's whole environment, `directory` is absolute."""
+    """The order that the shim gets. `environment` is the program's whole environment, `directory` is absolute.
+
+    `limits`: what the program may use at most, of "cpu" (CPUs) and "memory_bytes", where a control group enforces it.
+    """
 
     command: str
     arguments: list[str]
@@ -83,6 +90,7 @@ class Order:
     ready_line: str | None = None  # a regular expression that a line of the output must contain
     stop_signal: int = signal.SIGTERM
     grace_s: float = 5.0  # at most LONGEST_S
+    limits: dict[str, float] = field(default_factory=dict[str, float])
 
 
 class ExternalPrograms:
@@ -91,8 +99,20 @@ class ExternalPrograms:
     A thread of its own calls `on_exit(key, exit)` when a running program ends unasked.
     """
 
-    def __init__(self, directory: Path, on_exit: Callable[[str, Exit], None]) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        on_exit: Callable[[str, Exit], None],
+        *,
+        pauses: bool = False,
+        groups: ControlGroups | None = None,
+    ) -> None:
         """Work below `directory`, which is made for the first program if it does not exist.
+
+        Args:
+            on_exit: see above.
+            pauses: programs will be paused. Each then has a control group, where one can be made, as each with limits.
+            groups: where control groups are made. Default: beside or below that of this process.
 
         Raises:
             ProgramFailed: this Python has no pidfds.
@@ -101,6 +121,8 @@ class ExternalPrograms:
             raise ProgramFailed("external programs need pidfds: Linux 5.3 or later, and a Python that was built for it")
         self._directory = directory
         self._on_exit = on_exit
+        self._pauses = pauses
+        self._groups = groups or ControlGroups.of_this_process()
         self._watcher = ExitWatcher()
         self._lock = threading.Lock()
         self._watched: dict[str, ProcessHandle] = {}
@@ -184,24 +206,34 @@ class ExternalPrograms:
             raise ProgramFailed(f"the program of {home.path} cannot be ended: {held}")
 
     def pause(self, key: str) -> None:
-        """Stop a program and its process group where they are, until resume(), or stop(), which ends them.
+        """Stop a program where it is, with all that it started, until resume(), or stop(), which ends them.
+
+        Its control group is frozen. Without one, its process group is stopped.
 
         Raises:
             ProgramFailed: the program has ended.
         """
-        self._signal(key, signal.SIGSTOP)
+        with self._program(key) as program:
+            group = self._home(key).group()
+            if group is None or not group.freeze(program.pid):
+                _signal_group(program, signal.SIGSTOP)
 
     def resume(self, key: str) -> None:
         """Let a paused program go on; one that is not paused does so in any case. Raises as pause() does."""
-        self._signal(key, signal.SIGCONT)
+        with self._program(key) as program:
+            group = self._home(key).group()
+            if group is not None:
+                group.thaw()
+            _signal_group(program, signal.SIGCONT)
 
-    def _signal(self, key: str, number: int) -> None:
+    @contextlib.contextmanager
+    def _program(self, key: str) -> Generator[ProcessHandle]:
         try:
             program = ProcessHandle(*self._home(key).state()["program"])
         except (KeyError, ProcessLookupError):
             raise ProgramFailed("the program has ended") from None
-        with contextlib.closing(program), contextlib.suppress(ProcessLookupError):
-            os.killpg(program.pid, number)
+        with contextlib.closing(program):
+            yield program
 
     def usage(self, key: str) -> dict[str, float]:
         """Return what a running program uses, with all that it has started, as ProgramUsage.now() does.
@@ -247,8 +279,10 @@ class ExternalPrograms:
     def _spawn(self, home: Home, order: Order, allocation: str) -> ProcessHandle:
         """Start a shim; the watcher reaps it when it ends."""
         executable = interpreter.python(f"external program {order.command!r}")
+        group = self._make_group(home, order)
         order_end, written = os.pipe()  # both close-on-exec
-        message = {**asdict(order), "environment": {**order.environment, VARIABLE: allocation}}
+        environment = {**order.environment, VARIABLE: allocation}
+        message = {**asdict(order), "environment": environment, "group": group}
         try:
             pid = os.posix_spawn(
                 executable,
@@ -278,6 +312,22 @@ class ExternalPrograms:
         with contextlib.suppress(BrokenPipeError), os.fdopen(written, "w") as file:
             json.dump(message, file)
         return spawned
+
+    def _make_group(self, home: Home, order: Order) -> str | None:
+        """Make a control group for a program that needs one, where one can be made, and return its path."""
+        if not self._pauses and not order.limits:
+            return None
+        group, hold = self._groups.place(f"rr-{home.key}", order.limits), dict[str, float]()
+        if group is not None:
+            home.note_group(group)
+            try:
+                hold = group.make(order.limits)
+            except OSError as error:
+                logger.warning("%s: no control group: %s", home.key, error)
+                group = None
+        for what in sorted(order.limits.keys() - hold):
+            logger.warning("%s: its share of %s is counted, not enforced: see rr-actors doctor", home.key, what)
+        return None if group is None else str(group.path)
 
     def _wait_ready(
         self,
@@ -366,6 +416,11 @@ class ExternalPrograms:
             if not shim.wait(state["grace_s"] + _SHIM_LIMIT_S):
                 shim.send_signal(signal.SIGKILL)
                 shim.wait(_SHIM_LIMIT_S)
+
+
+def _signal_group(program: ProcessHandle, number: int) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(program.pid, number)
 
 
 def _ask(ready: Callable[[Running], bool], running: Running) -> Future[bool]:

@@ -16,6 +16,7 @@ from rr_actors.base.folder import Folder
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.exit_watcher import ProcessHandle
 from rr_actors.managers.process_marks import kill_allocation
+from rr_actors.runtime.processes.control_groups import ControlGroup
 
 logger = Log("rr_actors.managers.program_directory")
 
@@ -60,8 +61,23 @@ class Home:
         (self.path / "lock").touch(mode=0o600)
 
     def remove(self) -> None:
-        """Remove the directory with its contents."""
+        """Remove the directory with its contents, and the program's control group, in which no process is left."""
+        group = self.group()
+        if group is not None and not group.remove():
+            logger.warning("%s cannot be removed: a process of another user runs in it", group.path)
         shutil.rmtree(self.path)
+
+    def note_group(self, group: ControlGroup) -> None:
+        """Note the program's control group, before it is made."""
+        (self.path / "group").write_text(str(group.path))
+
+    def group(self) -> ControlGroup | None:
+        """Return the program's control group; None if it has none."""
+        try:
+            noted = (self.path / "group").read_text()
+        except FileNotFoundError:
+            return None
+        return ControlGroup(Path(noted)) if noted else None  # the manager was killed before it had written
 
     @contextlib.contextmanager
     def held(self) -> Generator[bool]:

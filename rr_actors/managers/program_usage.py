@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import psutil
+
+from rr_actors.runtime.processes.control_groups import ControlGroup, group_of, read_number
 
 _LEAST_S = 0.5  # between two samples: a clock tick is 10 ms, so the CPU over this time is known to 2 %
 
@@ -67,7 +67,7 @@ def _of_tree(shim: int, pid: int) -> Used:
     The time of a process that has ended is counted by the process that reaped it: its parent, or the shim.
     """
     group = _own_group(shim, pid)
-    inside = set[int]() if group is None else _pids(group)
+    inside = set[int]() if group is None else group.pids()
     root = psutil.Process(shim)
     reaped = root.cpu_times()
     cpu_s, memory_bytes, threads = reaped.children_user + reaped.children_system, 0, 0
@@ -79,53 +79,12 @@ def _of_tree(shim: int, pid: int) -> Used:
             threads += process.num_threads()
     if group is not None and {process.pid for process in tree} == inside:
         # Each may miss something: the group what was before it, /proc a child that nobody has reaped.
-        cpu_s = max(cpu_s, _read(group / "cpu.stat", "usage_usec") / 1e6)
-        memory_bytes = _read(group / "memory.current") or memory_bytes
+        cpu_s = max(cpu_s, read_number(group.path / "cpu.stat", "usage_usec") / 1e6)
+        memory_bytes = read_number(group.path / "memory.current") or memory_bytes
     return Used(round(cpu_s, 3), memory_bytes, threads)
 
 
-# -- control groups (version 2) ----------------------------------------------------------------------------------------
-
-
-def _own_group(shim: int, pid: int) -> Path | None:
-    """Return the directory of the program's control group; None if that is its shim's, or there are none."""
-    mounted, own = _mounted_at(), _group_of(pid)
-    if mounted is None or own is None or own == _group_of(shim):
-        return None
-    return mounted / own
-
-
-@functools.cache
-def _mounted_at() -> Path | None:
-    for line in Path("/proc/self/mountinfo").read_text().splitlines():
-        mount, _, kind = line.partition(" - ")
-        if kind.startswith("cgroup2 "):
-            return Path(mount.split()[4])
-    return None
-
-
-def _group_of(pid: int) -> str | None:
-    with contextlib.suppress(OSError):
-        for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines():
-            if line.startswith("0::/"):
-                return line.removeprefix("0::/")
-    return None
-
-
-def _read(file: Path, *key: str) -> int:
-    """Return the number in a control group's file, behind `key` if there are several; 0 if it is not there."""
-    with contextlib.suppress(OSError):
-        for line in file.read_text().splitlines():
-            *before, number = line.split()
-            if before == list(key):
-                return int(number)
-    return 0
-
-
-def _pids(group: Path) -> set[int]:
-    """Return the processes in a control group and in those below it."""
-    found: set[int] = set()
-    for path in group.rglob("cgroup.procs"):
-        with contextlib.suppress(OSError):  # the group has gone meanwhile
-            found.update(map(int, path.read_text().split()))
-    return found
+def _own_group(shim: int, pid: int) -> ControlGroup | None:
+    """Return the program's control group; None if that is its shim's, or there are none."""
+    own = group_of(pid)
+    return None if own is None or own == group_of(shim) else ControlGroup(own)

@@ -23,13 +23,15 @@ import msgspec
 from msgspec.structs import replace
 
 from rr_actors.base.errors import InvalidRequest, RrError, shown, text_of
+from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running
-from rr_actors.registrar.declarations import server
+from rr_actors.registrar.declarations import costing, server
 from rr_actors.registrar.engine.server import ServerSpec, checked_spec, checked_whole, current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State
+from rr_actors.runtime.processes.control_groups import CONTROLLERS
 
 logger = Log("rr_actors.managers.programs")
 
@@ -74,6 +76,8 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         stop_signal: the signal that asks its whole process group to end.
         grace_s: seconds until SIGKILL follows; infinite: it does not.
         instance: a name that distinguishes requests that are otherwise the same: each name gets its own program.
+        cost: what it costs of the pools of the manager's Budgets, as ``{"cpu": 0.5, "memory_bytes": 2e8}``: the shares
+            are loaded before it starts. It can use no more than these two, where a control group can be made for it.
     """
 
     command: str
@@ -84,6 +88,11 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_signal: str = "SIGTERM"
     grace_s: Seconds = 5.0
     instance: str = ""
+    cost: dict[str, float] = {}
+
+
+def _cost(request: RunProgram) -> dict[str, float]:
+    return request.cost
 
 
 class Program(msgspec.Struct, frozen=True):
@@ -108,16 +117,23 @@ class Programs(Manager):
         idle: Literal["unload", "pause"] = "unload",
         linger_s: float = 0.0,
         paused_s: float | None = None,
+        cost_from: str = "budgets",
     ) -> None:
         """Keep a directory for each program below `directory` (default: "programs" beside the registrar's catalog).
 
         Args:
             probes: functions that requests may name as their readiness.
             idle, linger_s, paused_s: what becomes of a program that nobody needs, as for register_server(). A paused
-                program is stopped by SIGSTOP, with its process group: it keeps its memory and takes no CPU.
+                program keeps its memory and takes no CPU: its control group is frozen, with all that it started.
+                Where none can be made, its process group is stopped by SIGSTOP.
+            cost_from: the child of the system that runs Budgets, for the requests with a `cost`, as for @rr.server.
+
+        Raises:
+            InvalidName: `cost_from` is no name.
         """
         self._directory = directory
         self._probes = dict(probes or {})
+        self._cost_from = check_name(cost_from, "cost_from")
         self._idleness = {"idle": idle, "linger_s": linger_s, "paused_s": paused_s}
         self._lock = threading.Lock()
         self._programs: ExternalPrograms | None = None
@@ -155,7 +171,7 @@ class Programs(Manager):
 
     @run_program.pause
     def pause_program(self, request: RunProgram, response: Program) -> None:
-        """Stop the program's process group where it is."""
+        """Freeze the program with all that it started, or stop its process group."""
         self._external.pause(current().resource_id)
 
     @run_program.resume
@@ -164,8 +180,8 @@ class Programs(Manager):
         self._external.resume(current().resource_id)
 
     def _adapted(self, spec: ServerSpec) -> ServerSpec:
-        pauses = self._idleness["idle"] == "pause"
-        unused = {} if pauses else {"pause": None, "resume": None}
+        unused = {} if self._pauses else {"pause": None, "resume": None}
+        spec = costing(spec, _cost, self._cost_from, self)
         return checked_whole(checked_spec(replace(spec, **self._idleness, **unused)))
 
     @property
@@ -174,8 +190,12 @@ class Programs(Manager):
         with self._lock:
             if self._programs is None:
                 directory = Path(self._directory or self._beside).absolute()
-                self._programs = ExternalPrograms(directory, self._program_ended)
+                self._programs = ExternalPrograms(directory, self._program_ended, pauses=self._pauses)
             return self._programs
+
+    @property
+    def _pauses(self) -> bool:
+        return self._idleness["idle"] == "pause"
 
     @property
     def _beside(self) -> Path:
@@ -210,6 +230,7 @@ def _order(request: RunProgram) -> Order:
         _checked_pattern(request.ready.line),
         _signal_number(request.stop_signal),
         min(request.grace_s, LONGEST_S),
+        {what: amount for what, amount in request.cost.items() if what in CONTROLLERS},
     )
 
 

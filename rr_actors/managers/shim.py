@@ -224,7 +224,8 @@ class Shim:
         self._stop_at = time.monotonic() + self._order["grace_s"]
         self._state["stopped"] = True
         self._signal_group(self._order["stop_signal"])
-        self._signal_group(signal.SIGCONT)  # a paused program acts on no other signal
+        _write(self._order["group"], "cgroup.freeze", "0")  # a paused program acts on no signal
+        self._signal_group(signal.SIGCONT)
 
     def _reap(self) -> None:
         """Reap every child that has ended, and note the end of the program."""
@@ -285,6 +286,7 @@ def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> No
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != parent:
             os._exit(127)  # the shim died before the death signal was set
+        _write(order["group"], "cgroup.procs", "0")
         null = os.open(os.devnull, os.O_RDONLY)
         os.dup2(null, 0)
         os.dup2(output, 1)
@@ -295,6 +297,13 @@ def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> No
         os.write(failure, f"{type(error).__name__}: {error}".encode())
     finally:
         os._exit(127)
+
+
+def _write(group: str | None, file: str, text: str) -> None:
+    """Write to a file of the program's control group, if it has one."""
+    if group is not None:
+        with contextlib.suppress(OSError), open(f"{group}/{file}", "w") as found:
+            found.write(text)
 
 
 def _execute(command: str, arguments: list[str], environment: dict[str, str]) -> None:

@@ -16,6 +16,7 @@ from rr_actors.base.names import check_name
 from rr_actors.registrar.engine.server import (
     RECOVER_S,
     ROLES,
+    Labels,
     ServerSpec,
     checked_callback,
     checked_spec,
@@ -73,6 +74,7 @@ class server:  # noqa: N801 - used as a decorator
         idle: Literal["unload", "pause"] = "unload",
         paused_s: float | None = None,
         health: Health | None = None,
+        provides: Labels | None = None,
         cost: Cost | None = None,
         cost_from: str = "budgets",
         request_type: Any = None,
@@ -84,7 +86,7 @@ class server:  # noqa: N801 - used as a decorator
         callbacks, types = (_nothing, None, None, None), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s, health=health)
-        self._spec = checked_spec(spec)
+        self._spec = checked_spec(replace(spec, provides=provides))
         self._cost = None if cost is None else _Cost(self._spec, cost, check_name(cost_from, "cost_from"))
 
     # The first overload that fits is meant: two parameters, of which one may have a default; one; any number.
@@ -277,6 +279,11 @@ class _Manager(Protocol):
     def registrar(self) -> _Loading: ...
 
 
+def costing(spec: ServerSpec, cost: Cost, cost_from: str, manager: _Manager) -> ServerSpec:
+    """Return a server of a ready-made manager as `cost` and `cost_from` of @rr.server would have made it."""
+    return replace(spec, load=_Cost(spec, cost, cost_from).paid_before(spec.load, manager))
+
+
 class _Cost:
     """What each resource of a server holds of pools.
 
@@ -323,8 +330,8 @@ class _Cost:
 
     def _requests(self, given: tuple[Any, ...], fields: dict[str, Any]) -> list[dict[str, object]]:
         amounts = self._checked(self._amounts(*given, **fields)) if callable(self._amounts) else self._amounts
-        whose = current().resource_id
-        return [{"pool": pool, "amount": amount, "instance": whose} for pool, amount in amounts.items()]
+        whose: dict[str, object] = {"instance": current().resource_id, "whose": current().name}
+        return [{"pool": pool, "amount": amount, **whose} for pool, amount in amounts.items()]
 
 
 def class_name(cls: type) -> str:

@@ -30,18 +30,25 @@ _FOUND = 20
 
 _VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
 
+_TAKEN = frozenset(("loaded", "pausing", "paused", "resuming"))  # phases of which a revocation says more
+
 _Row = TypeVar("_Row", Resource, Held)
 _Found = TypeVar("_Found")
+
+
+What = Literal["resources", "queries", "id", "servers", "loads", "streams", "response"]
 
 
 class Wanted(msgspec.Struct, frozen=True):
     """The page to return: `limit` rows from number `offset` on, of the rows that contain the text `match`.
 
     Responses are not searched. With "id", the rows of the resource and the query with this id, or with
-    this beginning or end of an id. With "servers", all servers with their counts. With "streams", the open streams.
+    this beginning or end of an id. With "servers", all servers with their counts. With "loads", how often and how long
+    loads of each server wait, and the queries whose loads wait now. With "streams", the open streams. With "response",
+    the whole response of the resource with this id.
     """
 
-    what: Literal["resources", "queries", "id", "servers", "streams"]
+    what: What
     match: str = ""
     offset: int = 0
     limit: int = 100
@@ -102,8 +109,8 @@ class ResourceRow(msgspec.Struct, frozen=True):
 
     @property
     def condition(self) -> str:
-        """The state of the last status while the resource is loaded, else its phase."""
-        return self.state if self.phase == "loaded" else self.phase
+        """The state of the last status while the resource is loaded, else its phase; "revoked" while it is that."""
+        return _condition(self.phase, self.state, revoked=self.revoked)
 
     @property
     def needed(self) -> str:
@@ -116,6 +123,12 @@ class ResourceRow(msgspec.Struct, frozen=True):
         return ", ".join(dict.fromkeys(holder.origin for holder in self.holders))
 
 
+def _condition(phase: str, state: str, *, revoked: bool) -> str:
+    if revoked and phase in _TAKEN:
+        return "revoked"
+    return state if phase == "loaded" else phase
+
+
 class QueryRow(msgspec.Struct, frozen=True):
     """A query as its holder sees it.
 
@@ -125,6 +138,7 @@ class QueryRow(msgspec.Struct, frozen=True):
         parent: the origin's resource that depends on it; "" for none.
         hold: "pending" (asked for), "held", or "owed" (released, and its provider does not know yet).
         priority: None for standby.
+        said: in a page of loads, the last report of the load callback that it waits for: "50% opening".
     """
 
     id: str
@@ -136,6 +150,7 @@ class QueryRow(msgspec.Struct, frozen=True):
     hold: str
     state: str
     priority: int | None = 0
+    said: str = ""
 
     @property
     def name(self) -> str:
@@ -157,14 +172,47 @@ class ServerRow(msgspec.Struct, frozen=True):
     holds: dict[str, int] = {}
 
 
+class LoadRow(msgspec.Struct, frozen=True):
+    """How often and how long loads of one server waited, since the server was registered.
+
+    Attributes:
+        server: "registrar/server".
+        loads: loads that have begun: those that ran the load callback, and those that shared its result.
+        shared: loads that shared: they joined a resource that was loaded, or was being loaded.
+        waited: loads that were not answered at once, because the load callback had to end first.
+        failed: load callbacks that raised.
+        loading: loads that wait now.
+        mean_s, longest_s: how long load callbacks took, in seconds.
+        p95_s: the time within which 95 % of the newest 500 of them ended.
+        seconds: how long all of them took together.
+    """
+
+    server: str
+    loads: int
+    shared: int
+    waited: int
+    failed: int
+    loading: int
+    mean_s: float
+    p95_s: float
+    longest_s: float
+    seconds: float
+
+
 class Page(msgspec.Struct, frozen=True):
-    """The wanted rows, and how many rows match in all."""
+    """The wanted rows, and how many rows match in all. `response`: as JSON.
+
+    `said`: with "loads", the last reports of this registrar's own load callbacks, by the queries that wait for them.
+    """
 
     total: int
     resources: list[ResourceRow] = []
     queries: list[QueryRow] = []
     servers: list[ServerRow] = []
+    loads: list[LoadRow] = []
     streams: list[StreamRow] = []
+    response: str = ""
+    said: dict[str, str] = {}
 
 
 def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
@@ -187,9 +235,18 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
         case "servers":
             servers = _server_rows(actor)
             return Page(len(servers), servers=servers)
+        case "loads":
+            waiting, total = _chosen(waiting_loads(actor), wanted, actor.name)
+            loads = [row for row in load_rows(actor) if wanted.match in row.server]
+            queries = [_query_row(actor.name, row) for row in waiting]
+            return Page(total, queries=queries, loads=loads, said=actor.progress.said())
         case "streams":
             streams = _stream_rows(actor, wanted.match)
             return Page(len(streams), streams=streams[wanted.offset : wanted.offset + wanted.limit])
+        case "response":
+            row = _read(actor, lambda catalog: catalog.find(wanted.match))
+            raw = None if row is None else row.response
+            return Page(int(raw is not None), response="" if raw is None else json_of(shown_plain(raw)))
 
 
 def _stream_rows(actor: RegistrarActor, match: str) -> list[StreamRow]:
@@ -202,24 +259,77 @@ def _stream_rows(actor: RegistrarActor, match: str) -> list[StreamRow]:
             server, request = f"{actor.name}/{resource.server}", text_of_value(resource.request)
             if any(match in text for text in (resource.id, publisher.name, f"{server} {request}")):
                 rows.append(publisher.row(server, request))
-    return sorted(rows, key=lambda row: (row.server, row.request, row.name))
+    return sorted(rows, key=lambda row: (row.info.server, row.request, row.info.name))
 
 
 def _server_rows(actor: RegistrarActor) -> list[ServerRow]:
-    resources, held, names = _read(
-        actor, lambda catalog: (list(catalog.resources.values()), list(catalog.held.values()), list(catalog.servers))
+    resources, held, names, revoked = _read(
+        actor,
+        lambda catalog: (
+            list(catalog.resources.values()),
+            list(catalog.held.values()),
+            list(catalog.servers),
+            set(catalog.revocations),
+        ),
     )
     states: dict[str, Counter[str]] = {name: Counter() for name in names}
     holds: dict[str, Counter[str]] = {}
     homes: dict[str, str] = {}
     for row in resources:
         homes[row.id] = row.server
-        states.setdefault(row.server, Counter())[str(row.state if row.phase is Phase.LOADED else row.phase.value)] += 1
+        condition = _condition(row.phase.value, str(row.state), revoked=row.id in revoked)
+        states.setdefault(row.server, Counter())[condition] += 1
     for query in held:
         if query.hold is not Hold.OWED:
             holds.setdefault(homes.get(query.parent, ""), Counter())[f"{query.registrar}/{query.server}"] += 1
     rows = [ServerRow(f"{actor.name}/{name}", dict(states[name]), dict(holds.get(name, {}))) for name in states]
     return [*rows, ServerRow(actor.name, {}, dict(holds[""]))] if "" in holds else rows
+
+
+def load_rows(actor: RegistrarActor) -> list[LoadRow]:
+    """Return how often and how long loads of each server of a registrar waited. From any thread.
+
+    Raises:
+        RegistrarDown: the registrar is closed.
+    """
+    with actor.enter():
+        catalog = actor.whole()
+        joined, waited = dict(catalog.joined), dict(catalog.waited)
+        resources = [catalog.resources.get(id) for id in catalog.waiting.values()]
+    loading = Counter(row.server for row in resources if row is not None)
+    running = Counter(row.server for row in {row.id: row for row in resources if row is not None}.values())
+    rows: list[LoadRow] = []
+    for name in actor.servers.names():
+        if (server := actor.servers.get(name)) is None:  # another thread has just unregistered it
+            continue
+        times, late = server.load_times, waited.get(name, 0)
+        shared, ended = joined.get(name, 0) + late, times.loaded + times.failed
+        begun = ended + running[name]
+        counts = begun + shared, shared, begun + late, times.failed, loading[name]
+        seconds = times.seconds / ended if ended else 0.0, times.p95_s(), times.longest_s, times.seconds
+        rows.append(LoadRow(f"{actor.name}/{name}", *counts, *seconds))
+    return rows
+
+
+def counted_loads(rows: Iterable[LoadRow]) -> dict[str, int]:
+    """Return how many loads these servers had together, and how many of them were shared."""
+    rows = list(rows)
+    return {"loads": sum(row.loads for row in rows), "shared": sum(row.shared for row in rows)}
+
+
+def waiting_loads(actor: RegistrarActor) -> list[Held]:
+    """Return the queries of a registrar whose loads wait, oldest first. From any thread.
+
+    Unlike for other pages, loads on direct connections stay there: to look at what waits makes no load slower.
+
+    Raises:
+        RegistrarDown: the registrar is closed.
+    """
+    with actor.enter():
+        catalog = actor.whole()
+        settled = [catalog.held[id] for id in catalog.unsettled]
+        rows = [row for row in settled if row.hold is Hold.PENDING] + list(catalog.in_flight.values())
+    return sorted(rows, key=lambda row: row.id)
 
 
 def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:

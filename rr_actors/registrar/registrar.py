@@ -12,7 +12,7 @@ import functools
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Unpack, cast, overload
@@ -29,7 +29,7 @@ from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode
 from rr_actors.base.values.failure import error_of
-from rr_actors.hosting.streams import StreamInfo, info_of
+from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.arguments import (
     DEFAULTS,
     GroupKeywords,
@@ -85,8 +85,8 @@ from rr_actors.registrar.model.rows import (
     priority_of,
     types_id,
 )
-from rr_actors.registrar.model.rows import Query as QueryRow
-from rr_actors.registrar.pages import Page, Wanted, page_of
+from rr_actors.registrar.model.rows import ServedQuery as QueryRow
+from rr_actors.registrar.pages import Page, Wanted, counted_loads, load_rows, page_of
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, response_bytes
 from rr_actors.registrar.replacements import Replacements, encoded_response
 from rr_actors.runtime.event_loop import check_asyncio
@@ -558,6 +558,7 @@ class Registrar(Consumer):
         resume: Callable[..., Any] | None = None,
         health: Health | None = None,
         probe: Callable[..., Any] | None = None,
+        provides: Mapping[str, Mapping[str, object]] | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
@@ -591,14 +592,13 @@ class Registrar(Consumer):
                 takes long, and idling costs CPU or power.
             paused_s: seconds after which a paused resource is unloaded that nobody holds. Default: None, never. Give
                 them where a paused one keeps memory.
-            pause: ``pause(request, response)`` runs when the resource is paused. Default: None. Give one with
-                idle="pause".
+            pause: ``pause(request, response)`` runs when it is paused. Default: None. Give one with idle="pause".
             resume: ``resume(request, response)`` runs when the resource is needed again, and may return a new response.
                 Default: None. Give one with idle="pause".
-            health: how often `probe` runs, and what follows from what it finds. Default: None, never. Give one where a
-                resource may fail without anybody noticing.
+            health: how often `probe` runs, and what follows. Default: None, never. Give one if a resource fails unseen.
             probe: ``probe(request, response)`` says how well a loaded resource is: it returns None (well), a State or a
                 Status, or it raises. Default: None. Give one with `health`.
+            provides: labels, as `{"range": {"rate_hz": 30}}`. Default: None. Give them where Choices shall find it.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -609,9 +609,8 @@ class Registrar(Consumer):
         callbacks, types = (load, unload, status, recover), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, usage=usage, idle=idle, paused_s=paused_s)
-        spec = replace(spec, pause=pause, resume=resume, health=health, probe=probe)
-        spec = checked_whole(checked_spec(spec))
-        self._register_spec(spec)
+        spec = replace(spec, pause=pause, resume=resume, health=health, probe=probe, provides=provides)
+        self._register_spec(checked_whole(checked_spec(spec)))
 
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server from its checked spec. With `stored`, these bytes of the spec are kept in the catalog.
@@ -753,6 +752,7 @@ class Registrar(Consumer):
         request: Any,
         server: str | Declared[Any, Any, Any] | None = None,
         *,
+        part: Query | str | None = None,
         response: Callable[[Query], Any] | None = None,
         timeout_s: float | None = 30.0,
     ) -> Query:
@@ -772,6 +772,8 @@ class Registrar(Consumer):
             status: the status that the callback got. `status.query_id` names the part.
             request: the request of the spare. After a crash it must be the same as before.
             server: the server that loads the spare. None: the server of the part.
+            part: the part to replace, or the id of its query. None: the part that the status is about. The status of
+                the resource itself may be the occasion to replace a part that works by a better one.
             response: makes the new response of the resource. It gets the spare's Query. None: the response stays.
             timeout_s: seconds that the load may take. None: no limit.
 
@@ -782,7 +784,7 @@ class Registrar(Consumer):
             The errors of load() and `response`: nothing is replaced; the status goes up unless the callback handles it.
             InvalidResponse, NotSerializable: the new response has another type, or cannot travel.
             UnknownQuery: the resource does not hold the part any more.
-            UsageError: not called in a status callback, or the status is of the resource itself.
+            UsageError: not called in a status callback; or the status is of the resource itself, and no part is named.
         """
         limit_s = time_limit(timeout_s)
         if response is not None and not callable(response):
@@ -795,7 +797,8 @@ class Registrar(Consumer):
         if not (resource_id and isinstance(owner, Registrar)):
             where = "expected to be called in a status callback of a server"
             raise UsageError(f"registrar {self.name!r}: replace_part: {where}")
-        return owner._replacements.replace(status, request, target, response, limit_s)
+        part_id = status.query_id if part is None else target_id(part)
+        return owner._replacements.replace(status, part_id, request, target, response, limit_s)
 
     # -- for the calls that load -----------------------------------------------------------------------------------
 
@@ -975,7 +978,7 @@ class Registrar(Consumer):
 
     def streams(self) -> list[StreamInfo]:
         """Return every open stream of the resources served here, by server, request and name."""
-        return [info_of(row) for row in self._page(_ALL_STREAMS).streams]
+        return [row.info for row in self._page(_ALL_STREAMS).streams]
 
     def usage(self, *, of: Iterable[str] | None = None, timeout_s: float = 5.0) -> Usages:
         """Return what each loaded resource served here uses now, as the usage callback of its server says.
@@ -1058,9 +1061,9 @@ class Registrar(Consumer):
         """Return counts of the present, and of events since the registrar was opened.
 
         Present: resources, queries held, releases owed, loads and unloads in flight, notices, and messages that wait
-        for a decision ("mailbox"). "unheard": statuses that this registrar has not dealt with. Events: commits, and
-        status and progress callbacks that raised. While a recording runs, commits are timed: "timed_commits" of them
-        took "commit_us" microseconds.
+        for a decision ("mailbox"). "unheard": statuses that this registrar has not dealt with. Events: commits,
+        status and progress callbacks that raised, and loads of its servers ("loads"), of which "shared" joined a
+        resource. While a recording runs, commits are timed: "timed_commits" of them took "commit_us" microseconds.
         """
         return self._calls.call(self._stats_now)
 
@@ -1078,6 +1081,7 @@ class Registrar(Consumer):
             "unheard": len(actor.catalog.hearing),
             "callback_failures": actor.callback_failures,
             "mailbox": len(actor.waiting),
+            **counted_loads(load_rows(actor)),
             **actor.commit_counts(),
         }
 

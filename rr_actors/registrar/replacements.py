@@ -44,6 +44,7 @@ class Replacements:
     def replace(
         self,
         status: Status,
+        part_id: str,
         request: Any,
         target: ServerId | None,
         response: Callable[[Query], Any] | None,
@@ -54,13 +55,13 @@ class Replacements:
         if not resource_id:
             where = "expected to be called in a status callback of a server of this registrar"
             raise UsageError(f"registrar {self._actor.name!r}: replace_part: {where}")
-        if not status.query_id:
-            text = "the status is of the resource itself, and not of a part (its query_id is '')"
+        if not part_id:
+            text = "the status is of the resource itself, and not of a part (its query_id is ''); part= names one"
             raise UsageError(f"registrar {self._actor.name!r}: replace_part: {text}")
-        family = _family(status.query_id)
-        found = self._calls.call(self._find, resource_id, status.query_id, family)
+        family = _family(part_id)
+        found = self._calls.call(self._find, resource_id, part_id, family)
         if found.part is None:
-            return self._replaced_before(status, found)
+            return self._replaced_before(status, part_id, found)
         place = target or ServerId(found.part.registrar, found.part.server)
         raw = encode(request)
         row = next((row for row in found.spares if (row.registrar, row.server, row.request) == (*place, raw)), None)
@@ -70,7 +71,7 @@ class Replacements:
             id = _spare_id(family, place, raw, next_spare(status))
             options = LoadOptions(timeout_s=timeout_s, priority=priority_of(found.part.priority), own=found.part.own)
             spare = self._loads.wait(place, raw, resource_id, options, query_id=id)
-        self._swap(found, status, spare, family, response)
+        self._swap(found, found.part, status, spare, family, response)
         status.handled()
         return spare
 
@@ -86,15 +87,21 @@ class Replacements:
         spares = [row for row in held if row.id.startswith(family)]
         return _Found(resource, self._actor.servers.get(resource.server), part, spares)
 
-    def _replaced_before(self, status: Status, found: _Found) -> Query:
+    def _replaced_before(self, status: Status, part_id: str, found: _Found) -> Query:
         if not found.spares:
-            text = f"query {status.query_id}: resource {found.resource.id} does not hold this part any more"
-            raise UnknownQuery(f"{text}: nothing is replaced", query_id=status.query_id)
+            text = f"query {part_id}: resource {found.resource.id} does not hold this part any more"
+            raise UnknownQuery(f"{text}: nothing is replaced", query_id=part_id)
         status.handled()
         return self._calls.call(self._views.of, found.spares[0])
 
     def _swap(
-        self, found: _Found, status: Status, spare: Query, family: str, response: Callable[[Query], Any] | None
+        self,
+        found: _Found,
+        part: Held,
+        status: Status,
+        spare: Query,
+        family: str,
+        response: Callable[[Query], Any] | None,
     ) -> None:
         resource = found.resource
         try:
@@ -104,9 +111,10 @@ class Replacements:
             raise
         others = tuple(row.id for row in self._calls.call(self._find, resource.id, "", family).spares)
         rest = tuple(id for id in others if id != spare.id)
-        text = f"{spare.server_id} takes the place of a part that failed: {status.message}"
-        swap = functools.partial(c.Swap, resource.id, status.query_id, spare.id, rest, new_id(), raw, text)
-        self._calls.command(swap, f"replacing {status.query_id}")
+        failed = "a part that failed" if part.id == status.query_id else f"{part.registrar}/{part.server}"
+        text = f"{spare.server_id} takes the place of {failed}: {status.message}"
+        swap = functools.partial(c.Swap, resource.id, part.id, spare.id, rest, new_id(), raw, text)
+        self._calls.command(swap, f"replacing {part.id}")
 
 
 def encoded_response(response: Any, resource: Resource | None, server: ServerActor | None) -> bytes:

@@ -173,6 +173,11 @@ class Probes:
 
     # -- one probe ---------------------------------------------------------------------------------------------------
 
+    def is_waiting(self, key: str) -> bool:
+        """Return whether the callback of a key has been told to start, and has not begun."""
+        probe = self._running.get(key)
+        return probe is not None and probe.began is None
+
     @any_thread
     def begins(self, key: str, may_begin: Callable[[str], bool]) -> bool:
         """Note that a callback begins now, and return whether it may. In the thread that runs it."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rr_actors.actors.actor import ExitReport
+from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable, text_of
 from rr_actors.base.reporting import log
@@ -22,23 +23,26 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.hosting import forwarded_logs
 from rr_actors.hosting.process_node import SystemInfo
-from rr_actors.registrar.engine.node import Node
+from rr_actors.registrar.engine.node import MESSAGES, Node
 from rr_actors.runtime import event_loop, interpreter
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.processes.fork_server import Inherited
 from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
-from rr_actors.supervision.heartbeat import Health
+from rr_actors.supervision.heartbeat import ProcessHealth
 from rr_actors.supervision.hosted import Hosted, prepare
 from rr_actors.supervision.supervisor import target_of
+from rr_actors.wire.frames import decoder_of
 
 logger = Log("rr_actors")
 
-# The fork server imports this module, and these two with it: a child need not import them later.
+# The fork server imports this module, and these two with it, and makes these decoders: a child has them already.
 for _module in ("concurrent.futures.thread", "uvloop"):
     with contextlib.suppress(ImportError):  # uvloop need not be installed
         importlib.import_module(_module)
+for _messages in (control.Message, *MESSAGES.values(), *CODECS.values()):
+    decoder_of(_messages)
 
 _CLOSE_S = 2.0
 
@@ -78,7 +82,7 @@ class ChildProcess:
         self.node.on_death_in_callback = lambda runs: self._say(control.DiedInCallback(runs))
         self.node.on_resumed = self._resumed
         self._has_resumed = False
-        self._health = Health(self._directories)
+        self._health = ProcessHealth(self._directories)
         self._inherited = inherited
         self._path = path
         self._spec = spec
@@ -135,7 +139,7 @@ class ChildProcess:
             in_worker = not interpreter.patched()  # no worker can start there
             self._say(await self.node.dispatcher.workers.run(_failed, error) if in_worker else _failed(error))
             return 1
-        self._say(control.Ready())
+        self._say(control.ChildReady())
         await asyncio.wait((self._told_to_stop, self._report), return_when=asyncio.FIRST_COMPLETED)
         return self._leave(self._report.result() if self._report.done() else await self._stop_actor())
 

@@ -196,7 +196,7 @@ class ProcessRun:
 
     async def _judge(self, answer: control.Message | None) -> bool:
         match answer:
-            case control.Ready():
+            case control.ChildReady():
                 self._up = True
                 if self._end.done():
                     self._loop.call_soon(self._tell)
@@ -229,7 +229,7 @@ class ProcessRun:
 
     def _received(self, message: control.Message) -> None:
         match message:
-            case control.Ready() | control.Ignored() | control.Failed():
+            case control.ChildReady() | control.Ignored() | control.Failed():
                 if not self._answer.done():
                     self._answer.set_result(message)
             case control.Exiting():

@@ -16,7 +16,7 @@ import msgspec
 
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import ProcessStacks
-from rr_actors.wire.frames import FrameReader, framed
+from rr_actors.wire.frames import FrameReader, decoder_of, framed
 
 logger = Log("rr_actors")
 
@@ -63,7 +63,7 @@ class FoundStacks(msgspec.Struct, tag=True, array_like=True, frozen=True):
     error: str = ""
 
 
-class Ready(msgspec.Struct, tag=True, array_like=True, frozen=True):
+class ChildReady(msgspec.Struct, tag=True, array_like=True, frozen=True):
     """The actor's on_start has returned; others can reach it."""
 
 
@@ -110,7 +110,7 @@ class News(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 Message = (Start | Stop | Ping | AskStacks) | (
-    Ready | Ignored | Failed | DiedInCallback | Resumed | Pong | FoundStacks | News | Exiting
+    ChildReady | Ignored | Failed | DiedInCallback | Resumed | Pong | FoundStacks | News | Exiting
 )
 
 
@@ -133,7 +133,7 @@ class Channel(asyncio.Protocol):
         self._path = path
         self._received = received
         self._lost = lost
-        self._reader: FrameReader[Message] = FrameReader(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
+        self._reader: FrameReader[Message] = FrameReader(decoder_of(Message), _LIMIT_BYTES)
         self._transport: asyncio.Transport | None = None
         self._resting: asyncio.TimerHandle | None = None
         self._gone = asyncio.Event()

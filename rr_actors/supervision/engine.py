@@ -1,7 +1,7 @@
 """Supervision: performs the decisions of supervision/core/restarts.py on real children. On the loop.
 
-It keeps one Tree. For each event of a child it takes a decision from the core, and performs the decision's actions in
-order. Their outcomes are the next events. The supervisor actor around it is in supervisor.py.
+It keeps the state of one supervisor. For each event of a child it takes a decision from the core, and performs the
+actions of that in order. Their outcomes are the next events. The supervisor actor around it is in supervisor.py.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from rr_actors.supervision.core.state import (
     StartChild,
     StopChild,
     SupervisorStarted,
-    Tree,
+    SupervisorState,
 )
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.supervision.given_up import give_up
@@ -83,7 +83,7 @@ class Supervision:
     ) -> None:
         self.path = path
         self.history = History()
-        self.tree = Tree.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
+        self.tree = SupervisorState.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
         self.final = False
         self.entries = Entries(node.directory)
         self._node = node
@@ -124,7 +124,7 @@ class Supervision:
             run.kill()
 
     def apply(self, decision: Decision) -> None:
-        """Keep the decision's Tree and perform its actions."""
+        """Keep the decision's SupervisorState and perform its actions."""
         self.tree, actions = decision
         steps = Steps()
         for action in actions:

@@ -78,7 +78,7 @@ class Heartbeat:
             was_ill = bool(trouble)
 
 
-class Health:
+class ProcessHealth:
     """The health of this process.
 
     Args:

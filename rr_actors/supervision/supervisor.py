@@ -443,7 +443,7 @@ def _asker_below(path: str) -> str | None:
 
 def _starts_here(ref: ActorRef[Any]) -> bool:
     local = local_of(ref)
-    actor: Any = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+    actor: object = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
     return isinstance(actor, SupervisorActor) and actor.is_starting
 
 

@@ -28,9 +28,9 @@ from rr_actors.registrar.model.rows import (
     Notice,
     Peer,
     Put,
-    Query,
     Resource,
     Row,
+    ServedQuery,
     content_of,
 )
 from rr_actors.registrar.registrar import Registrar, registrar_of
@@ -216,7 +216,7 @@ def _in_the_name_of(name: str, old: str, content: Content, _epoch: int) -> list[
 def _has_something(catalog: Path, origin: str) -> bool:
     """Return whether a provider's catalog has a query of `origin`, or a notice for it."""
     rows = read_rows(catalog) if os.path.exists(catalog) else ()
-    return any(isinstance(row, Query | Notice) and row.origin == origin for row in rows)
+    return any(isinstance(row, ServedQuery | Notice) and row.origin == origin for row in rows)
 
 
 async def give_up_clients(node: Node, names: Iterable[str]) -> None:

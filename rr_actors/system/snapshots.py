@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+import concurrent.futures
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import pykka
@@ -17,6 +17,10 @@ from rr_actors.registrar.registrar import Registrar
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Presence
+
+T = TypeVar("T")
+
+_ASKED_AT_ONCE = 16
 
 _NO_ANSWER = (RrError, pykka.Timeout)
 """What a supervisor raises that is stopped or being respawned, or whose process does not answer in time."""
@@ -91,31 +95,44 @@ def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
     return sorted(paths)
 
 
+def ask_registrars(node: Node, ask: Callable[[Registrar], T]) -> dict[str, T | RrError]:
+    """Ask every registrar that is up, several at a time, and return the answers by name; of one that fails, its error.
+
+    A process that has stopped holds up nobody but itself: else a snapshot would wait for one after another.
+
+    Args:
+        node: the node of any process of the system.
+        ask: is called in a thread of its own, with a handle that does not wait for a restart.
+    """
+
+    def answer(name: str) -> T | RrError:
+        try:
+            return ask(registrar_in(node, name, patient=False))
+        except RrError as error:
+            return error
+
+    up = [name for name, status in node.statuses().items() if status is Presence.UP]
+    with concurrent.futures.ThreadPoolExecutor(_ASKED_AT_ONCE, thread_name_prefix="rr-actors-snapshot") as threads:
+        return dict(zip(up, threads.map(answer, up), strict=True))
+
+
 def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
     """Return every registrar that is not gone, by name: its state, and if it is up, its servers, resources and queries.
 
     Args:
         node: the node of any process of the system.
     """
-    described: dict[str, dict[str, Any]] = {}
-    for name, status in node.statuses().items():
-        described[name] = {"state": str(status)}
-        if status is Presence.UP:
-            try:
-                described[name].update(describe_registrar(registrar_in(node, name, patient=False)))
-            except RrError as error:
-                described[name]["error"] = str(error)
+    described = {name: {"state": str(status)} for name, status in node.statuses().items()}
+    for name, answer in ask_registrars(node, describe_registrar).items():
+        described.setdefault(name, {"state": str(Presence.UP)})
+        described[name] |= {"error": str(answer)} if isinstance(answer, RrError) else answer
     return described
 
 
 def streams_of(node: Node) -> list[StreamInfo]:
     """Return the open streams of every registrar that answers."""
-    streams: list[StreamInfo] = []
-    for name, status in node.statuses().items():
-        if status is Presence.UP:
-            with contextlib.suppress(RrError):  # it has ended just now, or does not answer
-                streams += registrar_in(node, name, patient=False).streams()
-    return streams
+    answers = ask_registrars(node, Registrar.streams).values()
+    return [stream for answer in answers if not isinstance(answer, RrError) for stream in answer]
 
 
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:

@@ -46,7 +46,9 @@ from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import check_not_own, serving
+from rr_actors.registrar.pages import LoadRow, Wanted
 from rr_actors.registrar.registrar import Registrar
+from rr_actors.registrar.registrar import page as page_in
 from rr_actors.runtime.backlogs import Backlog
 from rr_actors.runtime.event_loop import (
     FORKED,
@@ -79,7 +81,14 @@ from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings
 from rr_actors.system.registrar_lookup import give_up_clients, left_behind, open_registrar, registrar_in, take_over
-from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to, streams_of
+from rr_actors.system.snapshots import (
+    ask_registrars,
+    describe_at,
+    describe_registrars,
+    describe_supervisor,
+    paths_to,
+    streams_of,
+)
 from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import Presence, StateDir, absolute_path, actor_key, open_state_dir, registrar_key
 
@@ -755,22 +764,23 @@ class System:
         return recording
 
     def figures(self) -> list[Figure]:
-        """Return the figures of the system: children, restarts, registrars, mailboxes, commits, dead letters.
+        """Return the figures of the system: children, restarts, registrars, servers' loads, commits, dead letters.
 
-        During recordings, loads, their time, and exits are also counted. rr_actors.system.recording.figures has
-        prometheus_text() for them, rr_actors.system.recording.otel_export has register_metrics().
+        During recordings, loads and their time as holders see them, and exits are also counted.
+        rr_actors.system.recording.figures has prometheus_text() for them, rr_actors.system.recording.otel_export has
+        register_metrics().
         """
         node = self._running()
-        stats: dict[str, dict[str, int]] = {}
-        for name, status in node.statuses().items():
-            try:
-                stats[name] = registrar_in(node, name, patient=False).stats() if status is Presence.UP else {}
-            except RrError:  # the registrar has ended just now
-                stats[name] = {}
+        stats = {name: dict[str, int]() for name in node.statuses()}
+        servers: list[LoadRow] = []
+        for name, answer in ask_registrars(node, _loads_and_stats).items():
+            if not isinstance(answer, RrError):  # else the registrar has ended just now
+                servers += answer[0]
+                stats[name] = answer[1]
         tree: dict[str, Any] = {"path": self._top, "state": "stopped"}
         if self._end is None:  # what has ended is not asked: that would make a dead letter
             tree = describe_supervisor(self.supervisor())
-        return [*figures_of(tree, stats, self.dead_letters().count), *self._counters.figures()]
+        return [*figures_of(tree, stats, servers, self.dead_letters().count), *self._counters.figures()]
 
     def _publish(self, event: Facts) -> None:
         node = self._node
@@ -801,6 +811,10 @@ class System:
     def __repr__(self) -> str:
         state = "stopped" if self._node is None else "running" if self._end is None else "ended, not stopped,"
         return f"<System {self.name} {state} in {self.state_dir}>"
+
+
+def _loads_and_stats(registrar: Registrar) -> tuple[list[LoadRow], dict[str, int]]:
+    return page_in(registrar, Wanted("loads", limit=0)).loads, registrar.stats()
 
 
 def _say_log_lost(error: BaseException, event: Facts | None) -> None:

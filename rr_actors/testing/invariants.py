@@ -1,4 +1,4 @@
-"""Checks of the catalogs: when nothing is in flight any more, and when everything is released."""
+"""Checks of the catalogs and of the house: when nothing is in flight any more, and when everything is released."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from rr_actors.registrar.model.rows import Hold, Phase
+from rr_actors.registrar.queries import ResourceInfo
 from rr_actors.tools.inspection import Contents, check
 
 _LOOK_S = 0.1
@@ -49,11 +50,39 @@ def check_told(state: Mapping[str, Contents], told: Mapping[str, Iterable[str]])
     return violations
 
 
+def check_house(
+    devices: Iterable[ResourceInfo],
+    budgets: Iterable[ResourceInfo],
+    programs: Iterable[ResourceInfo],
+    stands: Callable[[int], bool],
+) -> list[str]:
+    """Return what is wrong in a house at rest: shares without their wholes, and programs that stand, or do not.
+
+    Args:
+        devices, budgets, programs: the resources of the three managers, at one moment.
+        stands: whether the program of this pid stands still.
+    """
+    on = sorted(info.request.watts for info in devices if info.server == "device")
+    shares = sorted(info.request.amount for info in budgets if info.server == "share")
+    found = [] if shares == on else [f"the shares are {shares}, and the devices need {on}"]
+    found += [f"{info.request} is {info.phase}" for info in (*devices, *budgets) if info.phase != "loaded"]
+    for info in programs:
+        is_needed = info.priority is not None
+        if info.phase != ("loaded" if is_needed else "paused") or stands(info.response.pid) == is_needed:
+            found.append(f"{info.request.instance}: priority {info.priority}, {info.phase}, needed: {is_needed}")
+    return found
+
+
+def used_by(devices: Iterable[ResourceInfo]) -> float:
+    """Return the watts of all devices that are on."""
+    return sum(info.request.watts for info in devices if info.server == "device" and info.phase == "loaded")
+
+
 def _moving(contents: Contents, state: Mapping[str, Contents]) -> Iterator[str]:
     held = {query.resource_id for query in contents.queries.values()}
     for resource in contents.resources.values():
         what = f"{contents.name}: resource {resource.id}"
-        if resource.phase is not Phase.LOADED:
+        if resource.phase not in (Phase.LOADED, Phase.PAUSED):
             yield f"{what} is {resource.phase}"
         elif resource.id not in held:
             yield f"{what} is held by nobody"

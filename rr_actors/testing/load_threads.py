@@ -1,12 +1,15 @@
-"""Consumers: threads of this process that load, wait, send statuses and unload, and note the answers."""
+"""Consumers and residents: threads of this process that load, wait and unload, and note the answers."""
 
 from __future__ import annotations
 
+import abc
+import functools
 import random
 import threading
 import time
 import uuid
 from collections import Counter
+from collections.abc import Callable
 from typing import NamedTuple
 
 from rr_actors.base.errors import RrError
@@ -159,3 +162,84 @@ class Consumer:
                 finally:
                     self._check_twice(query.id)
                 return query.server_id
+
+
+class LoadThread(abc.ABC):
+    """A thread that does one operation after another, by a registrar of its own, and notes how each has ended.
+
+    Attributes:
+        app: the registrar.
+
+    Args:
+        role: what the thread is, and of what its operations are, for reports.
+        pause_s: the longest time between two operations.
+    """
+
+    _refusals: tuple[type[Exception], ...] = (RrError,)  # what an operation may raise while the system is harmed
+    _release_s = PATIENCE_S
+
+    def __init__(self, app: Registrar, seed: int, tally: Tally, role: tuple[str, str], pause_s: float) -> None:
+        self.app = app
+        self._plan = random.Random(seed)
+        self._tally, self._pause_s = tally, pause_s
+        who, self._of = role
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"{who} of {app.name}", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Have the thread begin no further operation."""
+        self._stopped.set()
+
+    def join(self, deadline: float) -> None:
+        """Wait for the thread's last operation; note a violation if it runs after `deadline` (time.monotonic())."""
+        self._thread.join(max(0.0, deadline - time.monotonic()))
+        if self._thread.is_alive():
+            self._tally.violation(f"{self._thread.name}: a call hangs")
+
+    def release(self) -> None:
+        """Unload all that it holds."""
+        try:
+            self.app.unload_all(timeout_s=self._release_s)
+        except RrError as error:
+            self._tally.violation(f"{self.app.name}: a release failed: {error!r}")
+
+    def _run(self) -> None:
+        while not self._stopped.wait(self._plan.uniform(0, self._pause_s)):
+            kind, do = self._next()
+            started = time.monotonic()
+            try:
+                do()
+            except self._refusals as error:
+                self._tally.error(kind, type(error).__name__)
+            except Exception as error:
+                self._tally.violation(f"{self.app.name}: {kind} raised {error!r}")
+            else:
+                self._tally.operation(kind, time.monotonic() - started, self._of)
+
+    @abc.abstractmethod
+    def _next(self) -> tuple[str, Callable[[], object]]:
+        """Return the kind of the next operation, and what does it."""
+
+
+class Resident(LoadThread):
+    """A thread that switches devices of the house on and off, and changes their priorities."""
+
+    def __init__(self, app: Registrar, seed: int, tally: Tally) -> None:
+        super().__init__(app, seed, tally, ("resident", "of the house"), 0.05)
+
+    def _next(self) -> tuple[str, Callable[[], object]]:
+        held, chance = self.app.queries(), self._plan.random()
+        priority = self._plan.choice([None, 0, 1, 2, 5, 9])
+        if len(held) < 2 or (chance < 0.4 and len(held) < 6):
+            name, watts = f"device-{self._plan.randrange(12)}", self._plan.choice([10.0, 20.0, 35.0])
+            request = {"name": name, "watts": watts, "program": self._plan.random() < 0.5}
+            load = functools.partial(self.app.load, "house/device", request, priority=priority, timeout_s=5.0)
+            return "load of a device", load
+        query = self._plan.choice(held)
+        if chance < 0.7:
+            return "priority of a device", functools.partial(setattr, query, "priority", priority)
+        return "unload of a device", functools.partial(query.unload, timeout_s=5.0)

@@ -8,14 +8,15 @@ import resource
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rr_actors.base.errors import CatalogDamaged, CatalogError, RrError
 from rr_actors.storage.opening import read_rows
+from rr_actors.testing.mission.mission_managers import PLANNERS
 from rr_actors.testing.report import KILLS, Tally
-from rr_actors.testing.victim_managers import cut_links
-from rr_actors.testing.victim_system import CREWS, ROOT_MAKERS, Plant
+from rr_actors.testing.victim_managers import LESS, WATTS, cut_links
+from rr_actors.testing.victim_system import CREWS, HOUSE, MAKERS, ROOT_MAKERS, Plant
 from rr_actors.wire.handshake import PROTOCOL
 
 _FULL_BYTES = 16 * 1024
@@ -39,6 +40,8 @@ class Monkey:
         self._garbage: list[socket.socket] = []
         self._deeds: dict[Callable[[], str | None], int] = {
             self._kill_manager: 50,
+            self._kill_house: 30,
+            self._kill_planner: 40,
             self._kill_crew: 12,
             self._kill_starting: 6,
             self._kill_supervisor: 4,
@@ -49,6 +52,7 @@ class Monkey:
             self._fill_disk: 5,
             self._damage: 3,
             self._let_stray: 8,
+            self._change_watts: 8,
         }
 
     def pause(self, meanwhile: Callable[[], None]) -> None:
@@ -83,10 +87,21 @@ class Monkey:
     # -- signals ---------------------------------------------------------------------------------------------------
 
     def _kill_manager(self) -> str | None:
-        return self._kill("a manager", [p for name, p in self._plant.census().managers.items() if name not in CREWS])
+        return self._kill("a manager", self._pids(MAKERS))
+
+    def _kill_house(self) -> str | None:
+        """Kill one of those that plan, revoke, pause and resume."""
+        return self._kill("a manager of the house", self._pids(HOUSE))
+
+    def _kill_planner(self) -> str | None:
+        """Kill one of those that choose, keep, and run graphs."""
+        return self._kill("a manager of the mission", self._pids(PLANNERS))
 
     def _kill_crew(self) -> str | None:
-        return self._kill("a consumer", [p for name, p in self._plant.census().managers.items() if name in CREWS])
+        return self._kill("a consumer", self._pids(CREWS))
+
+    def _pids(self, names: tuple[str, ...]) -> list[int]:
+        return [pid for name, pid in self._plant.census().managers.items() if name in names]
 
     def _kill_starting(self) -> str | None:
         inner = self._inner()
@@ -117,22 +132,26 @@ class Monkey:
 
     def _let_stray(self) -> str | None:
         """Have a manager start a daemon, which must not outlive the manager."""
-        return "daemon started by a manager" if self._tell_a_maker("stray") else None
+        return "daemon started by a manager" if self._tell("stray", [*ROOT_MAKERS]) else None
 
-    def _tell_a_maker(self, what: str) -> bool:
-        name = self._plan.choice([*ROOT_MAKERS])
+    def _tell(self, what: str, names: Sequence[str]) -> bool:
+        name = self._plan.choice(names)
         try:
             self._plant.system.ref(f"root/{name}").tell(what)
         except Exception:
             return False  # it is being respawned
         return True
 
+    def _change_watts(self) -> str | None:
+        changed = self._plant.set_capacity(self._plan.choice([WATTS.capacity, LESS]))
+        return "capacity of a pool changed" if changed else None
+
     # -- connections -----------------------------------------------------------------------------------------------
 
     def _cut(self) -> str | None:
         if self._plan.random() < 0.5:
             return "links of this process cut" if cut_links() else None
-        return "links of a manager cut" if self._tell_a_maker("cut") else None
+        return "links of a manager cut" if self._tell("cut", [*ROOT_MAKERS, *PLANNERS]) else None
 
     def _babble(self) -> str | None:
         sockets = sorted((self._plant.state_dir / "run").glob("*/*.sock"))

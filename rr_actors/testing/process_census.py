@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rr_actors.runtime.processes.control_groups import ControlGroup, group_of
 from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.testing.victim_managers import LOG_TO, OWNER
 
@@ -95,6 +96,16 @@ class Mark:
         known = {*managers.values(), *servers}
         others = [pid for pid, parent in living.items() if pid not in known and parent in servers]
         return Census(managers, tuple(sorted(servers)), tuple(others))
+
+
+def stands(pid: int) -> bool:
+    """Return whether a process stands still: stopped by a signal, or frozen with its control group."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return False
+    group = group_of(pid)
+    return fields[0] == "T" or (group is not None and ControlGroup(group).is_frozen())
 
 
 def _owner_of(pid: int) -> int | None:

@@ -15,7 +15,7 @@ from rr_actors.base.errors import UsageError
 from rr_actors.testing.callback_log import Line, read_journal
 from rr_actors.testing.monkey import Monkey
 from rr_actors.testing.report import Report, Tally
-from rr_actors.testing.soak import Churn, Soak
+from rr_actors.testing.soak import ENOUGH_SAMPLES, Churn, Soak
 from rr_actors.testing.victim_managers import CREW, SUCCEEDED, UNEXPECTED, log_to
 from rr_actors.testing.victim_system import Plant
 from rr_actors.testing.watchdog import Standstill, Watch
@@ -38,7 +38,7 @@ class Options:
         seconds: end after this number of seconds, if that is sooner.
         seed: the seed of the faults; by default a new one.
         state_dir: must be empty or missing; it is kept. None: a temporary directory.
-        soak_s: for this number of seconds, measure growth instead of harming the system.
+        soak_s: for this number of seconds, and until there are samples enough, measure growth instead of harming.
         churn_s: in a soak, the mean seconds between two managers that are killed, restarted, or added and removed.
         pace_s: mean seconds between two deeds of the monkey.
         patience_s: seconds that one deed or one check may take; after that the run stands still.
@@ -157,17 +157,19 @@ def _soak(
     until = time.monotonic() + seconds
     pause_s = min(max(seconds / _SAMPLES, 0.2), _SAMPLE_S)
     sampled = shown = float("-inf")
-    while (now := time.monotonic()) < until:
+    samples = 0
+    while (now := time.monotonic()) < until or samples < ENOUGH_SAMPLES:
         watch.phase("a sample of the soak, or a manager that is replaced")
         if now - sampled >= pause_s:
             sampled = now
+            samples += 1
             soak.sample()
         if now - shown >= _SHOW_S:
             shown = now
             show(tally.line())
         if churn is not None:
             churn.step()
-        time.sleep(min(pause_s, _CHURN_LOOK_S, max(0.0, until - time.monotonic())))
+        time.sleep(min(pause_s, _CHURN_LOOK_S))
     report.growth, grown = soak.growth()
     tally.violation(*grown)
 

@@ -21,6 +21,9 @@ from rr_actors.testing.victim_managers import PATIENCE_S, Maker, Want
 from rr_actors.testing.victim_system import MANAGERS, ROOT_MAKERS, Plant
 
 _WARM_UP = 0.25  # the part of the samples that is left out
+_FEWEST_POINTS = 4  # that a line is laid through
+ENOUGH_SAMPLES = 8
+"""So many samples leave enough points for a line, when those of the warm-up are left out."""
 _LIMITS = {
     "USS (MiB)": 2.0,
     "descriptors": 3.0,
@@ -78,7 +81,7 @@ class Soak:
         grown: list[str] = []
         for (who, what), points in self._series.items():
             looked_at = points[int(len(points) * _WARM_UP) :]
-            if len(looked_at) < 4:
+            if len(looked_at) < _FEWEST_POINTS:
                 continue
             growth = slope(looked_at) * (looked_at[-1][0] - looked_at[0][0])
             line = f"{who}: {what} {looked_at[0][1]:.1f} to {looked_at[-1][1]:.1f}, by a line {growth:+.2f}"

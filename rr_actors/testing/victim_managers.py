@@ -1,7 +1,8 @@
-"""The managers of the system: makers serve things made of other things, and crews use them."""
+"""The managers of the system: makers serve things made of other things, crews use them, and a house has devices."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -11,13 +12,15 @@ import socket
 import subprocess
 import threading
 import time
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rr_actors.base.errors import RrError
+from rr_actors.managers import Pool, Reserve, RunProgram, Share, Supply
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.server import current
+from rr_actors.registrar.engine.server import Current, current
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.queries import Query
 from rr_actors.testing.callback_log import Journal
@@ -31,6 +34,11 @@ CREW, SUCCEEDED, UNEXPECTED = "crew-", "-", "unexpected"
 LOG_TO = "RR_ACTORS_CHAOS_LOG"
 OWNER = "RR_ACTORS_CHAOS_OWNER"
 """A daemon's variable: the pid of the manager that started it."""
+RESERVE = 30.0
+WATTS = Pool("watts", 100.0, reserve=(Reserve("house/generator", RESERVE),))
+"""The pool of the house's devices."""
+LESS = 60.0
+"""What its capacity is lowered to now and then."""
 _LINKS = re.compile(r"\d+-[0-9a-f]{8}\.sock$")
 
 
@@ -41,7 +49,35 @@ class Want:
     number: int
 
 
-class Maker(Manager):
+class Recorded(Manager):
+    """A manager that records the runs of its load and unload callbacks in the journal.
+
+    Args:
+        directory: the journal's directory.
+    """
+
+    def __init__(self, directory: str) -> None:
+        self.journal = Journal(directory)
+
+    @contextlib.contextmanager
+    def recorded(self, what: str) -> Generator[Current]:
+        """Record the beginning of a callback, and how it ends. `what`: load or unload."""
+        now, name = current(), self.registrar.name
+        self.journal.note(name, what, now.resource_id, now.attempt)
+        try:
+            yield now
+        except BaseException:
+            self.journal.note(name, "failed", now.resource_id, now.attempt)
+            raise
+        self.journal.note(name, f"{what}ed", now.resource_id, now.attempt)
+
+    def unmake(self) -> None:
+        """Unload a resource."""
+        with self.recorded("unload"):
+            time.sleep(UNLOAD_S)
+
+
+class Maker(Recorded):
     """Serves "thing" and "warm" (which lingers for 0.1 s), each made of one thing from each of `needs`.
 
     Args:
@@ -50,7 +86,7 @@ class Maker(Manager):
     """
 
     def __init__(self, directory: str, needs: tuple[str, ...] = ()) -> None:
-        self.journal = Journal(directory)
+        super().__init__(directory)
         self.needs = needs
 
     @server("thing")
@@ -59,7 +95,7 @@ class Maker(Manager):
 
     @load_thing.unload
     def unload_thing(self, request: Want, response: str) -> None:
-        self._unmake()
+        self.unmake()
 
     @server("warm", linger_s=0.1)
     def load_warm(self, request: Want) -> str:
@@ -67,7 +103,7 @@ class Maker(Manager):
 
     @load_warm.unload
     def unload_warm(self, request: Want, response: str) -> None:
-        self._unmake()
+        self.unmake()
 
     def on_receive(self, message: Any) -> Any:
         if message == "cut":
@@ -78,26 +114,30 @@ class Maker(Manager):
         return message
 
     def _make(self, request: Want) -> str:
-        now, name = current(), self.registrar.name
-        self.journal.note(name, "load", now.resource_id, now.attempt)
-        try:
+        with self.recorded("load") as now:
             for need in self.needs:
                 self.registrar.load(need, Want(request.number // 2), timeout_s=PATIENCE_S)
             luck = hashlib.sha256(f"{now.resource_id} {now.attempt}".encode()).digest()
             time.sleep(luck[0] / 255 * 0.01)
             if request.number % 10 == 0 and luck[1] < 80:
                 raise ValueError("out of luck")
-        except BaseException:
-            self.journal.note(name, "failed", now.resource_id, now.attempt)
-            raise
-        self.journal.note(name, "loaded", now.resource_id, now.attempt)
-        return f"{name} {request.number}"
+        return f"{self.registrar.name} {request.number}"
 
-    def _unmake(self) -> None:
-        now, name = current(), self.registrar.name
-        self.journal.note(name, "unload", now.resource_id, now.attempt)
-        time.sleep(UNLOAD_S)
-        self.journal.note(name, "unloaded", now.resource_id, now.attempt)
+
+class House(Manager):
+    """A device needs watts, and those with a program run that as well. The generator is the reserve of the watts."""
+
+    @server("device", recovery="keep")
+    def switch_on(self, name: str, watts: float, program: bool) -> float:
+        self.registrar.load("budgets/share", Share(WATTS.name, watts, wait_s=0.2), timeout_s=PATIENCE_S)
+        if program:
+            run = RunProgram("sleep", ("1000",), instance=name)
+            self.registrar.load("programs/program", run, timeout_s=PATIENCE_S)
+        return watts
+
+    @server("generator", recovery="keep")
+    def start_generator(self) -> None:
+        self.registrar.load("budgets/supply", Supply(WATTS.name, RESERVE), timeout_s=PATIENCE_S)
 
 
 class Crew(Manager):

@@ -1,9 +1,12 @@
-"""Plant: the system that is harmed. Dependencies are three deep; makers and crews run in processes of their own.
+"""Plant: the system that is harmed. Dependencies are three deep; managers run in processes of their own.
 
 root ── east, west                     serve things made of nothing
  │      mill, forge                    need east; east and west
  │      harbour, market                need mill and forge; forge
  │      crew-1                         uses harbour, mill
+ │      budgets, programs, house       devices of the house need watts, and programs, which pause
+ │      sensors-1, sensors-2           are chosen, kept, and loaded by actions, by the three
+ │      choices, keeper, actions
  └─ inner (a process of its own)
         north                          serves things made of nothing; market needs it
         crew-2                         uses market, forge
@@ -20,14 +23,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rr_actors.base.errors import RrError
+from rr_actors.managers import Budgets, Programs
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
 from rr_actors.testing.callback_log import check_journal, read_journal
-from rr_actors.testing.invariants import check_at_rest, check_empty, check_told, settled
-from rr_actors.testing.load_threads import Consumer
-from rr_actors.testing.process_census import Census, Mark
+from rr_actors.testing.invariants import check_at_rest, check_empty, check_house, check_told, settled, used_by
+from rr_actors.testing.load_threads import Consumer, Resident
+from rr_actors.testing.mission.mission_managers import PLANNERS, SENSORS
+from rr_actors.testing.mission.mission_part import APP_NAMES, Mission
+from rr_actors.testing.mission.mission_threads import Operator
+from rr_actors.testing.process_census import Census, Mark, stands
 from rr_actors.testing.report import Tally
-from rr_actors.testing.victim_managers import Crew, Maker
+from rr_actors.testing.victim_managers import LESS, RESERVE, WATTS, Crew, House, Maker
 from rr_actors.testing.watchdog import Watch
 from rr_actors.tools.inspection import Contents, check_state, read_state
 
@@ -40,10 +47,17 @@ ROOT_MAKERS = {
     "market": ("forge/warm", "north/thing"),
 }
 CREWS = ("crew-1", "crew-2")
-MANAGERS = (*ROOT_MAKERS, "north", *CREWS)
+MAKERS = (*ROOT_MAKERS, "north", *SENSORS)
+HOUSE = ("budgets", "programs", "house")
+MANAGERS = (*MAKERS, *CREWS, *HOUSE, *PLANNERS)
 _USED = ("harbour/thing", "market/thing", "harbour/warm", "mill/thing", "forge/thing", "forge/warm", "east/warm")
 _APPS = 3
 _THREADS = 6
+_RESIDENTS = 2
+_APP_NAMES = (*(f"app-{n}" for n in range(1, _APPS + 1)), *(f"home-{n}" for n in range(1, _RESIDENTS + 1)), *APP_NAMES)
+_GRACE_S = 60.0  # longer than any restart: what is revoked is unloaded, top first, and never by force
+_WATCH_S = 0.05
+_PROGRAMS = {"idle": "pause", "linger_s": 0.1, "paused_s": 2.0}
 _SETTLE_S = 30.0
 _ABANDON_S = 20.0
 
@@ -62,9 +76,15 @@ class Plant:
         self.journal_dir.mkdir(parents=True, exist_ok=True)
         self.tally = tally
         self.mark = Mark(self.journal_dir)
+        self.mission = Mission(self.journal_dir, tally)
         self.system = System(self._tree(), name="chaos", state_dir=self.state_dir)
         self._seed = seed
         self.consumers: list[Consumer] = []
+        self.residents: list[Resident] = []
+        self._capacity = self._limit = WATTS.capacity  # that was set, and that holds
+        self._lock = threading.Lock()
+        self._at_rest = threading.Event()
+        self._watcher = threading.Thread(target=self._watch_house, name="chaos: the house", daemon=True)
 
     def _tree(self) -> Supervisor:
         place = str(self.journal_dir)
@@ -82,24 +102,43 @@ class Plant:
             placement="process",
             max_restarts=1_000_000,
         )
-        return Supervisor([inner, *makers, crew_1], id="root", max_restarts=1_000_000)
+        house = [
+            ChildSpec(Budgets, id="budgets", args=([WATTS], _GRACE_S)),
+            ChildSpec(Programs, id="programs", kwargs=_PROGRAMS),
+            ChildSpec(House, id="house"),
+        ]
+        children = [inner, *makers, crew_1, *house, *self.mission.children()]
+        return Supervisor(children, id="root", max_restarts=1_000_000)
 
     def __enter__(self) -> Plant:
         self.system.start()
         apps = [self.system.open_registrar(f"app-{n}") for n in range(1, _APPS + 1)]
         for n in range(_THREADS):
             self.consumers.append(Consumer(self.system, apps[n % _APPS], _USED, self._seed * 1000 + n, self.tally))
-        for consumer in self.consumers:
-            consumer.start()
+        for n in range(1, _RESIDENTS + 1):
+            app = self.system.open_registrar(f"home-{n}")
+            self.residents.append(Resident(app, self._seed * 1000 - n, self.tally))
+        self.mission.open(self.system, self._seed)
+        for thread in self._threads():
+            thread.start()
+        self._watcher.start()
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for consumer in self.consumers:
-            consumer.stop()
+        self._stop_threads()
         self.system.stop()
         self.mark.remove()
         left = settled(lambda: [f"process {pid} is left" for pid in self.mark.processes()], 5.0)
         self.tally.violation(*left)
+
+    def _stop_threads(self) -> None:
+        self._at_rest.set()
+        self.mission.stop()
+        for thread in self._threads():
+            thread.stop()
+
+    def _threads(self) -> list[Consumer | Resident | Operator]:
+        return [*self.consumers, *self.residents, *self.mission.operators]
 
     def census(self) -> Census:
         """Return the living processes by role."""
@@ -122,8 +161,7 @@ class Plant:
 
     def abandon(self) -> None:
         """Kill the processes of a system that stands still, and try to stop it in this process, for 20 s at most."""
-        for consumer in self.consumers:
-            consumer.stop()
+        self._stop_threads()
         self.mark.remove()
         stopping = threading.Thread(target=self.system.stop, name="chaos: stopping", daemon=True)
         stopping.start()
@@ -150,6 +188,10 @@ class Plant:
         self._rest(watch)
         if self.tally.violations:
             return False
+        begin("checking the house")
+        self._settle_house()
+        begin("checking the mission")
+        self.tally.violation(*self.mission.settle(self._look, _SETTLE_S))
         begin("checking what is held")
         told = self._told()
         look = self._look
@@ -160,13 +202,14 @@ class Plant:
         )
         for consumer in self.consumers:
             consumer.check_heard()
-        living = {name: set(contents.resources) for name, contents in look().items()}
+        living = {name: set(contents.resources) for name, contents in look().items() if name not in (*HOUSE, *PLANNERS)}
         self.tally.violation(*check_journal(read_journal(self.journal_dir), living))
         if self.tally.violations:
             return False
         begin("releasing everything")
-        for consumer in self.consumers:
-            consumer.release()
+        for thread in self._threads():
+            thread.release()
+        self.tally.violation(*self.mission.give_up(_SETTLE_S))
         for crew in CREWS:
             watch.phase(f"releasing what {crew} holds")
             self._tell(crew, "release")
@@ -176,7 +219,7 @@ class Plant:
         return True
 
     def _look(self) -> dict[str, Contents]:
-        for name in [*MANAGERS, *(f"app-{n}" for n in range(1, _APPS + 1))]:
+        for name in [*MANAGERS, *_APP_NAMES]:
             try:
                 self.system.registrar(name).save_catalog()  # commits what might be written a moment later
             except RrError:
@@ -185,13 +228,52 @@ class Plant:
 
     def _rest(self, watch: Watch) -> None:
         deadline = time.monotonic() + 60.0
-        for consumer in self.consumers:
-            consumer.stop()
-        for consumer in self.consumers:
-            consumer.join(deadline)
+        self._stop_threads()
+        for thread in self._threads():
+            thread.join(deadline)
+        self._watcher.join(max(0.0, deadline - time.monotonic()))
+        self.mission.join(max(0.0, deadline - time.monotonic()))
         for crew in CREWS:
             watch.phase(f"waiting for {crew}")
             self._tell(crew, "rest")
+
+    # -- the house -------------------------------------------------------------------------------------------------
+
+    def set_capacity(self, capacity: float) -> bool:
+        """Set the watts; return False if Budgets cannot be asked now, and may have heard of it."""
+        with self._lock:
+            self._capacity = self._limit = WATTS.capacity
+        try:
+            self.system.ref("root/budgets").proxy().set_capacity(WATTS.name, capacity).get(timeout=10)
+        except Exception:  # it is being respawned
+            return False
+        self._capacity = capacity
+        return True
+
+    def _watch_house(self) -> None:
+        """Check that the devices use no more than there is, outside the grace after a lowered capacity."""
+        while not self._at_rest.wait(_WATCH_S):
+            capacity = self._capacity
+            try:
+                used = used_by(self.system.registrar("house").resources())
+            except RrError:
+                continue  # it is being respawned
+            with self._lock:
+                if used <= capacity + RESERVE and capacity == self._capacity:
+                    self._limit = capacity
+            if used > self._limit + RESERVE:
+                self.tally.violation(f"house: {used:g} W are used of {self._limit:g}, and {RESERVE:g} in reserve")
+
+    def _settle_house(self) -> None:
+        def lower() -> list[str]:
+            return [] if self.set_capacity(LESS) else ["house: the watts cannot be set"]
+
+        def look() -> list[str]:
+            budgets, programs, devices = (self.system.registrar(name).resources() for name in HOUSE)
+            found = check_house(devices, budgets, programs, stands)
+            return [*found, *([f"{used} W are used"] if (used := used_by(devices)) > LESS + RESERVE else [])]
+
+        self.tally.violation(*settled(lower, _SETTLE_S), *settled(look, _SETTLE_S))
 
     def _tell(self, crew: str, what: str) -> None:
         """Send a crew a message, and repeat that while the crew is being restarted."""

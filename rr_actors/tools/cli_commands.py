@@ -8,7 +8,8 @@ import keyword
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -21,11 +22,13 @@ from rich.tree import Tree
 from typer.core import TyperGroup
 
 from rr_actors.base import __version__
-from rr_actors.base.errors import UsageError, shown
+from rr_actors.base.checks import needing
+from rr_actors.base.errors import NotRunning, UsageError, shown
 from rr_actors.registrar.model.rows import Held, priority_of
 from rr_actors.registrar.pages import priority_text
 from rr_actors.system.console.console_client import find_console
 from rr_actors.tools.doctor import examine
+from rr_actors.tools.graphs import png
 from rr_actors.tools.inspection import Contents, check_state, read_state, readable
 from rr_actors.tools.log_lines import printable
 
@@ -78,6 +81,22 @@ StateOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs instead of people.")]
+WatchOption = Annotated[bool, typer.Option("--watch", "-w", help="Show it again every two seconds, until Ctrl-C.")]
+_WATCH_S = 2.0
+
+
+def shown_again(watch: bool, show: Callable[[], None]) -> None:
+    """Show a list; with `watch` again and again, until the system has ended, on a terminal in the same place."""
+    show()
+    while watch:
+        time.sleep(_WATCH_S)
+        try:
+            if sys.stdout.isatty():
+                typer.echo("\x1b[2J\x1b[H", nl=False)
+            show()
+        except NotRunning:
+            say("the system has ended", err=True)
+            return
 
 
 @app.command(rich_help_panel=PROJECT)
@@ -148,9 +167,14 @@ def inspect(state_dir: StateDir = None, state_option: StateOption = None, as_jso
 
 
 @app.command(rich_help_panel=LOOK_LATER)
-def tree(state_dir: StateDir = None, state_option: StateOption = None) -> None:
+def tree(state_dir: StateDir = None, state_option: StateOption = None, watch: WatchOption = False) -> None:
     """Show each registrar's own queries, and below them the resources that they depend on."""
-    state = read_state(_found(state_dir, state_option))
+    found = _found(state_dir, state_option)
+    shown_again(watch, lambda: _show_tree(found))
+
+
+def _show_tree(found: Path) -> None:
+    state = read_state(found)
     console = _console()
     holders = {name: [held for held in contents.held.values() if not held.parent] for name, contents in state.items()}
     for name, roots in holders.items():
@@ -226,6 +250,19 @@ def new(
         target.parent.mkdir(exist_ok=True)
         target.write_text(text)
     typer.echo(f"made {name}: see {name}/README.md, or: cd {name}; python -m pytest; python -m {module}")
+
+
+@app.command(rich_help_panel=PROJECT, epilog="Example: rr-actors import-temoto components.yaml pipes.yaml > pipes.toml")
+def import_temoto(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE.yaml...", help="A components.yaml and a pipes.yaml, or several.")
+    ],
+) -> None:
+    """Print the files of a temoto_component_manager as one TOML file for the manager Pipes."""
+    with needing("import-temoto", "temoto"):
+        from rr_actors.managers.pipes import temoto_files
+
+    say_lines(temoto_files.import_temoto(files))
 
 
 @app.command(
@@ -354,6 +391,14 @@ def say_lines(text: str, before: str = "") -> None:
     """Print each line of a text, with the text `before` in front of it."""
     for line in text.splitlines():
         say(before + line)
+
+
+def say_picture(drawn: str, format: str) -> None:
+    """Write a picture on the standard output: an SVG document, as PNG if that is wanted, or text."""
+    if format == "png":
+        typer.echo(png(drawn), nl=False)
+    else:
+        say_lines(drawn)
 
 
 def say_json(value: object) -> None:

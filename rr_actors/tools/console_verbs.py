@@ -19,8 +19,7 @@ from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotRunning, RrError, UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.base.names import short_ids
 from rr_actors.hosting.forwarded_logs import LogLine
-from rr_actors.registrar.model.rows import HIGHEST, LOWEST
-from rr_actors.registrar.pages import ResourceRow
+from rr_actors.registrar.pages import LoadRow, ResourceRow
 from rr_actors.supervision.event_history import Record, left_records, records_of
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
@@ -35,13 +34,16 @@ from rr_actors.tools.cli_commands import (
     LOOK,
     JsonOption,
     StateOption,
+    WatchOption,
     app,
     say,
     say_json,
     say_lines,
+    say_picture,
     say_table,
+    shown_again,
 )
-from rr_actors.tools.explanations import explain
+from rr_actors.tools.explanations import LOADS_HEADS, NO_LOAD_WAITS, WAITING_HEADS, explain, loads_cells, waiting_cells
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
@@ -55,7 +57,6 @@ _UNLOAD_S = 60.0  # for the unload callbacks, after a grace
 _LATEST = 10  # records of a child that its status shows
 _SHOWN = 200  # rows of a list, unless more are asked for
 _COMPLETED = 50
-_WATCH_S = 2.0
 _TICK_S = 0.1  # while nothing happens, lines that are settled are printed so often
 
 
@@ -123,23 +124,6 @@ Output = Annotated[
 ]
 
 
-Watch = Annotated[bool, typer.Option("--watch", "-w", help="Show it again every two seconds, until Ctrl-C.")]
-
-
-def _shown_again(watch: bool, show: Callable[[], None]) -> None:
-    """Show a list; with `watch` again and again, until the system has ended, on a terminal in the same place."""
-    show()
-    while watch:
-        time.sleep(_WATCH_S)
-        try:
-            if sys.stdout.isatty():
-                typer.echo("\x1b[2J\x1b[H", nl=False)
-            show()
-        except NotRunning:
-            say("the system has ended", err=True)
-            return
-
-
 def _client(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleClient:
     return ConsoleClient(find_console(state), timeout_s=timeout_s + _GRACE_S)
 
@@ -164,12 +148,12 @@ def ps(
     sort_by: Annotated[
         Literal["up", "restarts", "cpu", "memory"] | None, typer.Option("--sort-by", help="The most first.")
     ] = None,
-    watch: Watch = False,
+    watch: WatchOption = False,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its start) and memory."""
-    _shown_again(watch, lambda: _show_children(state, sort_by, output, as_json))
+    shown_again(watch, lambda: _show_children(state, sort_by, output, as_json))
 
 
 def _show_children(state: Path | None, sort_by: str | None, output: str | None, as_json: bool) -> None:
@@ -229,12 +213,12 @@ def resources(
     ] = None,
     wide: Annotated[bool, typer.Option("--wide", help="Shorten no request to fit the terminal.")] = False,
     output: Output = None,
-    watch: Watch = False,
+    watch: WatchOption = False,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the resources of the running system, and who holds each."""
-    _shown_again(
+    shown_again(
         watch,
         lambda: _show_resources(
             state,
@@ -278,12 +262,13 @@ def _show_resources(
     table: list[tuple[str, ...]] = []
     ids = short_ids(row.id for row in page.rows)
     for row in page.rows:
-        shown_state = row.state if row.phase == "loaded" else f"{row.phase} {row.message}".rstrip()
+        shown_state = row.condition if row.phase == "loaded" else f"{row.condition} {row.message}".rstrip()
         name = f"{row.server} {row.request}"
         table.append((name, shown_state, row.needed, str(row.holder_count), row.held_by, ids[row.id]))
     if table:
         heads = ("resource", "state", "priority", "holders", "held by", "id")
-        say_table(heads, table, gives_way=("resource",), right=("priority", "holders"), wide=output == "wide")
+        right = ("priority", "holders")
+        say_table(heads, table, gives_way=("resource", "state"), right=right, wide=output == "wide")
     if page.total > len(page.rows):
         say(f"{page.total - len(page.rows)} more: choose with MATCH, or raise --limit", err=True)
     for note in page.notes:
@@ -295,7 +280,7 @@ def _chosen(page: c.Resources, states: set[str], holder: str, sort_by: str | Non
     rows = [
         row
         for row in page.rows
-        if (not states or row.condition.lower() in states)
+        if (not states or states & {row.condition.lower(), row.state.lower()})
         and (not holder or any(one.origin == holder for one in row.holders))
     ]
     keys: dict[str, Callable[[ResourceRow], Any]] = {
@@ -319,12 +304,12 @@ def usage(
     ] = "",
     limit: Limit = _SHOWN,
     output: Output = None,
-    watch: Watch = False,
+    watch: WatchOption = False,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show what each resource uses now, CPU and memory for instance, of servers that can say it."""
-    _shown_again(watch, lambda: _show_usages(state, match, registrar, sort_by, limit, output, as_json))
+    shown_again(watch, lambda: _show_usages(state, match, registrar, sort_by, limit, output, as_json))
 
 
 def _show_usages(
@@ -363,6 +348,66 @@ def _show_usages(
             say(f"not known: {row.name} ({ids[row.id]}): {row.failure}", err=True)
     for note in page.notes:
         say(f"not asked: {note}", err=True)
+
+
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors loads cameras --sort-by p95 --watch")
+def loads(
+    match: Annotated[str, typer.Argument(help="Only those with this text in their id, server or request.")] = "",
+    registrar: Annotated[
+        str,
+        typer.Option(
+            help="Only loads that this one waits for, and its servers.", autocompletion=_completing(_registrars)
+        ),
+    ] = "",
+    sort_by: Annotated[
+        Literal["loads", "shared", "waited", "failed", "mean", "p95", "longest"] | None,
+        typer.Option("--sort-by", help="The server with the most of it first."),
+    ] = None,
+    limit: Limit = _SHOWN,
+    watch: WatchOption = False,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show which loads wait now, and how often and how long loads of each server had to wait.
+
+    A load is shared if it joins a resource that is loaded, or is being loaded. It has waited if it was not answered at
+    once. The times are those of load callbacks: the mean and the longest of all, p95 of the newest 500.
+    """
+    shown_again(watch, lambda: _show_loads(state, match, registrar, sort_by, limit, as_json))
+
+
+def _show_loads(state: Path | None, match: str, registrar: str, sort_by: str | None, limit: int, as_json: bool) -> None:
+    with _client(state) as client:
+        found = client.loads(registrar, match)
+        servers = found.servers
+        if sort_by is not None:
+            servers = sorted(servers, key=_LOAD_ORDERS[sort_by], reverse=True)
+        if as_json:
+            say_json({"waiting": found.rows, "servers": servers})
+            return
+        waiting = [waiting_cells(client.ask, row) for row in found.rows[:limit]]
+    if waiting:
+        say_table(WAITING_HEADS, waiting, gives_way=("to load", "for what", "because"), right=("waits for",))
+    else:
+        say(NO_LOAD_WAITS)
+    if found.total > len(waiting):
+        say(f"{found.total - len(waiting)} more wait: choose with MATCH, or raise --limit", err=True)
+    if servers:
+        say("")
+        say_table(LOADS_HEADS, [loads_cells(row) for row in servers], gives_way=("server",), right=LOADS_HEADS[1:])
+    for note in found.notes:
+        say(f"not asked: {note}", err=True)
+
+
+_LOAD_ORDERS: dict[str, Callable[[LoadRow], float]] = {
+    "loads": lambda row: row.loads,
+    "shared": lambda row: row.shared,
+    "waited": lambda row: row.waited,
+    "failed": lambda row: row.failed,
+    "mean": lambda row: row.mean_s,
+    "p95": lambda row: row.p95_s,
+    "longest": lambda row: row.longest_s,
+}
 
 
 def _amount(name: str, number: float | None) -> str:
@@ -599,26 +644,49 @@ def why(
 
 @app.command(rich_help_panel=LOOK, epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
 def graph(
+    what: Annotated[
+        Literal["check", "show", "run", "change"] | None,
+        typer.Argument(help="Without it the system is drawn. With it, FILE.json is a graph of actions."),
+    ] = None,
+    file: Annotated[Path | None, typer.Argument(metavar="[FILE.json]")] = None,
+    id: Annotated[str, typer.Argument(metavar="[ID]", help="Of `change`: the resource of a graph that runs.")] = "",
     format: Annotated[
         Literal["mermaid", "dot", "svg", "png"],
         typer.Option("--format", help="dot is for Graphviz; png needs the program rsvg-convert."),
     ] = "mermaid",
     of: Annotated[Literal["tree", "dependencies", "both"], typer.Option("--of", help="What to draw.")] = "both",
     limit: Limit = _SHOWN,
+    inputs: Annotated[str, typer.Option(metavar="JSON", help="Of `run`: what the first actions are given.")] = "{}",
+    start: Annotated[str, typer.Option("--from", metavar="ACTION", help="Of `change`: what runs then.")] = "",
+    timeout_s: Timeout = 3600.0,
     state: StateOption = None,
 ) -> None:
-    """Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz."""
+    """Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz.
+
+    With `check`, `show` or `run` and FILE.json: check a graph of actions, draw it, or have the child `actions` run it.
+    With `change`, FILE.json and ID: have a graph that runs go on as the one in the file.
+    """
     if format == "png" and sys.stdout.isatty():
         raise UsageError("--format png: expected a file, got a terminal: rr-actors graph --format png > graph.png")
+    if what is not None:
+        if file is None:
+            raise UsageError(f"graph {what}: expected a file with a graph of actions, got none")
+        from rr_actors.tools.terminal import action_graphs  # the managers, which the other verbs do without
+
+        if what == "check":
+            action_graphs.check(file)
+        elif what == "show":
+            action_graphs.show(file, format)
+        elif what == "change":
+            action_graphs.change(file, id, state, start)
+        else:
+            action_graphs.run(file, state, inputs, timeout_s)
+        return
     with _client(state) as client:
         rows = client.children().rows
         page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
     draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
-    drawn = draw(rows, page.rows, of)
-    if format == "png":
-        typer.echo(graphs.png(drawn), nl=False)
-    else:
-        say_lines(drawn)
+    say_picture(draw(rows, page.rows, of), format)
     if page.total > len(page.rows):
         say(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
 
@@ -683,7 +751,8 @@ def load(
 ) -> None:
     """Load a resource and show its response; without --hold or --as it is released again at once."""
     keep = hold or bool(holder)
-    command = commands.Load(server, request, holder, keep, timeout_s, dry_run, _priority("--priority", priority))
+    urgency = commands.priority_from("--priority", priority)
+    command = commands.Load(server, request, holder, keep, timeout_s, dry_run, urgency)
     done = _carry_out(state, command, as_json, timeout_s)
     if "response" in done.facts and not as_json:
         say_json(done.facts["response"])
@@ -704,16 +773,7 @@ def priority(
     dry_run: DryRun = False,
 ) -> None:
     """Give a query of any holder a priority; what its resource depends on follows."""
-    _carry_out(state, commands.GivePriority(id, _priority("PRIORITY", value), dry_run), as_json)
-
-
-def _priority(what: str, text: str) -> int | None:
-    if text == "standby":
-        return None
-    with contextlib.suppress(ValueError):
-        if LOWEST <= (number := int(text)) <= HIGHEST:
-            return number
-    raise UsageError(f"{what}: expected a whole number from {LOWEST} to {HIGHEST}, or standby, got {shown(text)}")
+    _carry_out(state, commands.GivePriority(id, commands.priority_from("PRIORITY", value), dry_run), as_json)
 
 
 @app.command(rich_help_panel=CHANGE_RESOURCES, epilog="Example: rr-actors unload 01a2085d3f7c")

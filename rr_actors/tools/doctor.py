@@ -21,6 +21,7 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import interpreter
+from rr_actors.runtime.processes.control_groups import CONTROLLERS, ControlGroups
 from rr_actors.supervision.core.specs import ChildSpec
 from rr_actors.system.system import System
 
@@ -53,6 +54,7 @@ def examine(state_dir: Path) -> list[Finding]:
         _descriptors,
         _processes,
         _control_groups,
+        _program_groups,
         _shared_memory,
         _debugging,
         _clock,
@@ -117,6 +119,19 @@ def _control_groups() -> Iterator[Finding]:
             limits=least < little,
             todo="raise it: docker run --memory, --pids-limit; MemoryMax=, TasksMax= in a systemd unit",
         )
+
+
+def _program_groups() -> Iterator[Finding]:
+    """Say what Programs can do with control groups, by those of this process."""
+    groups = ControlGroups.of_this_process()
+    limits, freezes = groups.limits(), groups.place("rr-doctor") is not None
+    yield _judge(
+        "control group: programs",
+        f"paused by {'freezing' if freezes else 'SIGSTOP'}; shares enforced: {', '.join(limits) or 'none'}",
+        limits=not freezes or len(limits) < len(CONTROLLERS),
+        todo="to freeze and limit programs, give the system a writable group of version 2 with cpu and memory: "
+        "Delegate=yes and DelegateSubgroup=system in its systemd unit",
+    )
 
 
 def _groups() -> Iterator[Path]:

@@ -1,4 +1,4 @@
-"""Explanations: sentences that say who holds a resource, for whom, since when, and why it waits."""
+"""Explanations: texts that say who holds a resource, for whom, since when, why it waits, and how long loads wait."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rr_actors.base.errors import UnknownQuery, UsageError, few, shown
 from rr_actors.base.names import short_id, short_ids
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
-from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
+from rr_actors.registrar.pages import Holder, LoadRow, QueryRow, ResourceRow
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Found
 from rr_actors.system.console.console_questions import Find
@@ -67,6 +67,37 @@ def name_of_resource(ask: Callable[[Find], Found], id: str, registrar: str) -> s
     return name
 
 
+WAITING_HEADS = ("who waits", "for what", "to load", "waits for", "because")
+"""The heads of waiting_cells()."""
+LOADS_HEADS = ("server", "loads", "shared", "waited", "failed", "waiting now", "mean", "p95", "longest")
+"""The heads of loads_cells()."""
+NO_LOAD_WAITS = "No load waits now."
+
+
+def waiting_cells(ask: Callable[[Find], Found], row: QueryRow) -> tuple[str, ...]:
+    """Return who waits for a load, for what, for which resource of its own, how long already, and what is reported."""
+    whose = name_of_resource(ask, row.parent, row.origin) if row.parent else "itself"
+    at = since(row.id)
+    waited = "" if at is None else seconds_text(max(0.0, time.time() - at))
+    return row.origin, row.name, whose, waited, row.said
+
+
+def loads_cells(row: LoadRow) -> tuple[str, ...]:
+    """Return how often and how long loads of a server waited, as texts."""
+    counts = (row.loads, row.shared, row.waited, row.failed, row.loading)
+    times = (row.mean_s, row.p95_s, row.longest_s) if row.longest_s else ()
+    return row.server, *(f"{count:,}" for count in counts), *(map(seconds_text, times) if times else ("",) * 3)
+
+
+def seconds_text(seconds: float) -> str:
+    """Return a duration for people: "0.4 ms", "120 ms", "3.2 s", "5 min"."""
+    if seconds < 0.001:
+        return f"{seconds * 1000:.1f} ms"
+    if seconds < 1:
+        return f"{seconds * 1000:.0f} ms"
+    return f"{seconds:.1f} s" if seconds < 60 else ago(seconds)
+
+
 def _since(id: str) -> str:
     at = since(id)
     if at is None:
@@ -106,7 +137,7 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
         yield f"{resource.holder_count - len(resource.holders)} others hold it, too."
     for stream in client.streams(resource.server.partition("/")[0], resource.id).rows:
         by = f"is read by {readers_text(stream)}" if stream.readers else "has no reader"
-        yield f"Its stream {stream.name!r} {by}."
+        yield f"Its stream {stream.info.name!r} {by}."
     for part in resource.parts:
         yield from _of_part(client, part, "", {resource.id})
 
@@ -116,6 +147,23 @@ def readers_text(stream: StreamRow) -> str:
     return ", ".join(
         f"{one.registrar} (process {one.pid}{f', missed {one.missed}' if one.missed else ''})" for one in stream.readers
     )
+
+
+def bytes_text(row: StreamRow) -> str:
+    """Return how many bytes a stream has in a second: "173.8 MiB/s"; "" if nobody reads it."""
+    return f"{row.info.bytes_per_s / 2**20:.1f} MiB/s" if row.readers else ""
+
+
+def rate_text(row: StreamRow) -> str:
+    """Return how many frames a stream has in a second: "29.3/s"."""
+    return f"{row.info.rate_hz:.1f}/s"
+
+
+def age_text(row: StreamRow) -> str:
+    """Return how old a stream's newest frame is: "16 ms", or "no frame"."""
+    if (age_s := row.info.age_s) is None:
+        return "no frame"
+    return f"{age_s * 1000:.0f} ms" if age_s < 1 else ago(age_s)
 
 
 def _named(resource: ResourceRow) -> str:

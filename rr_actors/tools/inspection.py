@@ -24,9 +24,9 @@ from rr_actors.registrar.model.rows import (
     Notice,
     Peer,
     Phase,
-    Query,
     Resource,
     Row,
+    ServedQuery,
     State,
     StoredServer,
     content_of,
@@ -49,13 +49,13 @@ class Contents:
         self.damage = damage
         tables = content_of(rows)
         self.resources: dict[str, Resource] = tables["resources"]
-        self.queries: dict[str, Query] = tables["queries"]
+        self.queries: dict[str, ServedQuery] = tables["queries"]
         self.held: dict[str, Held] = tables["held"]
         self.notices: dict[str, Notice] = tables["notices"]
         self.peers: dict[str, Peer] = tables["peers"]
         self.stored_servers: dict[str, StoredServer] = tables["stored_servers"]
 
-    def holders(self, resource_id: str) -> list[Query]:
+    def holders(self, resource_id: str) -> list[ServedQuery]:
         """Return the queries on a resource, in the order of their ids, and so of their creation."""
         return self._holders.get(resource_id, [])
 
@@ -69,7 +69,7 @@ class Contents:
         return {notice.query_id for notice in self.notices.values() if notice.released}
 
     @cached_property
-    def _holders(self) -> dict[str, list[Query]]:
+    def _holders(self) -> dict[str, list[ServedQuery]]:
         rows = sorted(self.queries.values(), key=lambda query: query.id)
         return _grouped((query.resource_id, query) for query in rows)
 

@@ -66,6 +66,26 @@ class _Watched:
         self.peaks.append((bucket, max(peak, self.percent)))
 
 
+class RateWatch:
+    """How fast counts grow, from one look to the next. For one thread at a time."""
+
+    def __init__(self) -> None:
+        self._seen: dict[str, tuple[float, int, float | None]] = {}  # by name: when, the count, the rate until then
+
+    def look(self, name: str, count: int) -> float | None:
+        """Return by how much a count grew in a second since the last look; None at the first look at it."""
+        now = time.monotonic()
+        at, before, rate = self._seen.pop(name, (now, count, None))
+        if count < before:  # it began anew
+            at, before, rate = now, count, None
+        if now - at > _LEAST_S:
+            at, before, rate = now, count, (count - before) / (now - at)
+        self._seen[name] = at, before, rate
+        while len(self._seen) > _KEPT:
+            del self._seen[next(iter(self._seen))]
+        return rate
+
+
 class UsageWatch:
     """The usage of processes between two looks, and its course over the last five minutes. For one thread at a time."""
 

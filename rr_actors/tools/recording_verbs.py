@@ -18,10 +18,10 @@ from rr_actors.system.recording.recordings import Recording, RecordingFile, add,
 from rr_actors.system.recording.timelines import read_timeline
 from rr_actors.tools.cli_commands import RECORD, JsonOption, StateOption, json_text, say, say_lines
 from rr_actors.tools.console_verbs import app
-from rr_actors.tools.terminal import stream_verbs
+from rr_actors.tools.terminal import planner_verbs, stream_verbs
 from rr_actors.tools.web.timeline_file import html
 
-__all__ = ["app", "stream_verbs"]  # in the order of the help
+__all__ = ["app", "planner_verbs", "stream_verbs"]  # in the order of the help
 
 _LISTEN_S = 10.0
 

@@ -6,6 +6,7 @@ goodbye of a side that closes on purpose: an end of the stream without it means 
 
 from __future__ import annotations
 
+import functools
 import struct
 from typing import Any, Generic, TypeVar
 
@@ -28,6 +29,15 @@ GOODBYE = _pack_length(0)
 # The errors of the encoder: for a type, an int over 64 bits, half a character, too deep a nesting. An exception that a
 # signal handler raises meanwhile is none of these.
 _NOT_ENCODED = (TypeError, OverflowError, UnicodeEncodeError, RecursionError)
+
+
+@functools.cache
+def decoder_of(messages: Any) -> msgspec.msgpack.Decoder[Any]:
+    """Return the decoder of these message types, a class or a union, which all connections share.
+
+    Some take milliseconds to be made. So a fork server makes those that its children need (child_main.py).
+    """
+    return msgspec.msgpack.Decoder(messages)
 
 
 class FrameReader(Generic[T]):

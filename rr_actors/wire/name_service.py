@@ -52,6 +52,7 @@ _log = Log(__name__)
 
 _REGISTRAR = "r."  # the prefix of a registrar's entry
 _CLASSES = "c."  # the prefix of an entry with the classes of a manager
+_LABELS = "l."  # the prefix of an entry with what a server provides
 _BELOW = "~"  # stands for "/" in the name of an actor's entry
 _LOCK = "system.lock"
 _KEY_BYTES = 32
@@ -60,6 +61,9 @@ _INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
 _SHOWN = 10  # names in an error at most
 _CONTENT_BYTES = 1000  # XFS has links of at most 1023 bytes
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
+
+LABELS_BYTES = 900
+"""The limit for what a server provides, as JSON."""
 
 PATH_BYTES = 482
 """The limit for the path of the state directory. SQLite opens paths of 504 bytes: this, and "/a/catalog.sqlite3.new".
@@ -266,6 +270,35 @@ class Directory:
                 with contextlib.suppress(OSError):
                     found[name.removeprefix(_CLASSES)] = os.readlink(name, dir_fd=names.fd).split(",")
         return found
+
+    def put_labels(self, registrar: str, server: str, labels: str) -> None:
+        """Write what a server provides, or remove that if it is ""."""
+        name = f"{_LABELS}{check_name(registrar, 'registrar name')}{_BELOW}{server}"
+        if labels:
+            self._put(name, labels)
+            return
+        self._written.pop(name, None)
+        with contextlib.suppress(OSError):  # there is none
+            os.unlink(name, dir_fd=self._names.fd)
+
+    def labels(self) -> dict[str, str]:
+        """Return what the servers of the registrars that are there provide, by server id, sorted."""
+        found: dict[str, str] = {}
+        names = self._names
+        for name in self.names():
+            if name.startswith(_LABELS):
+                registrar, _, server = name.removeprefix(_LABELS).partition(_BELOW)
+                entry = self.lookup(_REGISTRAR + registrar)
+                if entry is not None and entry.status in (Presence.UP, Presence.STARTING):
+                    with contextlib.suppress(OSError):  # it was removed just now
+                        found[f"{registrar}/{server}"] = os.readlink(name, dir_fd=names.fd)
+        return found
+
+    def changed_at(self) -> int:
+        """Return when an entry was written or removed last, in ns of the system's clock; coarse. One system call."""
+        with contextlib.suppress(OSError):
+            return os.fstat(self._names.fd).st_mtime_ns
+        return 0
 
     def actors_below(self, path: str) -> list[str]:
         """Return the names of the entries of all actors below this path, sorted."""

@@ -27,7 +27,7 @@ import weakref
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import msgspec
 
@@ -118,24 +118,36 @@ class Slot(msgspec.Struct, frozen=True):
     fresh: int
 
 
-class Slots:
-    """The slots of one segment.
+class Head(Protocol):
+    """The bytes at the start of a segment, of which each slot's number has one: FREE or USED."""
 
-    A slot has the number that take() gave it, and one more for each holder that share() lets have it. It is free when
-    all of them are given back.
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, number: int, /) -> int: ...
+
+    def __setitem__(self, number: int, mark: int, /) -> None: ...
+
+
+class Slots:
+    """The slots of one segment, as its owner knows them.
+
+    A slot has the number that take() gave it, and one more for each holder that share() lets have it. The one who has a
+    number sets its byte in the head to FREE. The slot is free when all of its numbers are.
 
     Attributes:
         used: the slots that hold a value, by each of their numbers.
         holders: who has the numbers that share() gave.
 
     Args:
+        head: the bytes that both ends set.
         start, end: the bytes of the segment that slots may have; multiples of PAGE_BYTES.
         numbers: the numbers that slots may have.
     """
 
-    def __init__(self, start: int, end: int, numbers: range) -> None:
+    def __init__(self, head: Head, start: int, end: int, numbers: range) -> None:
         self.used: dict[int, Slot] = {}
         self.holders: dict[int, object] = {}
+        self._head = head
         self._shares: dict[int, int] = {}
         self._size = end - start
         self._free = Intervals(start, end)
@@ -152,6 +164,7 @@ class Slots:
 
         The first gap that is long enough is used, so the same pages are used again.
         """
+        self.collect()
         size = -(-size // PAGE_BYTES) * PAGE_BYTES
         start = self._free.first_fit(size)
         if start is None or not self._numbers:
@@ -161,25 +174,47 @@ class Slots:
             return None
         self._cold.remove(start, start + size)
         self._free.remove(start, start + size)
-        slot = Slot(self._numbers.pop(), start, start + size, fresh)
-        self.used[slot.number] = slot
+        number = self._numbers.pop()
+        slot = self.used[number] = Slot(number, start, start + size, fresh)
+        self._head[number] = USED
         return slot
 
-    def share(self, number: int, holder: object) -> int | None:
-        """Return another number of a slot, for a holder of its own; None if there is none."""
+    def share(self, number: int, holder: object, most_bytes: int) -> int | None:
+        """Return another number of a slot, for a holder of its own; None if that is one too many.
+
+        A holder may have two values, and more while those that it has are less than `most_bytes`.
+        """
+        self.collect()
+        has = self.numbers_of(holder)
+        if len(has) >= 2 and sum(self.used[own].end - self.used[own].start for own in has) >= most_bytes:
+            return None
         if not self._numbers:
             return None
         slot, other = self.used[number], self._numbers.pop()
         self.used[other], self.holders[other] = slot, holder
         self._shares[slot.start] = self._shares.get(slot.start, 0) + 1
+        self._head[other] = USED
         return other
 
     def numbers_of(self, holder: object) -> list[int]:
         """Return the numbers that a holder has."""
         return [number for number, other in self.holders.items() if other is holder]
 
-    def give_back(self, number: int) -> None:
-        """Give a number back, and make its slot free if that was the last. The slot's pages stay warm."""
+    def free(self, number: int) -> None:
+        """Set a number free for the one that has it."""
+        self._head[number] = FREE
+
+    def take_back(self, holder: object) -> None:
+        """Set free all that a holder has: it has ended."""
+        for number in self.numbers_of(holder):
+            self.free(number)
+
+    def collect(self) -> None:
+        """Make the slots free of which all numbers have been set free. Their pages stay warm."""
+        for number in [number for number in self.used if self._head[number] == FREE]:
+            self._give_back(number)
+
+    def _give_back(self, number: int) -> None:
         slot = self.used.pop(number)
         self.holders.pop(number, None)
         self._numbers.append(number)
@@ -191,6 +226,7 @@ class Slots:
 
     def cool(self, most: int) -> list[tuple[int, int]]:
         """Make at most `most` free bytes cold; return those that were not, for the caller to give back."""
+        self.collect()
         warm: list[tuple[int, int]] = []
         for start, end in self._free:
             for cold_start, cold_end in self._cold:
@@ -242,6 +278,25 @@ def _places(start: int, lengths: Sequence[int]) -> list[int]:
     places = [start]
     for length in lengths:
         places.append(places[-1] + -(-length // _ALIGNED) * _ALIGNED)
+    return places
+
+
+def places_in(parcel: Parcel, head: Head) -> list[int]:
+    """Return where each part of a value in a segment begins, and where the last ends; raise Lie if it cannot be there.
+
+    Args:
+        head: the bytes of the whole segment.
+    """
+    places = _places(parcel.start, parcel.lengths)
+    if (
+        not parcel.lengths
+        or min(parcel.lengths) < 0
+        or parcel.start < PAGE_BYTES
+        or places[-1] > len(head)
+        or parcel.slot not in _SLOTS
+        or head[parcel.slot] != USED
+    ):
+        raise Lie("it sent a value that is not in its segment")
     return places
 
 
@@ -344,25 +399,12 @@ class _Owned:
             fcntl.fcntl(fd, fcntl.F_ADD_SEALS, getattr(fcntl, seal))
         self.map = mmap.mmap(fd, self.bytes)
         _KEY.pack_into(self.map, 0, self.key)
-        self.slots = Slots(PAGE_BYTES, self.bytes, _SLOTS)
+        self.slots = Slots(self.map, PAGE_BYTES, self.bytes, _SLOTS)
 
     def __del__(self) -> None:
         """Close the descriptor: no thread writes any more."""
         if self.fd >= 0:
             os.close(self.fd)
-
-    def take(self, size: int, room: int) -> Slot | None:
-        """Return a slot, after those that the other side has freed are free."""
-        self.collect()
-        slot = self.slots.take(size, room)
-        if slot is not None:
-            self.map[slot.number] = USED
-        return slot
-
-    def collect(self) -> None:
-        """Make the slots free that the other side has freed."""
-        for number in [number for number in self.slots.used if self.map[number] == FREE]:
-            self.slots.give_back(number)
 
     def write(self, slot: Slot, part: Bytes, at: int) -> None:
         """Write a part of a value to its place; raise OSError if the machine has no memory for it."""
@@ -378,13 +420,11 @@ class _Owned:
 
     def discard(self, slot: Slot) -> None:
         """Free a slot that could not be written, and give its pages back."""
-        self.map[slot.number] = FREE
-        self.slots.give_back(slot.number)
+        self.slots.free(slot.number)
         self.give_back(sys.maxsize)
 
     def give_back(self, most: int) -> int:
         """Give free pages back to the machine, at most so many bytes; return how many it were."""
-        self.collect()
         pieces = self.slots.cool(most)
         for start, end in pieces:
             self.map.madvise(mmap.MADV_REMOVE, start, end - start)
@@ -494,13 +534,13 @@ class Parcels:
             if self._closed:
                 raise OSError("the connection is closed")
             owned = self._owned = self._owned or segments.make(self._pid)
-            return owned, owned.take(size, segments.room)
+            return owned, owned.slots.take(size, segments.room)
 
     def discard(self, parcel: Parcel) -> None:
         """Free the slot of a parcel that was not sent."""
         owned = self._owned
         if owned is not None:
-            owned.map[parcel.slot] = FREE
+            owned.slots.free(parcel.slot)
 
     def share(self, parcel: Parcel, holder: object, most_bytes: int) -> Parcel | None:
         """Return a parcel of this end for one more holder, who frees it for itself.
@@ -511,22 +551,15 @@ class Parcels:
         with self._segments.bookkeeping():
             if (owned := self._owned) is None:
                 raise OSError("the connection is closed")
-            owned.collect()
-            has = owned.slots.numbers_of(holder)
-            slots = [owned.slots.used[number] for number in has]
-            if len(has) >= 2 and sum(slot.end - slot.start for slot in slots) >= most_bytes:
+            if (number := owned.slots.share(parcel.slot, holder, most_bytes)) is None:
                 return None
-            if (number := owned.slots.share(parcel.slot, holder)) is None:
-                return None
-            owned.map[number] = USED
             return msgspec.structs.replace(parcel, slot=number)
 
     def take_back(self, holder: object) -> None:
         """Free all that a holder has: it has ended."""
         with self._segments.bookkeeping():
             if (owned := self._owned) is not None:
-                for number in owned.slots.numbers_of(holder):
-                    owned.map[number] = FREE
+                owned.slots.take_back(holder)
 
     def claim(self, parcel: Parcel, shared_by: object = None) -> Callable[[], Any]:
         """Return a function that makes the value of a parcel that has arrived. Unused, it frees the slot.
@@ -545,16 +578,7 @@ class Parcels:
         except (OSError, MemoryError) as error:
             why = f"a value of {len(parcel)} bytes cannot be read: {wanted_by(error) or text_of(error)}"
             return lambda: _raise(Unavailable(why))
-        places = _places(parcel.start, parcel.lengths)
-        if (
-            not parcel.lengths
-            or min(parcel.lengths) < 0
-            or parcel.start < PAGE_BYTES
-            or places[-1] > len(mapped)
-            or parcel.slot not in _SLOTS
-            or mapped[parcel.slot] != USED
-        ):
-            raise Lie("it sent a value that is not in its segment")
+        places = places_in(parcel, mapped)
         view = _owner_of(mapped, parcel.slot, parcel.start, places[-1] - parcel.start, shared_by)
         if shared_by is not None:
             view = view.toreadonly()

@@ -14,14 +14,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import msgspec
-
 from rr_actors.base.errors import RrError, Unavailable, UsageError
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.wire.blocking_link import BlockingLink
-from rr_actors.wire.frames import FRAME_LIMIT_BYTES
+from rr_actors.wire.frames import FRAME_LIMIT_BYTES, decoder_of
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
 from rr_actors.wire.segments import Segments
 from rr_actors.wire.transport import Accept, Attach, Hello, Link, Welcome
@@ -66,10 +64,7 @@ class UnixTransport:
     ) -> None:
         self._sockets = SocketDir(socket_dir)
         self._key = check_key(key)
-        self.wires = {
-            kind: Wire(msgspec.msgpack.Decoder(message_type), frame_limit_bytes)
-            for kind, message_type in codecs.items()
-        }
+        self.wires = {kind: Wire(decoder_of(message_type), frame_limit_bytes) for kind, message_type in codecs.items()}
         self.segments = Segments(segments_limit_bytes, frame_limit_bytes)
         self.address = new_name()
         self._server: asyncio.AbstractServer | None = None

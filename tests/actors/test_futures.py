@@ -13,7 +13,7 @@ import pykka
 import pytest
 
 import rr_actors as rr
-from rr_actors.actors.messaging.futures import Reply
+from rr_actors.actors.messaging.futures import Reply, StopReply
 from support import Calls, Gate, eventually, serve
 from support_pykka import Worker, boom
 
@@ -270,3 +270,26 @@ def test_many_threads_wait_set_and_cancel_at_once() -> None:
             thread.join()
         assert seen.wait() == [reply]
         assert reply.cancelled() or reply.get() == 1
+
+
+@pytest.mark.parametrize("report", ["set", "set_unopened"])
+def test_who_waits_for_a_stop_returns_when_the_end_has_been_noted(report: str) -> None:
+    reply = StopReply()
+    noted: list[bool] = []
+    reply.ended = lambda: noted.append(reply.done())
+
+    getattr(reply, report)(None)
+
+    assert noted == [False]
+    assert reply.get() is True
+
+
+def test_an_end_that_did_not_come_is_not_noted() -> None:
+    reply = StopReply()
+    noted: list[bool] = []
+    reply.ended = lambda: noted.append(True)
+
+    reply.set_exception(rr.ActorUnavailable("away", id="away"))
+
+    assert reply.get() is False
+    assert noted == []

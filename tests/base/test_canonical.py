@@ -212,6 +212,16 @@ class Job:
     run: Any
 
 
+class Loose(msgspec.Struct, frozen=True):
+    name: str
+    value: Any = None
+
+
+def test_a_struct_may_have_a_field_of_any_type() -> None:
+    for value in (None, {"parts": [1, "two"]}):
+        assert Codec(Loose).decode(encode(Loose("outer", value))) == Loose("outer", value)
+
+
 NOT_PLAIN: list[tuple[Any, str, str]] = [
     (Camera(), "request", "an object of type test_canonical.Camera"),
     ({"options": [1, 2, {"callback": encode}]}, "request.options[2].callback", "a function (encode)"),

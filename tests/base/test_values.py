@@ -76,6 +76,11 @@ class Struct(msgspec.Struct, frozen=True):
     topic: str
 
 
+class OpenStruct(msgspec.Struct, frozen=True):
+    name: str
+    anything: Any
+
+
 class Point(NamedTuple):
     x: int
     y: int
@@ -195,6 +200,7 @@ DECLARED: list[tuple[Any, Any]] = [
     (Word, Word.A),
     (Pose, Pose(1.5)),
     (Struct, Struct("a")),
+    (OpenStruct, OpenStruct("a", {"b": (1, 2)})),
     (Point, Point(1, 2)),
     (Wheel, Wheel(1.5)),
     (Model, MODEL),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Literal
 
 import pytest
 from hypothesis import given
@@ -39,6 +40,10 @@ TABLE = [
     ((50, 9), [(100, 1)], [50], ALL, Plan(start=["s0"], wait=["a"])),
     ((50, 9), [(100, 1)], [20, 50], ALL, Plan(start=["s1"], wait=["a"])),
     ((50, 9), [(100, 1)], [20], ALL, Plan(revoke=["r0"], wait=["a"])),
+    # one that is not enough alone starts first
+    ((50, 9), [(30, 1), (70, 9)], [20], ALL, Plan(start=["s0"], wait=["a"])),
+    ((50, 9), [(30, 1), (70, 9)], [20], ("preempt", "supply"), Plan(start=["s0"], revoke=["r0"], wait=["a"])),
+    ((50, 9), [(30, None), (70, 9)], [20], ALL, Plan(start=["s0"], revoke=["r0"], wait=["a"])),
     # the lowest, then the fewest, then the newest
     ((30, 9), [(50, 2), (50, 1)], [], ALL, Plan(revoke=["r1"], wait=["a"])),
     ((30, 9), [(30, 1), (10, 1), (10, 1), (10, 1), (40, 3)], [], ALL, Plan(revoke=["r0"], wait=["a"])),
@@ -82,6 +87,26 @@ def test_one_that_has_waited_long_enough_is_refused_unless_room_is_being_made_fo
 
     assert plan(100, ALL, [leaving, Running("r1", 40, 9)], [late]) == Plan(wait=["a"])
     assert plan(100, ALL, [Running("r1", 50, 9)], [late]) == Plan(refuse=["a"])
+
+
+def test_as_long_as_room_depends_on_a_reserve_that_may_fail_nobody_is_revoked_for_it() -> None:
+    shares, asked = running((30, 1), (70, 9)), [Asked("a", 50, 9, patient=False)]
+
+    assert plan(100, ALL, shares, asked, [Spare("s0", 20, "starting")]) == Plan(wait=["a"])
+    assert plan(100, ALL, shares, asked, [Spare("s0", 20, "late")]) == Plan(wait=["a"])
+    assert plan(120, ALL, shares, asked, [Spare("s0", 20, "on")]) == Plan(revoke=["r0"], wait=["a"])
+    assert plan(100, ALL, shares, asked) == Plan(refuse=["a"])
+    after = [Asked("b", 30, 5), Asked("z", 20, 9)]
+    assert plan(100, ALL, shares, after, [Spare("s0", 20, "starting")]) == Plan(wait=["z", "b"])
+    assert plan(120, ALL, shares, after, [Spare("s0", 20, "on")]) == Plan(admit=["z"], revoke=["r0"], wait=["b"])
+
+
+def test_what_is_over_the_capacity_waits_for_a_reserve_unless_it_is_late() -> None:
+    shares = running((30, 1), (70, 9))
+
+    assert plan(80, ALL, shares, reserves=[Spare("s0", 20, "starting")]) == Plan()
+    assert plan(80, ALL, shares, reserves=[Spare("s0", 20, "late")]) == Plan(revoke=["r0"])
+    assert plan(50, ALL, shares, reserves=[Spare("s0", 20)]) == Plan(start=["s0"], revoke=["r0"])
 
 
 def test_a_capacity_that_has_become_less_sheds_the_lowest_whatever_the_policy_is() -> None:
@@ -145,13 +170,20 @@ def test_ten_thousand_shares_take_few_steps() -> None:
 
 
 class Pools(RuleBasedStateMachine):
-    """A pool in which anything happens in any order, as a manager would carry out the plans."""
+    """A pool in which anything happens in any order, as a manager would carry out the plans.
+
+    A crash of the manager loses what only it knew: the loads that it had admitted and that were not on disk yet, which
+    ask again, the revocations that had not begun, the starts of reserves, and the ages.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.capacity = 20.0
         self.running: dict[str, Running] = {}
         self.asked: dict[str, Asked] = {}
+        self.spares = {"s0": Spare("s0", 5), "s1": Spare("s1", 8)}
+        self.on_disk: set[str] = set()  # shares
+        self.revoked: set[str] = set()  # begun, so that a crash does not lose them
         self.count = 0
         self.is_late = False  # the capacity was lowered, and what is over has not left yet
 
@@ -187,8 +219,50 @@ class Pools(RuleBasedStateMachine):
         self.asked[one.id] = Asked(one.id, one.amount, one.priority, one.since, False)
         self.settle()
 
+    @rule(id=st.sampled_from(["s0", "s1"]), state=st.sampled_from(["off", "late", "on"]))
+    def move_reserve(self, id: str, state: Literal["off", "late", "on"]) -> None:
+        """A reserve that starts is on, is late or fails; one that is on is lost."""
+        is_on = self.spares[id].state == "on"
+        if self.spares[id].state == "off" or (is_on and state != "off"):
+            return
+        self.is_late = self.is_late or is_on
+        self.set_reserve(id, state)
+        self.settle()
+
+    @precondition(lambda self: self.running)
+    @rule(data=st.data())
+    def reach_the_disk(self, data: st.DataObject) -> None:
+        id = data.draw(st.sampled_from(sorted(self.running)))
+        self.on_disk.add(id)
+        if self.running[id].leaving:
+            self.revoked.add(id)
+
+    @rule()
+    def crash(self) -> None:
+        for id, spare in self.spares.items():
+            if spare.state in ("starting", "late"):
+                self.set_reserve(id, "off")
+        for since, (id, one) in enumerate(list(self.running.items())):
+            self.running[id] = Running(id, one.amount, one.priority, since, id in self.revoked)
+            if id not in self.on_disk:
+                del self.running[id]
+                self.asked[id] = Asked(id, one.amount, one.priority, since)
+        self.settle()
+
+    def set_reserve(self, id: str, state: Literal["off", "starting", "late", "on"]) -> None:
+        self.spares[id] = Spare(id, self.spares[id].amount, state)
+
+    def plan(self) -> Plan:
+        return plan(self.total(), ALL, [*self.running.values()], [*self.asked.values()], [*self.spares.values()])
+
     def settle(self) -> None:
-        made = plan(self.capacity, ALL, list(self.running.values()), list(self.asked.values()))
+        """Plan and carry it out until nothing more is to be done, as the manager does while somebody waits."""
+        for _ in range(5):
+            if self.carry_out(self.plan()):
+                break
+
+    def carry_out(self, made: Plan) -> bool:
+        """Do what a plan says; return whether that was nothing."""
         assert sorted([*made.admit, *made.wait, *made.refuse]) == sorted(self.asked)
         self._check_victims(made)
         for id in made.refuse:
@@ -199,40 +273,60 @@ class Pools(RuleBasedStateMachine):
         for id in made.admit:
             one = self.asked.pop(id)
             self.running[id] = Running(id, one.amount, one.priority, one.since)
-        self.is_late = self.is_late and self.used() > self.capacity + 1e-6
+        for id in made.start:
+            self.set_reserve(id, "starting")
+        for id in made.stop:
+            self.set_reserve(id, "off")
+        self.is_late = self.is_late and self.used() > self.total() + 1e-6
+        return made == Plan(wait=made.wait)
 
     def _check_victims(self, made: Plan) -> None:
-        """Check that no victim is one too many, and that each is lower than somebody who waits."""
+        """Check that each victim is lower than somebody who waits, whose room nothing but victims makes."""
         victims = [self.running[id] for id in made.revoke]
         waiting = [self.asked[id] for id in made.wait]
-        if self.used(staying=True) <= self.capacity:
+        if self.used(staying=True) <= self.total():
             for victim in victims:
                 assert any(rank(victim.priority) < rank(one.priority) for one in waiting)
+            staying = self.used(staying=True) - math.fsum(victim.amount for victim in victims)
+            fits = [one.amount for one in waiting if staying + one.amount <= self.total() + 1e-6]
+            in_vain = [victim for victim in victims if victim.priority is not None and not fits]
+            assert not in_vain, "their room depends on a reserve that may fail"
+
+    def total(self) -> float:
+        return self.capacity + math.fsum(spare.amount for spare in self.spares.values() if spare.state == "on")
 
     def used(self, staying: bool = False) -> float:
         return math.fsum(one.amount for one in self.running.values() if not (staying and one.leaving))
 
     @invariant()
     def the_sum_is_within_the_capacity(self) -> None:
-        assert self.is_late or self.used() <= self.capacity + 1e-6
+        assert self.is_late or self.used() <= self.total() + 1e-6
+
+    @invariant()
+    def what_is_over_the_capacity_leaves_or_waits_for_a_reserve_that_is_not_late(self) -> None:
+        starting = math.fsum(spare.amount for spare in self.spares.values() if spare.state == "starting")
+        assert self.used(staying=True) <= self.total() + starting + 1e-6
 
     @invariant()
     def nothing_more_is_to_be_done(self) -> None:
         """A plan that was carried out is complete: planned again, nothing more comes of it."""
-        made = plan(self.capacity, ALL, list(self.running.values()), list(self.asked.values()))
+        made = self.plan()
         assert made == Plan(wait=made.wait)
 
     @invariant()
     def nobody_waits_who_would_fit_while_a_lower_one_runs(self) -> None:
-        room = self.capacity - self.used(staying=True)
+        """Unless a reserve starts, which is preferred to victims."""
+        room = self.total() - self.used(staying=True)
         first = max(self.asked.values(), key=lambda one: (rank(one.priority), -one.since), default=None)
-        if first is not None and room < first.amount - 1e-6:
+        starts = any(spare.state in ("starting", "late") for spare in self.spares.values())
+        if first is not None and room < first.amount - 1e-6 and not starts:
             lower = [
                 one.amount
                 for one in self.running.values()
                 if not one.leaving and rank(one.priority) < rank(first.priority)
             ]
-            assert room + math.fsum(lower) < first.amount + 1e-6
+            off = [spare.amount for spare in self.spares.values() if spare.state == "off"]
+            assert room + math.fsum([*lower, *off]) < first.amount + 1e-6
 
 
 TestPools = Pools.TestCase

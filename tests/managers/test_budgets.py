@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import threading
 from collections.abc import Callable
@@ -67,6 +68,20 @@ class House:
 @pytest.fixture
 def house(start: Start) -> House:
     return House(start, Pool("watts", 100))
+
+
+def test_the_command_line_shows_the_pools_and_a_question_that_is_none_is_refused(house: House) -> None:
+    house.run("heater", 60)
+    head, row, *rest = run_cli("budgets").stdout.splitlines()
+    assert head.split() == ["pool", "capacity", "used", "free", "waiting", "enforced", "problem"]
+    assert row.split() == ["watts", "100", "60", "40", "0", "no"]
+    assert rest == []
+    (pool,) = json.loads(run_cli("budgets", "--json").stdout)
+    assert (pool["name"], pool["capacity"], pool["free"]) == ("watts", 100.0, 40.0)
+    missing = run_cli("budgets", "--budgets", "wallet")
+    assert (missing.returncode, "wallet" in missing.stderr) == (2, True)
+    with pytest.raises(rr.UsageError, match="budgets: expected a question to Budgets, got 'what'"):
+        house.system.ref("budgets").ask("what")
 
 
 def test_shares_are_admitted_while_they_fit_and_given_back(house: House) -> None:
@@ -147,6 +162,52 @@ def test_a_load_that_waits_for_room_says_for_which_pool_and_how_much_is_free(hou
     assert not said("resources")
 
 
+def test_all_that_happens_for_want_of_room_is_told_by_name(house: House) -> None:
+    heard = Calls()
+    house.system.subscribe(lambda event: heard((event["event"], event.get("text") or event.get("detail", ""))))
+    house.run("heater", 60, priority=1)
+    oven = house.run("oven", 50, wait_s=60, priority=1, block=False)
+    eventually(lambda: house.pool().waiting == 1)
+    kettle = house.run("kettle", 60, wait_s=60, block=False)
+
+    def because(what: str) -> str:
+        rows = json.loads(run_cli("loads", "--json", "--state", house.system.state_dir).stdout)["waiting"]
+        return next((row["said"] for row in rows if f'device [\\"{what}' in row["request"]), "")
+
+    room = "0% waits for room in pool 'watts': asked"
+    held = f'{room} 50, free 40 of 100; held by devices/device ["heater",60,0.0] (priority 1)'
+    assert eventually(lambda: because("oven") == held)
+    behind = f'{room} 60, free 40 of 100; behind devices/device ["oven",50,60] (priority 1)'
+    assert eventually(lambda: because("kettle") == behind)
+
+    pump = house.run("pump", 60, wait_s=60, priority=9)
+    has = "has 60 of pool 'watts' after"
+    assert eventually(lambda: any(event[0] == "progress" and event[1].startswith(has) for event in heard.items))
+    why = """pool 'watts' has no room for it: devices/device ["pump",60,60] (priority 9) needs room"""
+    assert ("revoked", why) in heard.items
+    assert ("progress", held.removeprefix("0% ")) in heard.items
+    house.set_capacity(50)
+    less = ("revoked", "pool 'watts' has no room for it: its capacity is 50 now")
+    assert eventually(lambda: less in heard.items)
+    pump.wait_status("FATAL", timeout_s=20)
+    assert oven.get(timeout=30).response == "oven"
+    kettle.cancel()
+
+
+def test_a_share_is_found_by_the_name_that_it_has_at_its_holder(house: House) -> None:
+    query = house.app.load("budgets/share", {"pool": "watts", "amount": 5, "instance": "x"})
+    (info,) = house.system.registrar("budgets").resources()
+    assert info.request.amount == 5.0
+
+    def why(name: str) -> str:
+        ran = run_cli("why", name, "--state", house.system.state_dir)
+        return ran.stdout + ran.stderr
+
+    name = 'budgets/share {"amount":5,"instance":"x","pool":"watts"}'
+    assert f"({query.resource_id[-8:]}) is loaded" in why(name)
+    assert "no query and no resource has this id" in why(name.replace("5", "6"))
+
+
 def test_who_has_waited_long_enough_is_refused(house: House) -> None:
     house.run("heater", 60)
     with pytest.raises(OverCapacity):
@@ -224,6 +285,33 @@ def test_after_a_reserve_that_fails_others_give_way(start: Start) -> None:
     assert house.ended.items == ["heater"]
 
 
+def test_nobody_gives_way_in_vain_beside_a_reserve_that_fails(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 20, -1.0),)))
+    house.run("heater", 30, priority=1)
+    house.run("other", 70, priority=9)
+    with pytest.raises(OverCapacity):
+        house.run("lamp", 50, priority=9)
+    assert house.ended.items == []
+
+
+def test_what_is_over_the_capacity_does_not_wait_longer_than_its_grace_for_a_reserve(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/slow", 50),)), grace_s=0.5)
+    begun, goes_on = Calls(), threading.Event()
+
+    def start_slowly() -> None:
+        begun("begun")
+        goes_on.wait(60)
+
+    house.devices.register_server("slow", start_slowly)
+    house.run("heater", 50, priority=1)
+    house.run("pump", 50, priority=9)
+    house.set_capacity(60)
+    begun.wait()
+    assert eventually(lambda: house.ended.items == ["heater"])
+    assert not goes_on.is_set()
+    goes_on.set()
+
+
 def test_a_reserve_that_is_lost_takes_its_supply_with_it(start: Start) -> None:
     house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, 50.0),)))
     house.run("heater", 100, priority=1)
@@ -263,6 +351,17 @@ def test_a_manager_that_is_killed_knows_all_shares_and_who_waits(house: House) -
     assert eventually(lambda: house.pool() == PoolInfo("watts", 80, 60, 1))
     with pytest.raises(OverCapacity):
         house.run("lamp", 30)
+    heater.unload()
+    assert oven.get(timeout=30).response == "oven"
+
+
+def test_a_manager_that_is_killed_knows_its_supplies_before_their_server_is_there_again(house: House) -> None:
+    house.app.load("devices/generator", 50.0)
+    heater = house.run("heater", 150)
+    oven = house.run("oven", 50, wait_s=60, block=False)
+    eventually(lambda: house.pool().waiting == 1)
+    house.respawn()  # the load of the oven's share runs again at once
+    assert eventually(lambda: house.pool() == PoolInfo("watts", 150, 150, 1))
     heater.unload()
     assert oven.get(timeout=30).response == "oven"
 

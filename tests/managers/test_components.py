@@ -133,6 +133,15 @@ def test_a_missing_parameter_is_an_error_that_names_it(begin: Begin) -> None:
         app.load("components/component", LoadComponent("lidar"))
 
 
+def test_a_default_stands_for_a_parameter_that_is_not_given(begin: Begin) -> None:
+    _, app = begin(entry("a").replace("[component.program]", 'defaults = { place = "roof" }\n[component.program]'))
+    with (
+        app.load("components/component", LoadComponent("lidar")) as one,
+        app.load("components/component", LoadComponent("lidar", {"place": "mast"})) as other,
+    ):
+        assert [query.response.parameters["topic"] for query in (one, other)] == ["roof/a", "mast/a"]
+
+
 def test_when_nothing_can_take_its_place_the_holders_hear_fatal(begin: Begin, tmp_path: Path) -> None:
     once = tmp_path / "once"
     code = f"import os, time; open('{once}', 'x').close(); print('ready'); time.sleep(600)"
@@ -192,6 +201,7 @@ def test_the_program_managers_crash_is_not_held_against_a_component(begin: Begin
         ("[[component]]\nname = 'a'\n", "component[0]", "type"),
         (entry("a").replace("1.0", "'high'"), "component[0].reliability", "expected `float`, got 'high' (str)"),
         (entry("a").replace("1.0", "1.5"), "component[0].reliability", "<= 1"),
+        (entry("a").replace("1.0", "nan"), "component[0].reliability", ">= 0.0, got nan"),
         (entry("a").replace("grace_s", "grace"), "component[0].program.grace", "did you mean 'grace_s'?"),
         (entry("a").replace("timeout_s", "timeout"), "component[0].program.ready.timeout", "did you mean 'timeout_s'?"),
         ("[robot]\n", "robot", "expected one of component, got an unknown key"),

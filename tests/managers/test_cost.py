@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.managers import Budgets, OverCapacity, Pool
+from rr_actors.managers import Budgets, OverCapacity, Pool, Programs, RunProgram
+from rr_actors.runtime.processes.control_groups import ControlGroups
 from support import eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -138,3 +139,33 @@ def test_a_child_that_there_is_not_is_named(app: rr.Registrar) -> None:
 def test_a_wrong_cost_is_refused_at_once(options: dict[str, Any], error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         rr.server("lamp", **options)
+
+
+def test_a_program_costs_what_its_request_says_and_a_pool_says_whether_it_is_enforced(start: Start) -> None:
+    pools = [Pool("watts", 100), Pool("cpu", 2), Pool("memory_bytes", 1e9)]
+    budgets = rr.ChildSpec(Budgets, id="budgets", args=(pools,))
+    system = start(budgets, rr.ChildSpec(Programs, id="programs"))
+    app = system.open_registrar("app")
+    cost = {"watts": 30, "cpu": 0.5, "memory_bytes": 2e8}
+    program = app.load("programs/program", RunProgram("sleep", ("1000",), cost=cost))
+    assert used(system) == cost
+    enforced = {pool.name for pool in system.ref("budgets").proxy().pools().get() if pool.enforced}
+    assert enforced == {*ControlGroups.of_this_process().limits()}
+    with pytest.raises(OverCapacity, match="pool 'cpu': asked 4"):
+        app.load("programs/program", RunProgram("sleep", ("1000",), cost={"cpu": 4}))
+    with pytest.raises(rr.LoadFailed, match="cost of 'cpu'"):
+        app.load("programs/program", RunProgram("sleep", ("1000",), cost={"cpu": -1}))
+    program.unload()
+    assert eventually(lambda: used(system) == dict.fromkeys(cost, 0.0))
+
+
+def test_programs_pay_to_the_budgets_that_they_are_given(start: Start) -> None:
+    power = rr.ChildSpec(Budgets, id="power", args=([Pool("watts", 100)],))
+    system = start(power, rr.ChildSpec(Programs, id="programs", kwargs={"cost_from": "power"}))
+    app = system.open_registrar("app")
+    app.load("programs/program", RunProgram("sleep", ("1000",), cost={"watts": 30}))
+    assert system.ref("power").proxy().pools().get()[0].used == 30
+    with pytest.raises(OverCapacity, match="pool 'watts': asked 80, free 70 of 100"):
+        app.load("programs/program", RunProgram("sleep", ("1001",), cost={"watts": 80}))
+    with pytest.raises(rr.InvalidName, match="cost_from"):
+        Programs(cost_from="power/share")

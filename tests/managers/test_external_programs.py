@@ -21,7 +21,10 @@ from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
 from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
+from rr_actors.runtime.processes.control_groups import ControlGroup, ControlGroups
+from rr_actors.testing.process_census import stands
 from support import NoDescriptors, hang
+from support_programs import group_of_program
 from support_slow import few_now
 
 KEY = os.environ["RR_ACTORS_TESTS"]  # of this run of the tests alone, and of what its processes start
@@ -623,3 +626,101 @@ def test_closing_leaves_the_programs_running(tmp_path: Path, exits: Exits) -> No
     second.close()
     assert not is_running(running.pid)
     assert exits.seen == []
+
+
+# -- control groups --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def grouped(tmp_path: Path, exits: Exits) -> Iterator[ExternalPrograms]:
+    if ControlGroups.of_this_process().place("rr-test") is None:
+        pytest.skip("no control groups of version 2 that can be written")
+    programs = ExternalPrograms(tmp_path / "programs", exits, pauses=True)
+    yield programs
+    programs.stop(KEY)
+    programs.close()
+
+
+def test_a_paused_program_is_frozen_in_a_group_with_all_that_it_started_which_goes_with_it(
+    grouped: ExternalPrograms, tmp_path: Path
+) -> None:
+    code = "import os, time; os.fork() or os.setsid(); print('ready', flush=True); time.sleep(600)"
+    running = grouped.start(KEY, python(code, ready="ready"))
+    group = group_of_program(running.pid)
+    assert group is not None
+    pids = set(find_processes(VARIABLE, KEY))
+    assert len(pids) == 2
+    assert ControlGroup(group).pids() == pids
+    grouped.pause(KEY)
+    assert all(stands(pid) for pid in pids)
+    grouped.pause(KEY)
+    grouped.resume(KEY)
+    assert not any(stands(pid) for pid in pids)
+    assert psutil.Process(running.pid).status() != psutil.STATUS_STOPPED
+    grouped.pause(KEY)
+    grouped.stop(KEY)  # a frozen program is ended as others are, without waiting for its grace
+    assert not find_processes(VARIABLE, KEY)
+    assert not group.exists()
+
+
+def test_a_group_is_removed_when_manager_and_shim_were_killed(grouped: ExternalPrograms, tmp_path: Path) -> None:
+    running = grouped.start(KEY, python(SLEEP, ready="ready"))
+    group = group_of_program(running.pid)
+    assert group is not None
+    grouped.pause(KEY)
+    shim = psutil.Process(running.pid).parent()
+    assert shim is not None
+    shim.kill()
+    eventually(lambda: not shim.is_running() or shim.status() == psutil.STATUS_ZOMBIE)
+    again = ExternalPrograms(tmp_path / "programs", print, pauses=True)
+    with pytest.raises(ProgramFailed):
+        again.attach(KEY)
+    again.stop(KEY)
+    again.close()
+    assert not group.exists()
+
+
+def test_a_group_that_was_noted_and_never_made_is_no_error(grouped: ExternalPrograms, tmp_path: Path) -> None:
+    home = Home(tmp_path / "programs" / KEY)
+    home.make()
+    home.note_group(ControlGroup(tmp_path / "none"))
+    running = grouped.start(home.key, python(SLEEP, ready="ready"))
+    assert group_of_program(running.pid) is not None
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_where_none_can_be_made_a_program_runs_and_is_stopped_and_its_limits_are_said_not_to_hold(
+    tmp_path: Path, exits: Exits, there: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "cgroup.procs").touch()
+    (tmp_path / f"rr-{KEY}").touch()  # no group can have this name
+    groups = ControlGroups(tmp_path if there else None, tmp_path)
+    programs = ExternalPrograms(tmp_path / "programs", exits, pauses=True, groups=groups)
+    running = programs.start(KEY, python(SLEEP, ready="ready", limits={"cpu": 0.5, "memory_bytes": 1e8}))
+    try:
+        assert group_of_program(running.pid) is None
+        assert "its share of cpu is counted, not enforced: see rr-actors doctor" in caplog.text
+        assert "its share of memory_bytes is counted, not enforced" in caplog.text
+        programs.pause(KEY)
+        eventually(lambda: stands(running.pid))
+        programs.resume(KEY)
+        eventually(lambda: not stands(running.pid))
+    finally:
+        programs.stop(KEY)
+        programs.close()
+
+
+def test_a_program_enters_its_group_and_the_limits_are_there_before_it(tmp_path: Path, exits: Exits) -> None:
+    top = tmp_path / "top"
+    top.mkdir()
+    (top / "cgroup.procs").touch()
+    (top / "cgroup.subtree_control").write_text("cpu")
+    programs = ExternalPrograms(tmp_path / "programs", exits, groups=ControlGroups(top, top))
+    limit = str(top / f"rr-{KEY}" / "cpu.max")
+    code = f"print(open({limit!r}).read(), flush=True); import time; time.sleep(600)"
+    programs.start(KEY, python(code, ready="^50000 100000", limits={"cpu": 0.5}))
+    try:
+        assert (top / f"rr-{KEY}" / "cgroup.procs").read_text() == "0"
+    finally:
+        programs.stop(KEY)
+        programs.close()

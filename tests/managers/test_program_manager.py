@@ -18,6 +18,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Program, Programs, Ready, RunProgram
+from rr_actors.testing.process_census import stands
 from support import Calls, eventually, kill, pid_of, wait_respawned
 from support_programs import running_programs
 
@@ -61,7 +62,7 @@ def test_a_program_is_started_shared_and_ended_with_its_last_holder(system: rr.S
 
 
 def is_paused(program: Program) -> bool:
-    return psutil.Process(program.pid).status() == psutil.STATUS_STOPPED
+    return stands(program.pid)
 
 
 def test_an_idle_program_is_paused_also_over_a_crash_of_its_manager_and_goes_on_when_it_is_needed(start: Start) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from support import REPOSITORY
+from support import REPOSITORY, run_example
 
 EXPECTED = {
     "first_resource": ["loaded: Feed(topic='/camera/dev/video0')", "unloaded: nothing is held any more"],
@@ -55,6 +52,15 @@ EXPECTED = {
         "at most 100 W were in use",
         "60 W                 arm, pump",
         "100 W again          camera, map, arm, pump",
+    ],
+    "keep": [
+        "three are wanted   3 of 3",
+        "one is killed      2 of 3  failing",
+        "one is silent      2 of 3  failing",
+        "one is wanted      1 of 1",
+        "radio 0 ██··████████",
+        "radio 1 ██████··██··",
+        "radio 2 ██████████··",
     ],
     "generator": [
         "100 of 100 W, 0 W too much: arm, camera, lamp, radio",
@@ -121,20 +127,10 @@ CRASHES = {"restart_storm", "monitors"}
 @pytest.mark.parametrize("name", sorted(EXPECTED))
 def test_the_example_runs_and_says_what_it_shows(name: str, tmp_path: Path) -> None:
     script = REPOSITORY / "examples" / f"{name}.py"
-    done = subprocess.run(
-        [sys.executable, str(script)],
-        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert name in CRASHES or "Traceback" not in done.stderr  # that a process was killed may be logged
-    lines = done.stdout.splitlines()
+    said = run_example(tmp_path, script, limit_s=30, may_log_errors=name in CRASHES)
+    lines = said.splitlines()
     for expected in EXPECTED[name]:
-        assert any(line.startswith(expected) for line in lines), (expected, done.stdout)
+        assert any(line.startswith(expected) for line in lines), (expected, said)
 
 
 IN_THREADS = ("async_load", "dependencies", "first_resource", "sharing", "status")
@@ -151,20 +147,10 @@ runpy.run_path(sys.argv[1], run_name="__main__")
 
 @pytest.mark.parametrize("name", IN_THREADS)
 def test_the_example_says_the_same_when_its_managers_are_threads(name: str, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(REPOSITORY / "examples" / f"{name}.py")],
-        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    lines = done.stdout.splitlines()
+    said = run_example(tmp_path, "-c", PROGRAM, REPOSITORY / "examples" / f"{name}.py", limit_s=30)
+    lines = said.splitlines()
     for expected in EXPECTED[name]:
-        assert any(line.startswith(expected) for line in lines), (expected, done.stdout)
+        assert any(line.startswith(expected) for line in lines), (expected, said)
 
 
 @pytest.mark.parametrize("name", sorted(EXPECTED))

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+import rr_actors as rr
+
 OPTIONAL = {
     "uvloop",
     "rich",
@@ -72,6 +74,17 @@ def test_importing_the_package_imports_nothing_that_is_seldom_needed() -> None:
 
 def test_importing_the_package_imports_no_more_modules_than_it_must() -> None:
     assert len(imported_by("import rr_actors")["all"]) <= MOST_MODULES
+
+
+def test_the_ready_made_managers_are_imported_when_they_are_asked_for() -> None:
+    assert "rr_actors.managers" not in imported_by("import rr_actors")["all"]
+    assert "rr_actors.managers" in imported_by("import rr_actors as rr; rr.managers.Choices")["all"]
+
+
+def test_what_the_package_does_not_have_is_named_with_what_is_near() -> None:
+    with pytest.raises(AttributeError, match="module 'rr_actors' has no attribute 'mangers'") as raised:
+        rr.mangers  # type: ignore[attr-defined]  # noqa: B018
+    assert raised.value.name == "mangers"
 
 
 @pytest.mark.parametrize(("setup", "collects"), [("", True), ("gc.disable()", False)])

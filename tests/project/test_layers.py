@@ -28,6 +28,8 @@ PLACES = {
         "tools/cli_commands.py",
         "tools/console_verbs.py",
         "tools/recording_verbs.py",
+        "tools/terminal/action_graphs.py",
+        "tools/terminal/planner_verbs.py",
         "tools/terminal/stream_verbs.py",
     ),
     "rich": (
@@ -39,6 +41,7 @@ PLACES = {
     "textual": ("tools/terminal/terminal_app.py",),
     "nicegui": ("tools/web/",),
     "opentelemetry": ("system/recording/otel_export.py",),
+    "yaml": ("managers/pipes/temoto_files.py",),
     "matplotlib": (),
     "tomllib": (),  # read by way of msgspec.toml
 }

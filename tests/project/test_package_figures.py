@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import statistics
 
-from package_figures import function_lengths, imports_up, monitor_entries, passed, private_uses, untyped_hubs
+from package_figures import (
+    function_lengths,
+    imports_up,
+    monitor_entries,
+    passed,
+    private_uses,
+    shared_class_names,
+    untyped_hubs,
+)
 
-USERS_OBJECTS = {"rr_actors/supervision/hosted.py", "rr_actors/supervision/supervisor.py"}
+import rr_actors as rr
+from rr_actors import managers
+
+USERS_OBJECTS = {"rr_actors/supervision/hosted.py"}
 """Where an object of any class is what a user's code made, and not a part of the registrar."""
 
 
@@ -16,6 +27,10 @@ def test_no_room_imports_a_room_above_it() -> None:
 
 def test_what_has_the_registrar_knows_its_type() -> None:
     assert [hub for hub in untyped_hubs() if hub.partition(":")[0] not in USERS_OBJECTS] == []
+
+
+def test_no_other_class_has_the_name_of_a_public_one() -> None:
+    assert {*rr.__all__, *managers.__all__}.intersection(shared_class_names()) == set()
 
 
 def test_functions_are_as_short_as_they_were() -> None:

@@ -18,7 +18,7 @@ from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.engine.monitor import RegistrarMonitor
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
-from rr_actors.registrar.model.rows import Phase, Query, Resource
+from rr_actors.registrar.model.rows import Phase, Resource, ServedQuery
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
 from support_inside import actor_of
@@ -62,7 +62,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Calls:
 def on_disk(state_dir: Path, request: str) -> list[Phase]:
     """The phases of what the provider has loaded, or is loading, for this request; none if no query is on it."""
     rows = list(read_rows(catalog_path(state_dir, "provider")))
-    queries = {row.resource_id for row in rows if isinstance(row, Query)}
+    queries = {row.resource_id for row in rows if isinstance(row, ServedQuery)}
     wanted = msgspec.msgpack.encode(request)
     return [row.phase for row in rows if isinstance(row, Resource) and row.request == wanted and row.id in queries]
 

@@ -313,6 +313,50 @@ def test_what_a_crash_interrupted_runs_again_under_the_next_number(
     assert (resource.attempt, resource.tries) == (attempt, tries)
 
 
+@pytest.mark.parametrize("recovery", ["keep", "reload"])
+def test_a_health_callback_in_whose_runs_three_processes_have_died_loses_its_resource(recovery: Any) -> None:
+    server = Server("cam", recovery=recovery)
+    registrar = provider("loaded", recovery=recovery)
+    for deaths in (1, 2, 3):
+        registrar.obey(c.BeginProbe("q", "cam"))
+        assert [effect.resource_id for effect in registrar.effects if isinstance(effect, e.StartProbe)] == ["q"]
+        registrar = registrar.again(server)
+        assert registrar.catalog.callback_runs["health:q"].deaths == deaths
+
+    assert registrar.catalog.resources["q"].state is State.FATAL
+
+
+def test_a_health_callback_that_has_returned_is_not_blamed_for_the_death_of_its_process() -> None:
+    registrar = provider("loaded")
+    for _ in range(5):
+        registrar.obey(c.BeginProbe("q", "cam"))
+        registrar.obey(c.ProbeDone("q"))
+        registrar = registrar.again(Server("cam"))
+
+    assert registrar.catalog.callback_runs == {}
+    assert registrar.catalog.resources["q"].state is State.OK
+
+
+def test_after_two_deaths_health_callbacks_run_one_after_another_until_the_one_that_kills_is_found() -> None:
+    registrar = provider("loaded")
+    registrar.decide(Load("r", "cam", b"rear", "app", "", 0, 2))
+    registrar.obey(c.LoadDone("r", 1, b"feed"))
+    for _ in range(2):
+        registrar.together((c.BeginProbe("q", "cam"), None), (c.BeginProbe("r", "cam"), None))
+        assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartProbe)] == ["q", "r"]
+        registrar = registrar.again(Server("cam"))
+
+    registrar.together((c.BeginProbe("q", "cam"), None), (c.BeginProbe("r", "cam"), None))
+    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartProbe)] == ["q"]
+    registrar.obey(c.ProbeDone("q"))
+    registrar.obey(c.BeginTrial("health:r"))
+    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartProbe)] == ["r"]
+    registrar = registrar.again(Server("cam"))
+
+    states = {id: resource.state for id, resource in registrar.catalog.resources.items()}
+    assert states == {"q": State.OK, "r": State.FATAL}
+
+
 def test_what_an_interrupted_reload_had_loaded_goes_with_a_resource_that_is_fatal_since() -> None:
     server = Server("cam", recovery="reload")
     registrar = provider("loaded", recovery="reload").again(server)

@@ -63,6 +63,14 @@ class Deadly(rr.Manager):
         self.meets("recover", request)
         return response
 
+    @rr.server("probed", health=rr.Health(every_s=0.1))
+    def load_probed(self, request: str) -> str:
+        return request
+
+    @load_probed.health
+    def probe(self, request: str, response: str) -> None:
+        self.meets("health", request)
+
     @rr.server("other")
     def load_other(self, request: str) -> str:
         return request
@@ -134,6 +142,29 @@ def test_a_status_callback_that_ends_its_process_three_times_is_passed_over(
     system.registrar("shop").send_status(query.resource_id, rr.Status(rr.State.OK, "second"))
     assert [status.message for status in hears.wait(2)] == ["first", "second"]
     assert len(workshop.lines("status status")) == 3
+    assert system.ended is None
+
+
+@pytest.mark.parametrize("how", ENDS)
+def test_a_health_callback_that_ends_its_process_each_time_loses_the_resource_by_name(
+    start: Start, workshop: Workshop, how: str
+) -> None:
+    system = start(deadly(workshop, how))
+    app = system.open_registrar("app")
+    hears = Calls()
+    lost = app.load("shop/probed", "health", on_status=hears)
+    kept = [app.load("shop/probed", f"kept {number}") for number in range(3)]
+    workshop.note("armed")
+    (status,) = hears.wait()
+    assert status.state is rr.State.FATAL
+    assert "shop/probed: the process died in each of 3 runs of the health callback" in status.message
+    assert lost.resource_id in status.message
+    died = len(workshop.lines("health health"))
+    probed = len(workshop.lines("health kept 0"))
+    eventually(lambda: len(workshop.lines("health kept 0")) > probed + 3)
+    assert len(workshop.lines("health health")) == died  # it is not probed any more
+    assert [query.state for query in kept] == [rr.State.OK] * 3
+    lost.unload()
     assert system.ended is None
 
 

@@ -13,7 +13,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.effects import Request
 from rr_actors.registrar.model.messages import Unload, Unloaded
-from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Query, Resource, Row, State, content_of
+from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Resource, Row, ServedQuery, State, content_of
 from rr_actors.runtime import event_loop
 from support import LIMIT_S, serve
 from support_steps import steps_of
@@ -24,7 +24,7 @@ def whole_of(parts: int) -> tuple[Catalog, list[Any]]:
     rows: list[Row] = [
         Peer("parts"),
         Resource("r", "car", b"", b"", Phase.UNLOADING, State.OK, "", 1),
-        Query("q", "r", "app", "", 1, 1),
+        ServedQuery("q", "r", "app", "", 1, 1),
     ]
     rows += [Held(f"p{n}", "parts", "wheel", b"", b"", f"w{n}", "r", 1, n, Hold.HELD, State.OK) for n in range(parts)]
     catalog = Catalog("shop", content_of(rows))

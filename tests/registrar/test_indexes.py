@@ -15,7 +15,18 @@ from hypothesis import strategies as st
 
 from rr_actors.registrar.model import catalog
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import TABLE_OF, Held, Hold, Notice, Phase, Query, Resource, Row, State, content_of
+from rr_actors.registrar.model.rows import (
+    TABLE_OF,
+    Held,
+    Hold,
+    Notice,
+    Phase,
+    Resource,
+    Row,
+    ServedQuery,
+    State,
+    content_of,
+)
 from rr_actors.runtime import garbage
 from rr_actors.runtime.garbage import left_alone
 
@@ -47,7 +58,7 @@ RESOURCES = st.builds(
     st.just(""),
     st.just(1),
 )
-QUERIES = st.builds(Query, IDS, IDS, SMALL, st.just(""), st.just(0), st.integers(0, 9))
+QUERIES = st.builds(ServedQuery, IDS, IDS, SMALL, st.just(""), st.just(0), st.integers(0, 9))
 HELD = st.builds(
     Held,
     IDS,

@@ -23,7 +23,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Load, Loaded, Unload
-from rr_actors.registrar.model.rows import Phase, Put, Query
+from rr_actors.registrar.model.rows import Phase, Put, ServedQuery
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.storage.opening import read_rows
@@ -96,6 +96,7 @@ def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[An
         else:
             fast.set("queries", query.id, query)
             resource = fast.resources[query.resource_id]
+            fast.joined[resource.server] = fast.joined.get(resource.server, 0) + 1  # as DirectPaths counts
             answer = Loaded(query.id, resource.id, resource.response or b"", state=resource.state)
             assert decision.effects == [Reply(step.origin, answer)]
             assert (decision.changes, decision.later) == ([Put(query)], {})
@@ -163,7 +164,7 @@ def test_what_was_refused_before_is_not_joined() -> None:
 
 
 def on_disk(state_dir: Path) -> list[str]:
-    return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Query)]
+    return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, ServedQuery)]
 
 
 def test_it_is_on_disk_when_the_load_returns_and_no_loop_was_woken(
@@ -364,12 +365,12 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
         thread = threading.Thread(target=lambda: app.load("provider/thing", "x"))
         thread.start()
         thread.join()
-        assert short_cuts == ["Query"]
+        assert short_cuts == ["ServedQuery"]
     finally:
         signal.signal(signal.SIGUSR1, before)
     monkeypatch.setattr(interpreter._interruptions, "look_at", 0.0)
     app.load("provider/thing", "x")
-    assert short_cuts == ["Query", "Query"]
+    assert short_cuts == ["ServedQuery", "ServedQuery"]
 
 
 @pytest.mark.parametrize("handled", [False, True], ids=["no handler", "a handler that may wait for the loop"])

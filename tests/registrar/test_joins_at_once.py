@@ -12,7 +12,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Message, Unload
-from rr_actors.registrar.model.rows import Query
+from rr_actors.registrar.model.rows import ServedQuery
 from rr_actors.storage.opening import read_rows
 from rr_actors.wire.transport import Hello
 from support import Served, catalog_path, eventually, serve
@@ -77,7 +77,7 @@ def lines(app: rr.Registrar, provider: rr.Registrar, served: Served) -> Lines:
 
 
 def on_disk(state_dir: Path) -> list[str]:
-    return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Query)]
+    return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, ServedQuery)]
 
 
 def commits(provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> list[int]:

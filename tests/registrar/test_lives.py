@@ -13,7 +13,7 @@ import pytest
 from test_semantics_recovery import run_and_be_killed
 
 import rr_actors as rr
-from rr_actors.registrar.model.rows import Notice, Query
+from rr_actors.registrar.model.rows import Notice, ServedQuery
 from rr_actors.storage.opening import read_rows
 from rr_actors.tools import inspection
 from support import Workshop, catalog_path, eventually, kill, pid_of, wait_respawned
@@ -38,7 +38,7 @@ def shop(workshop: Workshop, id: str = "shop") -> rr.ChildSpec:
 
 
 def served(state_dir: Path, name: str = "shop") -> list[object]:
-    return [row for row in read_rows(catalog_path(state_dir, name)) if isinstance(row, Query | Notice)]
+    return [row for row in read_rows(catalog_path(state_dir, name)) if isinstance(row, ServedQuery | Notice)]
 
 
 # -- a provider that is away while its consumer is opened and closed ------------------------------------------------

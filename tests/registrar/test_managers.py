@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -925,6 +926,23 @@ def test_a_snapshot_shows_tree_and_resources_as_plain_data(start: Start, worksho
     text = json.dumps(system.snapshot(), default=str)
     for word in ("parts", "shop", "app", bike.resource_id, bike.id):
         assert word in text, word
+
+
+@pytest.mark.slow
+def test_a_snapshot_waits_once_for_all_managers_that_do_not_answer(start: Start, workshop: Workshop) -> None:
+    names = [f"shop{number}" for number in range(5)]
+    system = start(*shops(workshop, *names))
+    pids = [pid_of(system, name) for name in names[1:]]
+    for pid in pids:
+        hang(pid)
+    begun = time.monotonic()
+    described = system.snapshot()["registrars"]
+    took = time.monotonic() - begun
+    for pid in pids:
+        os.kill(pid, signal.SIGCONT)
+    assert described["shop0"]["servers"] == ["shop0/thing"]
+    assert all("within 5 s" in described[name]["error"] for name in names[1:])
+    assert took < 10.0  # each of the four would wait for 5 s after the one before
 
 
 def test_subscribers_hear_of_what_happens(start: Start, workshop: Workshop) -> None:

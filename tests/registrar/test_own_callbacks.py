@@ -120,6 +120,13 @@ def test_a_thread_that_a_callback_starts_for_it_waits_until_the_callback_has_ret
     assert len(served.unloads) == 1
 
 
+def test_a_callback_knows_the_name_of_its_resource(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "thing", lambda _request: rr.current().name)
+    assert app.load("provider/thing", {"device": "front"}).response == 'provider/thing {"device":"front"}'
+    long = app.load("provider/thing", "x" * 100).response
+    assert (len(long), long[:17]) == (60, 'provider/thing "x')
+
+
 @pytest.mark.parametrize("act", [close, unregister, stop, force])
 @pytest.mark.timeout(LIMIT_S)
 def test_a_status_callback_may_do_all_of_it(

@@ -165,6 +165,29 @@ def test_a_part_that_its_provider_took_away_is_replaced(robot: Robot) -> None:
     eventually(lambda: robot.is_of("arm", "second"))
 
 
+def test_a_status_of_the_resource_itself_may_be_the_occasion_to_replace_a_part_that_works(
+    robot: Robot, provider: rr.Registrar
+) -> None:
+    def replace_named(status: rr.Status) -> Any:
+        part = next(part for part in provider.children(robot.query.resource_id) if part.request == "first")
+        return provider.replace_part(status, "second", part=part, response=of)
+
+    robot.replace = replace_named
+    provider.send_status(robot.query.resource_id, FATAL)
+    assert robot.outcomes.wait()[0].request == "second"
+    update = robot.query.wait_status(timeout_s=LIMIT_S)
+    assert (update.state, robot.query.response) == (rr.State.UPDATE, "second")
+    assert update.message == "parts/lidar takes the place of parts/lidar: unplugged"
+    eventually(lambda: robot.is_of("arm", "second"))
+    robot.settled()
+    assert [status.state for status in robot.heard] == [rr.State.UPDATE, rr.State.OK]
+
+
+def test_a_named_part_that_is_not_held_is_an_error(robot: Robot, provider: rr.Registrar) -> None:
+    robot.replace = lambda status: provider.replace_part(status, "second", part="0" * 32)
+    assert isinstance(robot.fail(), rr.UnknownQuery)
+
+
 # -- what fails ----------------------------------------------------------------------------------------------------
 
 

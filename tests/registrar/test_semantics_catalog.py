@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.model.rows import Query
+from rr_actors.registrar.model.rows import ServedQuery
 from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.opening import read_rows
 from support import Calls, Workshop, catalog_path, eventually, read_catalog, serve
@@ -101,7 +101,7 @@ def test_save_on_modify_is_the_default(app: rr.Registrar, provider: rr.Registrar
     serve(provider, "thing")
     query = app.load("provider/thing", "x")
     path = catalog_path(state_dir, "provider")
-    assert [row.id for row in read_rows(path) if isinstance(row, Query)] == [query.id]
+    assert [row.id for row in read_rows(path) if isinstance(row, ServedQuery)] == [query.id]
     query.unload()
     assert read_rows(path) == []
     eventually(lambda: read_catalog(path, "queries") == [])

@@ -156,11 +156,31 @@ def test_a_broken_protocol_is_noticed_in_the_world_directed_at_it(name: str, mon
     assert kind_of(replay(seed, history, mutation(monkeypatch.setattr))) == broken
 
 
+NOTICED_BY = {
+    "priority not lowered when a holder leaves": 1125899906842812,
+    "a priority acknowledged and lost in a crash": 1125899906842784,
+    "lists compared by their ids alone": 4503599627370581,
+    "a priority lost with its link": 2251799813685319,
+    "what is needed left paused": 4503599627370573,
+    "a part in flight overlooked": 2251799813685323,
+    "lost without a word": 2251799813685327,
+    "no link for acknowledgements": 36,
+    "interrupted load not started clean": 281474976710689,
+    "parts of a failed load kept": 8796093022239,
+    "attempt stamp not checked in reconcile": 1125899906842644,
+    "what is on standby never paused": 4503599627370512,
+    "release written later": 14,
+}
+"""Of what few worlds notice, one that does. Where the worlds have changed since, all are searched again."""
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_protocol_is_noticed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     factory = MUTATIONS[name](monkeypatch.setattr)
+    if name in NOTICED_BY and run(NOTICED_BY[name], factory=factory).violation is not None:
+        return
     for number in range(WORLDS_FOR_A_MUTATION):
         for first in FIRSTS:
             outcome = run(first + number, factory=factory)

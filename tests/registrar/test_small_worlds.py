@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-import pytest
+from collections.abc import Callable
+from typing import Any
 
+import pytest
+from msgspec.structs import replace
+
+from rr_actors.managers.budgets.planner import Asked, Plan, Running, plan
+from simulation.budgets import Budget
 from simulation.explore import Walk, digest, picture, walk
+from simulation.oracle import Violation
 from simulation.sim_registrar import SimRegistrar
 from simulation.small_worlds import WORLDS, main, told
 from simulation.world import World
 from support_mutations import DIRECTED, MUTATIONS
 
-SMALLEST = ("at once", "errors", "lost link", "crash")
+SMALLEST = ("at once", "errors", "lost link", "crash", "budget")
 """Each has more than a thousand states."""
+
+ENOUGH = 1000
+"""States of each larger world: two minutes of one core for all of them. `make explore` goes on from there."""
 
 FOUND = {
     "reply before commit": ("at once", 8),
@@ -34,10 +44,10 @@ def test_every_history_of_a_small_world_keeps_every_promise(name: str) -> None:
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("name", [name for name in WORLDS if name not in SMALLEST])
 def test_a_larger_world_keeps_every_promise_as_far_as_it_is_walked(name: str) -> None:
-    done = walk(WORLDS[name], go_on=lambda so_far: so_far.states < 3000)
+    done = walk(WORLDS[name], go_on=lambda so_far: so_far.states < ENOUGH)
 
     assert done.violation is None, "\n".join(told(WORLDS[name], done))
-    assert done.ended or done.states >= 3000
+    assert done.ended or done.states >= ENOUGH
 
 
 @pytest.mark.parametrize("name", FOUND)
@@ -48,6 +58,41 @@ def test_a_broken_protocol_is_found_with_a_shortest_history(name: str, monkeypat
 
     assert done.violation is not None
     assert len(done.history) == steps
+
+
+def over(*given: Any) -> Plan:
+    """Admits who has to wait."""
+    made = plan(*given)
+    return Plan(admit=[*made.admit, *made.wait])
+
+
+def too_many(capacity: float, policy: Any, running: list[Running], asked: list[Asked]) -> Plan:
+    """Revokes somebody for each who asks, also for who fits."""
+    made = plan(capacity, policy, running, asked)
+    made.revoke = [share.id for share in running if not share.leaving][: len(asked)]
+    return made
+
+
+def of_equals(capacity: float, policy: Any, running: list[Running], asked: list[Asked]) -> Plan:
+    """Revokes what is as urgent as who asks."""
+    return plan(capacity, policy, running, [replace(one, priority=(one.priority or 0) + 1) for one in asked])
+
+
+def never(*given: Any) -> Plan:
+    """Has all wait."""
+    made = plan(*given)
+    return Plan(wait=[*made.admit, *made.wait])
+
+
+@pytest.mark.parametrize(
+    ("planner", "capacity", "name"),
+    [(over, 2.0, "sum"), (too_many, 4.0, "victims"), (of_equals, 2.0, "victims"), (never, 2.0, "waiting")],
+)
+def test_a_planner_of_budgets_with_a_defect_is_found(planner: Callable[..., Plan], capacity: float, name: str) -> None:
+    done = walk(WORLDS["budget"]._replace(budget=Budget(capacity, planner)))
+
+    assert isinstance(done.violation, Violation)
+    assert done.violation.kind == name
 
 
 def test_a_shortest_history_is_drawn_with_a_column_for_each_registrar(monkeypatch: pytest.MonkeyPatch) -> None:

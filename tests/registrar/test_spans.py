@@ -16,7 +16,7 @@ from rr_actors.registrar.model import digests
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Fetch, Fetched, Noticed
-from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Query, Resource, Row, State, content_of
+from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Resource, Row, ServedQuery, State, content_of
 
 HOLDS = (None, Hold.PENDING, Hold.HELD, Hold.HELD, Hold.HELD, Hold.OWED)
 PHASES = (None, Phase.LOADED, Phase.LOADED, Phase.LOADED, Phase.LOADING, Phase.UNLOADING, Phase.UNLOAD_FAILED)
@@ -42,7 +42,7 @@ def held(number: int, hold: Hold = Hold.HELD, response: bytes | None = b"1") -> 
 
 def served(number: int, phase: Phase = Phase.LOADED, state: State = State.OK, response: bytes = b"1") -> list[Row]:
     resource = Resource(f"r{number}", "cam", b"%d" % number, response, phase, state, "", 1)
-    return [resource, Query(f"q{number}", f"r{number}", "app", "", 0, number)]
+    return [resource, ServedQuery(f"q{number}", f"r{number}", "app", "", 0, number)]
 
 
 def known(consumer: Catalog, before: digests.Known | None = None) -> digests.Known:
@@ -141,7 +141,7 @@ class Looked(dict[str, Resource]):
 
 def test_whoever_holds_little_is_answered_by_looking_at_little() -> None:
     others = [row for number in range(2, 500) for row in served(number)]
-    rows = [msgspec.structs.replace(row, origin="other") if isinstance(row, Query) else row for row in others]
+    rows = [msgspec.structs.replace(row, origin="other") if isinstance(row, ServedQuery) else row for row in others]
     provider = Catalog("p", content_of([*served(1), *rows]), 2)
     provider.resources = Looked(provider.resources)
 

@@ -34,7 +34,7 @@ from rr_actors.registrar.model.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State, content_of
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, ServedQuery, State, content_of
 from support import Calls, Gate, eventually, serve
 from support_inside import actor_of
 
@@ -50,7 +50,7 @@ def held(id: str, hold: Hold) -> Held:
 
 ROWS = (
     Resource("r", "cam", b"front", b"feed", Phase.LOADED, State.OK, "", 1),
-    Query("served", "r", "app", "", 0, 1),
+    ServedQuery("served", "r", "app", "", 0, 1),
     held("mine", Hold.HELD),
     held("owed", Hold.OWED),
 )
@@ -121,6 +121,8 @@ AGAIN: list[Any] = [
     c.PauseErred("r", 1, WHY),
     c.ResumeDone("r", 1, None, "event"),
     c.ResumeErred("r", 1, WHY, "event"),
+    c.BeginProbe("r", "cam"),
+    c.ProbeDone("r"),
     c.BeginTrial("recover:r"),
     c.TrialOver("recover:r"),
     c.RefusalOver("request:cam:0"),

@@ -14,7 +14,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.model.rows import Query
+from rr_actors.registrar.model.rows import ServedQuery
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, catalog_path, eventually, serve
 from support_inside import actor_of
@@ -68,7 +68,7 @@ UNLOADS: dict[str, Unload] = {"by its thread": unload, "by the loop": unload_lat
 
 
 def on_disk(state_dir: Path) -> list[str]:
-    return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Query)]
+    return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, ServedQuery)]
 
 
 @pytest.mark.parametrize("way", LOADS)

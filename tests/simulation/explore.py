@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from rr_actors.registrar.model.catalog import Catalog, Server
+from simulation.budgets import Book, Budget
 from simulation.network import OLD
 from simulation.pending_steps import Key, Todo
 from simulation.quiescence import INDEXES, come_to_rest, finish
@@ -32,7 +33,7 @@ Factory = Callable[..., SimRegistrar]
 class Person(NamedTuple):
     """Somebody who asks one registrar for something, and then does these things with the query, in this order.
 
-    Each of `then` is a priority, "unload", or "owe": unload by a line of its own.
+    Each of `then` is a priority, "unload", or "owe": unload by a line of its own. `request`: what of.
     """
 
     registrar: str
@@ -40,6 +41,7 @@ class Person(NamedTuple):
     server: str
     then: tuple[int | str, ...] = ("unload",)
     direct: bool = False
+    request: bytes = b"p"
 
 
 class SmallWorld(NamedTuple):
@@ -56,6 +58,7 @@ class SmallWorld(NamedTuple):
         tires: how many people stop waiting.
         hasty: registrars that decide everything as it comes in.
         linked: whether those who ask have links to their providers before they do.
+        budget: what decides when a load of a share ends, and which shares are revoked.
     """
 
     layout: Mapping[str, tuple[Server, ...]]
@@ -68,6 +71,7 @@ class SmallWorld(NamedTuple):
     tires: int = 0
     hasty: frozenset[str] = frozenset()
     linked: bool = False
+    budget: Budget | None = None
 
 
 class Walk(NamedTuple):
@@ -93,6 +97,7 @@ class _Spent(NamedTuple):
     cuts: int = 0
     raises: int = 0
     tires: int = 0
+    book: Book = Book()
 
 
 class _Node(NamedTuple):
@@ -118,6 +123,8 @@ def walk(
             try:
                 world = pickle.loads(node.world)
                 world.apply(step)
+                if small.budget is not None:
+                    small.budget.check(world, spent.book)
                 mark = digest(world, spent)
                 if mark in met:
                     continue
@@ -195,8 +202,12 @@ def _arrives(world: World, consumer: str, provider: str, way: int) -> str:
 
 
 def _moves(world: World, small: SmallWorld, spent: _Spent) -> Iterator[tuple[Step, _Spent]]:
+    if small.budget is not None:
+        for step, book in small.budget.moves(world, spent.book):
+            yield step, spent._replace(book=book)
     for key in world.todo.keys:
-        yield from _goes_on(world, small, spent, key)
+        if small.budget is None or not small.budget.decides(key):
+            yield from _goes_on(world, small, spent, key)
     for number, person in enumerate(small.people):
         if (step := _next_of(person, number, spent.done[number])) is not None and _is_possible(world, step):
             done = (*spent.done[:number], spent.done[number] + 1, *spent.done[number + 1 :])
@@ -229,9 +240,10 @@ def _goes_on(world: World, small: SmallWorld, spent: _Spent, key: Key) -> Iterat
                 yield (*key, 1_000_000, fault), spent._replace(crashes=spent.crashes + 1)
     elif kind == "call":
         run = world.registrars[key[1]].runs[key]
-        part = small.parts.get(run.resource.server) if run.resource is not None else None
-        if key[2] in ("load", "reload") and part is not None and not run.subs:
-            yield (*key, "sub", *part, b"p"), spent
+        whole = run.resource
+        part = small.parts.get(whole.server) if whole is not None else None
+        if key[2] in ("load", "reload") and whole is not None and part is not None and not run.subs:
+            yield (*key, "sub", *part, whole.request), spent
         else:
             yield (*key, "ok"), spent
         if spent.raises < small.raises and key[2] != "hear":
@@ -249,7 +261,7 @@ def _goes_on(world: World, small: SmallWorld, spent: _Spent, key: Key) -> Iterat
 def _next_of(person: Person, number: int, done: int) -> Step | None:
     query_id = f"q{number}"
     if not done:
-        return ("load", query_id, person.registrar, person.provider, person.server, b"p", person.direct)
+        return ("load", query_id, person.registrar, person.provider, person.server, person.request, person.direct)
     if done > len(person.then):
         return None
     what = person.then[done - 1]

@@ -11,7 +11,7 @@ from typing import Any
 from rr_actors.registrar.core.callback_runs import is_given_up
 from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import STANDBY, Content, Hold, Notice, Phase, Query, Resource, State, rows_of
+from rr_actors.registrar.model.rows import STANDBY, Content, Hold, Notice, Phase, Resource, ServedQuery, State, rows_of
 from rr_actors.tools.inspection import Contents
 from rr_actors.tools.inspection import check as inspect
 from simulation.oracle import Violation
@@ -90,7 +90,7 @@ def check_revocations(world: World) -> None:
                 raise Violation("revocations", f"{registrar.name}: {id} is revoked, and nothing hinders its unload")
 
 
-def _waits(world: World, query: Query) -> bool:
+def _waits(world: World, query: ServedQuery) -> bool:
     consumer = world.registrars[query.origin]
     whole = consumer.catalog.resources.get(query.parent)
     if consumer.state != "up" or query.origin in world.retired | world.left:

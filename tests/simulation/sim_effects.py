@@ -164,6 +164,10 @@ def _happened(shell: SimShell, effect: e.Happened) -> None:
     shell.world.note(f"{shell.name}: {effect.what} {effect.resource.id} {effect.detail}")
 
 
+def _start_probe(shell: SimShell, effect: e.StartProbe) -> None:
+    shell.world.note(f"{shell.name}: probes {effect.resource_id}")
+
+
 def _died(shell: SimShell, effect: e.Died) -> None:
     shell.world.note(f"{shell.name}: its last process died in {'; '.join(effect.runs)}")
 
@@ -175,6 +179,7 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.StartLoad: _start_load,
     e.StartUnload: _start_unload,
     e.StartRecover: _start_recover,
+    e.StartProbe: _start_probe,
     e.StartPause: _start_pause,
     e.StartResume: _start_resume,
     e.StartStatus: _start_status,

@@ -23,8 +23,8 @@ from rr_actors.registrar.model.rows import (
     Notice,
     Phase,
     Put,
-    Query,
     Resource,
+    ServedQuery,
     is_own,
 )
 from simulation.oracle import Violation
@@ -148,7 +148,7 @@ class SimRegistrar(SimShell):
                         ledger.refused.add(row.id)
                 elif type(row) is Resource and row.phase is Phase.UNLOAD_FAILED:
                     ledger.given_up_unload(self.name, row.id, died=is_given_up(self.catalog, "unload", row.id))
-                elif type(row) is Query:
+                elif type(row) is ServedQuery:
                     ledger.begun(row.id)
                     ledger.on[row.id] = row.resource_id
                     self.begun.add(row.id)
@@ -181,7 +181,7 @@ class SimRegistrar(SimShell):
                 raise Violation("statuses", f"{row} is on its way, and its own server has not dealt with it")
         for notice in own:
             if notice.resource_id in tables["resources"]:
-                queries = [cast("Query", row) for row in tables["queries"].values()]
+                queries = [cast("ServedQuery", row) for row in tables["queries"].values()]
                 on_it = [q.id for q in queries if q.resource_id == notice.resource_id and q.id not in self.begun]
                 passed_over = is_given_up(self.catalog, "status", notice.resource_id)
                 self.world.ledger.own_dealt_with(notice, on_it, passed_over)
@@ -234,7 +234,7 @@ class SimRegistrar(SimShell):
         self.catalog.set("queries", query.id, query)
         return loading.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
-    def _joined(self, load: Load, fault: str) -> Query | None:
+    def _joined(self, load: Load, fault: str) -> ServedQuery | None:
         """The row, on disk; None if it is to be decided as any load."""
         query = loading.join(self.catalog, load)
         if query is None or self.inbox:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.rows import STANDBY
+from simulation.budgets import Budget
 from simulation.explore import Person, SmallWorld, Walk, picture, walk
 
 _WHOLE, _PART = Person("a", "r", "whole"), Person("b", "r", "part")
@@ -32,6 +33,19 @@ _ONE = SmallWorld({"a": (), "r": _SERVERS}, _PARTS, (_WHOLE,), hasty=frozenset("
 """One consumer, with the whole."""
 _LEAST = SmallWorld({"a": (), "r": _SERVERS}, {}, (Person("a", "r", "part"),), hasty=frozenset("ar"), linked=True)
 """One consumer, with something that has no parts."""
+_LAMP, _FAN = (Person("a", "budgets", "share", (STANDBY,), request=each) for each in (b"2 lamp", b"2 fan"))
+_PUMP = Person("a", "budgets", "share", request=b"2 pump")
+_SHARES = SmallWorld(
+    {"a": (), "budgets": (Server("share"),)},
+    {},
+    (_LAMP, _FAN, _PUMP),
+    hasty=frozenset(("a", "budgets")),
+    linked=True,
+    budget=Budget(4.0),
+)
+"""Three shares of two, where there is room for two. The lamp and the fan are not needed later, the pump is."""
+_HOUSE = {"a": (), "house": (Server("device"),), "budgets": (Server("share"),)}
+_DEVICES = tuple(each._replace(provider="house", server="device") for each in (_LAMP, _PUMP))
 _DIRECT = tuple(each._replace(then=("owe",), direct=True) for each in _BOTH)
 
 WORLDS = {
@@ -63,6 +77,15 @@ WORLDS = {
     "direct lines": _TWO._replace(people=_DIRECT, linked=True),
     "direct lines and errors": _LEAST._replace(
         people=(Person("a", "r", "part", ("owe",), direct=True),), crashes=1, tires=1, raises=1
+    ),
+    "budget": _SHARES._replace(people=(_LAMP, _PUMP), budget=Budget(2.0)),
+    "budget for two": _SHARES,
+    "budget of wholes": _SHARES._replace(
+        layout=_HOUSE,
+        parts={"device": ("budgets", "share")},
+        people=_DEVICES,
+        budget=Budget(2.0),
+        hasty=frozenset(_HOUSE),
     ),
     "crash with two holders": _TWO._replace(
         people=(Person("a", "r", "part"), Person("b", "r", "part")), parts={}, crashes=1, linked=True

@@ -19,7 +19,7 @@ import rr_actors as rr
 from fuzz import damage
 from rr_actors.base.errors import CatalogDamaged, CatalogLocked
 from rr_actors.base.folder import Folder
-from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, rows_of
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, ServedQuery, rows_of
 from rr_actors.registrar.model.store import Store
 from rr_actors.storage import opening
 from rr_actors.storage.catalog_lock import Reached
@@ -50,7 +50,7 @@ def test_the_sample_would_find_silence(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def committed(number: int) -> list[Change]:
-    return [Put(Query(f"q{number:03}", "r" * 500, "app", "", 1, number))]
+    return [Put(ServedQuery(f"q{number:03}", "r" * 500, "app", "", 1, number))]
 
 
 def left_by(place: Path, durability: Durability, *, folded: int = 40, more: int = 5) -> Path:

@@ -35,7 +35,7 @@ from rr_actors.managers.components import read_registry
 from rr_actors.managers.robots import read_robots
 from rr_actors.registrar.links import remote_calls
 from rr_actors.registrar.model.messages import Message
-from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Put, Query, Resource, Row, State, rows_of
+from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Put, Resource, Row, ServedQuery, State, rows_of
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.supervision import control_channel
 from rr_actors.supervision.core.specs import Supervisor
@@ -277,7 +277,7 @@ def rows() -> list[Row]:
     found: list[Row] = [Peer("maker")]
     for n in range(40):
         found.append(Resource(f"r{n:02}", "thing", b"q" * n, b"a", Phase.LOADED, State.OK, "", 1))
-        found.append(Query(f"q{n:02}", f"r{n:02}", "app", "", 1, n))
+        found.append(ServedQuery(f"q{n:02}", f"r{n:02}", "app", "", 1, n))
         held = Held(f"h{n:02}", "maker", "thing", b"q" * n, b"a", f"r{n:02}", "", 1, n, Hold.HELD, State.OK)
         found.append(held)
     return found

@@ -28,7 +28,7 @@ from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import Folder
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, rows_of
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, ServedQuery, rows_of
 from rr_actors.registrar.model.store import Store
 from rr_actors.storage import journaled_store, opening
 from rr_actors.storage import journaled_store as journaled_module
@@ -195,7 +195,7 @@ def test_a_store_that_is_closed_takes_nothing_and_tidies_nothing(path: Path) -> 
     """A worker may be late."""
     for durability in ("process", "power"):
         store = open_store(path, durability=durability)
-        store.commit([Put(Query(f"{n}", "r" * 4000, "app", "", 1, n)) for n in range(1000)])
+        store.commit([Put(ServedQuery(f"{n}", "r" * 4000, "app", "", 1, n)) for n in range(1000)])
         store.close(erase=True)
         store.tidy()
         with pytest.raises(CatalogError, match="closed"):
@@ -766,7 +766,7 @@ def test_a_row_that_sqlite_would_not_take_is_not_acknowledged(path: Path, monkey
 def test_a_row_of_20_megabytes_and_a_commit_of_100_000_changes_go_the_same_way(path: Path) -> None:
     store = journaled(path)
     huge = part("huge", os.urandom(20_000_000))
-    many: list[Row] = [Query(f"{n:06}", "r", "app", "", 1, n) for n in range(100_000)]
+    many: list[Row] = [ServedQuery(f"{n:06}", "r", "app", "", 1, n) for n in range(100_000)]
     store.commit([Put(huge)])
     store.commit([Put(row) for row in many])
     copy = left_by(path)
@@ -803,7 +803,7 @@ def test_threads_commit_while_others_fold_and_load(path: Path) -> None:
             for rows in (rows_of(store.load()), read_rows(path)):
                 by_name: dict[str, set[int]] = {}
                 for row in rows:
-                    assert isinstance(row, Query)
+                    assert isinstance(row, ServedQuery)
                     by_name.setdefault(row.id[0], set()).add(row.seq)
                 wrong.extend(seqs for seqs in by_name.values() if len(seqs) > 1)
 
@@ -826,7 +826,7 @@ def test_threads_commit_while_others_fold_and_load(path: Path) -> None:
 
 COMMITTER = """
 import sys, threading
-from rr_actors.registrar.model.rows import Drop, Put, Query, rows_of
+from rr_actors.registrar.model.rows import Drop, Put, ServedQuery, rows_of
 from rr_actors.storage.opening import open_store
 store = open_store(sys.argv[1])
 def fold():
@@ -838,7 +838,7 @@ sys.setswitchinterval(1e-4)
 print(n, flush=True)
 while True:
     n += 1
-    changes = [Put(Query(f"{n}-{i}", "r" * (n % 7 * 300), "app", "", 1, n)) for i in range(20)]
+    changes = [Put(ServedQuery(f"{n}-{i}", "r" * (n % 7 * 300), "app", "", 1, n)) for i in range(20)]
     if n > 3:
         changes += [Drop("queries", f"{n - 3}-{i}") for i in range(20)]
     store.commit(changes)
@@ -848,11 +848,11 @@ while True:
 
 def expected_of(last: int) -> list[Row]:
     batches = range(max(1, last - 2), last + 1)
-    return in_order(Query(f"{n}-{i}", "r" * (n % 7 * 300), "app", "", 1, n) for n in batches for i in range(20))
+    return in_order(ServedQuery(f"{n}-{i}", "r" * (n % 7 * 300), "app", "", 1, n) for n in batches for i in range(20))
 
 
 def last_of(rows: list[Row]) -> int:
-    return max((row.seq for row in rows if isinstance(row, Query)), default=0)
+    return max((row.seq for row in rows if isinstance(row, ServedQuery)), default=0)
 
 
 @pytest.mark.slow

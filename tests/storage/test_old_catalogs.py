@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.model.rows import Query
+from rr_actors.registrar.model.rows import ServedQuery
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sql_tables import OLDEST_VERSION, SCHEMA, SCHEMA_VERSION
 from support_cli import run_cli
@@ -67,7 +67,7 @@ def test_an_old_catalog_is_migrated_when_it_is_opened_and_not_when_it_is_read(ol
     rows = read_rows(catalog)
     after = {path.name: path.read_bytes() for path in catalog.parent.iterdir() if not path.name.endswith("-shm")}
     assert before == after
-    assert len([row for row in rows if isinstance(row, Query)]) == 3
+    assert len([row for row in rows if isinstance(row, ServedQuery)]) == 3
     store = open_store(catalog)
     content = store.load()
     store.close()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Query, Resource, State, rows_of
+from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Resource, ServedQuery, State, rows_of
 from rr_actors.registrar.model.store import Store
 from rr_actors.storage import sqlite_store
 from rr_actors.storage.opening import Durability, open_store, read_rows
@@ -31,7 +31,7 @@ def put(number: int) -> list[Change]:
     id_ = f"{number:032}"
     return [
         Put(Resource(id_, "thing", b"x" * 40, b"y" * 40, Phase.LOADED, State.OK, "", 1)),
-        Put(Query(id_, id_, "app", "", 1, number)),
+        Put(ServedQuery(id_, id_, "app", "", 1, number)),
     ]
 
 

@@ -28,7 +28,7 @@ from hypothesis import HealthCheck, given, settings
 from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked, CatalogVersion
 from rr_actors.base.pickling import dumps, loads
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, content_of, rows_of
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, ServedQuery, content_of, rows_of
 from rr_actors.registrar.model.store import MemoryStore, Store
 from rr_actors.storage.checked_records import errors_named
 from rr_actors.storage.opening import open_store, read_rows
@@ -319,14 +319,14 @@ def test_both_durabilities_write_the_same(catalog: FileDisk, durability: str) ->
 
 COMMITTER = """
 import sys
-from rr_actors.registrar.model.rows import Drop, Put, Query, rows_of
+from rr_actors.registrar.model.rows import Drop, Put, ServedQuery, rows_of
 from rr_actors.storage.opening import open_store
 store = open_store(sys.argv[1], durability=sys.argv[2])
 n = max((row.seq for row in rows_of(store.load())), default=0)
 print(n, flush=True)
 while True:
     n += 1
-    changes = [Put(Query(f"{n}-{i}", "r" * 500, "app", "", 1, n)) for i in range(20)]
+    changes = [Put(ServedQuery(f"{n}-{i}", "r" * 500, "app", "", 1, n)) for i in range(20)]
     if n > 3:
         changes += [Drop("queries", f"{n - 3}-{i}") for i in range(20)]
     store.commit(changes)
@@ -352,13 +352,13 @@ sys.stdin.read()
 OPENER = """
 import itertools, sys
 from rr_actors.base.errors import CatalogLocked
-from rr_actors.registrar.model.rows import Put, Query, rows_of
+from rr_actors.registrar.model.rows import Put, ServedQuery, rows_of
 from rr_actors.storage.opening import open_store
 print("go", flush=True)
 for n in itertools.count():
     store = open_store(f"{sys.argv[1]}/{n % 7}/catalog.sqlite3")
     assert len(rows_of(store.load())) in (0, 1), rows_of(store.load())
-    store.commit([Put(Query("a", "", "", "", 1, n))])
+    store.commit([Put(ServedQuery("a", "", "", "", 1, n))])
     store.close(erase=n % 3 != 0)
 """
 
@@ -406,10 +406,10 @@ def test_a_process_killed_while_it_commits_leaves_all_of_a_commit_or_none(
         copy = FileDisk(catalog.path.parent.parent / f"copy{epoch}")
         shutil.copytree(catalog.path.parent, copy.path.parent)
         store = copy.open()
-        last = max((row.seq for row in rows_of(store.load()) if isinstance(row, Query)), default=0)
+        last = max((row.seq for row in rows_of(store.load()) if isinstance(row, ServedQuery)), default=0)
         assert last in (acknowledged, acknowledged + 1)
         batches = range(max(1, last - 2), last + 1)
-        expected = [Query(f"{n}-{i}", "r" * 500, "app", "", 1, n) for n in batches for i in range(20)]
+        expected = [ServedQuery(f"{n}-{i}", "r" * 500, "app", "", 1, n) for n in batches for i in range(20)]
         assert content(store) == in_order(expected)
         assert store.epoch == epoch + 1
         store.close()
@@ -721,7 +721,7 @@ def test_tidying_beside_commits_keeps_the_wal_small_and_loses_nothing(power: Fil
     wal = path.with_name(path.name + "-wal")
     largest = tidied = 0
     for number in range(3000):
-        store.commit([Put(Query(f"{number % 1000:032x}", "r", "app", "", 1, number))])
+        store.commit([Put(ServedQuery(f"{number % 1000:032x}", "r", "app", "", 1, number))])
         if store.wants_tidying():
             tidier = threading.Thread(target=store.tidy)
             tidier.start()
@@ -731,7 +731,7 @@ def test_tidying_beside_commits_keeps_the_wal_small_and_loses_nothing(power: Fil
     store.close()
     assert tidied >= 2
     assert largest < 6 * 2**20
-    assert {row.id: row.seq for row in read_rows(path) if isinstance(row, Query)} == {
+    assert {row.id: row.seq for row in read_rows(path) if isinstance(row, ServedQuery)} == {
         f"{n % 1000:032x}": n for n in range(2000, 3000)
     }
 

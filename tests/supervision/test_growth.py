@@ -13,7 +13,17 @@ from rr_actors.actors.actor import Actor
 from rr_actors.supervision.core import child_calls, restarts
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Strategy, Supervisor
-from rr_actors.supervision.core.state import Action, Child, Decision, Exit, Phase, StartChild, StopChild, Tree, Why
+from rr_actors.supervision.core.state import (
+    Action,
+    Decision,
+    Exit,
+    Phase,
+    StartChild,
+    StopChild,
+    SupervisedChild,
+    SupervisorState,
+    Why,
+)
 from rr_actors.supervision.event_history import KEPT, History, Record
 from support_steps import steps_of
 
@@ -23,19 +33,19 @@ SPEC = ChildSpec(Actor, id="c")
 KILLED, DONE = Exit("killed"), Exit("shutdown")
 
 
-def running(count: int, strategy: Strategy) -> tuple[Tree, str]:
+def running(count: int, strategy: Strategy) -> tuple[SupervisorState, str]:
     """Return a supervisor of so many running children, and the id of the last one."""
     dynamic = strategy == "simple_one_for_one"
     specs = [SPEC] if dynamic else [ChildSpec(Actor, id=f"c-{n}") for n in range(1, count + 1)]
     spec = Supervisor(specs, strategy=strategy, max_restarts=1_000_000)
-    tree, actions = restarts.decide_start(Tree.of(spec), now=0.0)
+    tree, actions = restarts.decide_start(SupervisorState.of(spec), now=0.0)
     for n in range(count if dynamic else 0):
         tree, more = child_calls.start_child(tree, [], n, 0.0)
         actions += more
     return settled(tree, actions), f"c-{count}"
 
 
-def settled(tree: Tree, actions: Sequence[Action]) -> Tree:
+def settled(tree: SupervisorState, actions: Sequence[Action]) -> SupervisorState:
     """Do the starts and stops that the actions ask for, and those that follow from them."""
     for action in (left := list(actions)):
         more: Sequence[Action] = ()
@@ -47,35 +57,35 @@ def settled(tree: Tree, actions: Sequence[Action]) -> Tree:
     return tree
 
 
-def killed(tree: Tree, id: str) -> Decision:
+def killed(tree: SupervisorState, id: str) -> Decision:
     return restarts.decide_exit(tree, id, tree.children[id].run, KILLED, 1.0)
 
 
-def terminated(tree: Tree, id: str) -> Decision:
+def terminated(tree: SupervisorState, id: str) -> Decision:
     return child_calls.terminate_child(tree, id, "caller", 1.0)
 
 
-def terminated_and_restarted(tree: Tree, id: str) -> Decision:
+def terminated_and_restarted(tree: SupervisorState, id: str) -> Decision:
     return child_calls.restart_child(settled(*terminated(tree, id)), id, "caller", 1.0)
 
 
-def added(tree: Tree, _: str) -> Decision:
+def added(tree: SupervisorState, _: str) -> Decision:
     return child_calls.start_child(tree, [] if tree.dynamic else ChildSpec(Actor, id="new"), "caller", 1.0)
 
 
-def unknown(tree: Tree, _: str) -> Decision:
+def unknown(tree: SupervisorState, _: str) -> Decision:
     return child_calls.terminate_child(tree, "nobody", "caller", 1.0)
 
 
-def late(tree: Tree, id: str) -> Decision:
+def late(tree: SupervisorState, id: str) -> Decision:
     return restarts.decide_stopped(tree, id, 0, DONE, 1.0)
 
 
-def uncounted(tree: Tree, id: str) -> Decision:
+def uncounted(tree: SupervisorState, id: str) -> Decision:
     return restarts.decide_uncounted(tree, id, tree.children[id].run)
 
 
-DECISIONS: tuple[Callable[[Tree, str], Decision], ...] = (
+DECISIONS: tuple[Callable[[SupervisorState, str], Decision], ...] = (
     killed,
     terminated,
     terminated_and_restarted,
@@ -86,7 +96,7 @@ DECISIONS: tuple[Callable[[Tree, str], Decision], ...] = (
 )
 
 
-def cost(decide: Callable[[Tree, str], Decision], count: int, strategy: Strategy) -> tuple[int, int]:
+def cost(decide: Callable[[SupervisorState, str], Decision], count: int, strategy: Strategy) -> tuple[int, int]:
     """Return the steps of a decision with what follows from it, and the most bytes that it needs at a time."""
     tree, id = running(count, strategy)
     steps, _ = steps_of(lambda: settled(*decide(tree, id)))
@@ -109,7 +119,7 @@ def cost(decide: Callable[[Tree, str], Decision], count: int, strategy: Strategy
     ],
 )
 def test_a_decision_costs_with_many_children_what_it_costs_with_few(
-    decide: Callable[[Tree, str], Decision], strategy: Strategy
+    decide: Callable[[SupervisorState, str], Decision], strategy: Strategy
 ) -> None:
     few, few_bytes = cost(decide, FEW, strategy)
     many, many_bytes = cost(decide, MANY, strategy)
@@ -157,19 +167,19 @@ IDS = ("a", "b", "c", "d")
 
 
 @st.composite
-def changes(draw: st.DrawFn) -> tuple[int, str, Child | None]:
+def changes(draw: st.DrawFn) -> tuple[int, str, SupervisedChild | None]:
     """Draw which version is changed, the id of a child, and what is put there; None removes it."""
     significant = draw(st.booleans())
     spec = ChildSpec(Actor, id="x", restart="temporary", significant=significant)
-    child = Child("x", spec, phase=draw(st.sampled_from(Phase)), why=draw(st.sampled_from(Why)))
+    child = SupervisedChild("x", spec, phase=draw(st.sampled_from(Phase)), why=draw(st.sampled_from(Why)))
     return draw(st.integers(0, 30)), draw(st.sampled_from(IDS)), draw(st.sampled_from((child, child, None)))
 
 
 @given(st.lists(changes(), max_size=30), st.lists(st.integers(0, 30), max_size=10))
 def test_each_version_of_children_stays_what_it_was_whichever_is_changed_or_read(
-    steps: list[tuple[int, str, Child | None]], reads: list[int]
+    steps: list[tuple[int, str, SupervisedChild | None]], reads: list[int]
 ) -> None:
-    versions: list[tuple[Children, dict[str, Child]]] = [(Children({}), {})]
+    versions: list[tuple[Children, dict[str, SupervisedChild]]] = [(Children({}), {})]
     for which, id, child in steps:
         children, model = versions[which % len(versions)]
         if child is None:

@@ -21,7 +21,7 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.specs import Backoff
-from rr_actors.supervision.heartbeat import Health, Heartbeat
+from rr_actors.supervision.heartbeat import Heartbeat, ProcessHealth
 from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_gone, wait_respawned
 from support_children import hear
 
@@ -145,7 +145,7 @@ def test_a_manager_that_has_lost_what_it_needs_is_replaced(start: Start, what: s
 
 
 def test_what_a_new_process_would_suffer_from_as_well_is_no_trouble(tmp_path: Path) -> None:
-    missing = Health(lambda: [tmp_path / "missing"])
+    missing = ProcessHealth(lambda: [tmp_path / "missing"])
     assert missing.trouble() == ""
     missing._root = tmp_path.stat()
     assert "another root directory" in missing.trouble()

@@ -18,7 +18,7 @@ from rr_actors.base.errors import (
 from rr_actors.supervision.core import child_calls, restarts
 from rr_actors.supervision.core.child_calls import count_children, get_childspec, update_child, which_children
 from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
-from rr_actors.supervision.core.state import Exit, Mode, StartChild, Tree
+from rr_actors.supervision.core.state import Exit, Mode, StartChild, SupervisorState
 from support_simulated import Thing, World, child, world
 
 
@@ -516,7 +516,7 @@ def test_ids_of_dynamic_children_are_never_used_again_nor_longer_than_an_id_may_
     assert made.answer("start_child", []) == "x" * 40 + "-2"
 
     later = World(made.tree.spec)
-    later.tree = Tree.of(made.tree.spec, generation="g2")
+    later.tree = SupervisorState.of(made.tree.spec, generation="g2")
     later.start()
     assert later.answer("start_child", []) == "x" * 40 + "-g2.1"
     later.answer("terminate_child", "x" * 40 + "-g2.1")
@@ -554,7 +554,9 @@ def test_ten_thousand_dynamic_children_are_no_trouble() -> None:
     for n in range(300):
         made.answer("start_child", [n])
     children = {f"y-{n}": made.tree.children["x-1"] for n in range(10_000)}
-    tree = Tree(made.tree.spec, "root", Mode.RUNNING, {**made.tree.children, **children}, last_run=made.tree.last_run)
+    tree = SupervisorState(
+        made.tree.spec, "root", Mode.RUNNING, {**made.tree.children, **children}, last_run=made.tree.last_run
+    )
     tree, actions = restarts.decide_exit(tree, "x-7", tree.children["x-7"].run, Exit("killed"), 0.0)
     assert [action.id for action in actions if isinstance(action, StartChild)] == ["x-7"]
 
@@ -583,7 +585,9 @@ def test_the_backoff_starts_over_when_it_has_been_up_for_as_long_as_the_longest_
         assert made.starts["a"].delay_s == expected
         made.finish_start("a")
         assert made.alive
-        made.tree = Tree(**{**{f: getattr(made.tree, f) for f in Tree.__struct_fields__}, "restarts": ()})
+        made.tree = SupervisorState(
+            **{**{f: getattr(made.tree, f) for f in SupervisorState.__struct_fields__}, "restarts": ()}
+        )
 
 
 def test_the_jitter_is_the_callers_chance() -> None:
@@ -761,7 +765,7 @@ def test_a_nested_supervisor_that_was_updated_starts_by_its_new_specification() 
     started = made.starts["inner"].spec
     assert [spec.id for spec in started.actor_class_or_manager.child_specs] == ["x", "y"]  # type: ignore[union-attr]
     assert started.restart == "transient"
-    again = Tree.of(made.tree.spec)  # what its own parent would start next time
+    again = SupervisorState.of(made.tree.spec)  # what its own parent would start next time
     assert again.children["inner"].spec == started
 
 
@@ -801,7 +805,7 @@ def test_a_start_is_refused_with_the_reason_when_the_id_is_taken_by_one_being_re
 def test_decisions_never_change_the_tree_they_are_given() -> None:
     made = world(child("a"), child("b"), strategy="one_for_all")
     before = made.tree
-    copy = Tree(**{name: getattr(before, name) for name in Tree.__struct_fields__})
+    copy = SupervisorState(**{name: getattr(before, name) for name in SupervisorState.__struct_fields__})
     copy_of_children = dict(before.children)
     restarts.decide_exit(before, "a", before.children["a"].run, Exit("killed"), 1.0)
     restarts.decide_stop(before, 1.0)

@@ -349,23 +349,35 @@ if __name__ == "__main__":
     assert runs(tmp_path) == ["[]", SERVER_RUN]
 
 
+BOTH_FORMS = """
+optional = ["numpy", "IPython", "matplotlib", "pytest", "nicegui", "rich", "pygments", "PIL", "opentelemetry", "yaml"]
+found = Analysis(["app.py"], excludes=optional)
+modules = PYZ(found.pure)
+alone = EXE(modules, found.scripts, [], exclude_binaries=True, name="app")
+COLLECT(alone, found.binaries, found.datas, name="folder")
+EXE(modules, found.scripts, found.binaries, found.datas, [], name="single")
+"""
+"""A program with its libraries beside it, and one that is a single file."""
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-@pytest.mark.parametrize("form", ["--onedir", "--onefile"])
-def test_a_program_that_pyinstaller_has_frozen_runs(tmp_path: Path, form: str) -> None:
+def test_a_program_that_pyinstaller_has_frozen_runs_in_both_its_forms(tmp_path: Path) -> None:
     pytest.importorskip("PyInstaller")
     (tmp_path / "app.py").write_text(APP)
     (tmp_path / "others.py").write_text(CLASSES)
-    without = [f"--exclude-module={name}" for name in ("numpy", "IPython", "matplotlib", "pytest", "nicegui")]
-    command = [sys.executable, "-m", "PyInstaller", "--log-level=ERROR", form, *without, "app.py"]
+    (tmp_path / "app.spec").write_text(BOTH_FORMS)
+    command = [sys.executable, "-m", "PyInstaller", "--log-level=ERROR", "app.spec"]
     subprocess.run(command, cwd=tmp_path, check=True, timeout=300)
-    (program,) = [path for path in (tmp_path / "dist" / "app", tmp_path / "dist" / "app" / "app") if path.is_file()]
-    for name in ("rr_actors", "others.py"):
-        assert not (program.parent / name).exists()  # nothing but what was frozen
-    ran = subprocess.run([program], cwd=tmp_path, timeout=LIMIT_S, capture_output=True, text=True, check=False)
-    assert ran.stdout == "open one open two\n", ran.stderr
-    assert runs(tmp_path) == ["[]", SERVER_RUN]
-    assert (tmp_path / "mains").read_text() == "main\n"
+    for program in (tmp_path / "dist" / "folder" / "app", tmp_path / "dist" / "single"):
+        for name in ("rr_actors", "others.py"):
+            assert not (program.parent / name).exists()  # nothing but what was frozen
+        where = tmp_path / f"run of {program.name}"
+        where.mkdir()
+        ran = subprocess.run([program], cwd=where, timeout=LIMIT_S, capture_output=True, text=True, check=False)
+        assert ran.stdout == "open one open two\n", ran.stderr
+        assert runs(where) == ["[]", SERVER_RUN]
+        assert (where / "mains").read_text() == "main\n"
 
 
 # -- the terminal ----------------------------------------------------------------------------------------------------

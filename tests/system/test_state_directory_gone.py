@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.hosting import run_files
-from rr_actors.hosting.run_files import Keeper
+from rr_actors.hosting.run_files import RunKeeper
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.specs import Backoff
 from support import eventually, kill, pid_of, wait_respawned
@@ -146,10 +146,10 @@ def test_a_manager_that_is_respawned_meanwhile_waits_and_is_itself_when_the_dire
 def test_the_log_says_once_that_the_directory_is_gone_and_does_not_contradict_itself(
     state: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looks: list[Keeper] = []
-    look = Keeper.look
+    looks: list[RunKeeper] = []
+    look = RunKeeper.look
 
-    async def counted(keeper: Keeper) -> None:
+    async def counted(keeper: RunKeeper) -> None:
         await look(keeper)
         looks.append(keeper)
 
@@ -158,7 +158,7 @@ def test_the_log_says_once_that_the_directory_is_gone_and_does_not_contradict_it
         eventually(lambda: len(looks) >= count)
 
     monkeypatch.setattr(run_files, "LOOK_S", 0.02)
-    monkeypatch.setattr(Keeper, "look", counted)
+    monkeypatch.setattr(RunKeeper, "look", counted)
 
     def said() -> list[str]:
         return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]

@@ -17,7 +17,7 @@ import rr_actors as rr
 from rr_actors.actors.remote.hub import ActorHub
 from rr_actors.base.steps import Steps
 from rr_actors.hosting import run_files
-from rr_actors.hosting.run_files import Keeper
+from rr_actors.hosting.run_files import RunKeeper
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -62,7 +62,7 @@ SYNC: list[tuple[type[Any], str]] = [
     (StateDir, "_clear"),
     (StateDir, "close"),
     (Subscribers, "leave"),
-    (Keeper, "stop"),
+    (RunKeeper, "stop"),
     (Directory, "mark"),
     (Directory, "close"),
     (RegistrarActor, "close"),

@@ -21,6 +21,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.wire.segments import PAGE_BYTES
 from support import TESTS, eventually
 
 Start = Callable[..., rr.System]
@@ -445,6 +446,25 @@ def test_loans_take_the_memory_of_the_frames_in_use_and_no_more(start: Start) ->
     assert cameras.shared_bytes().get() < 3 * MB
     for reader in readers:
         reader.close()
+
+
+def test_the_memory_of_frames_is_given_back_when_a_stream_is_idle(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.wire.segments.IDLE_S", 0.02)
+    system = start(rr.ChildSpec(Cameras, id="cameras", placement="thread"))
+    camera = system.open_registrar("app").load(Cameras.open_camera, "front")
+    cameras = system.ref("cameras").proxy()
+    with read(system, camera, keep="all") as frames:
+        cameras.publish_buffers(2**22, 1, 2).get()
+        next(frames)
+        held = next(frames)
+        eventually(lambda: cameras.shared_bytes().get() < 2**22 + 2**16)  # the page of the head, and what is held
+        assert bytes(held.value) == bytes([2]) * 2**22
+        del held
+        eventually(lambda: cameras.shared_bytes().get() <= PAGE_BYTES)
+        cameras.publish_buffers(2**22, 3).get()
+        assert bytes(next(frames).value) == bytes([3]) * 2**22
 
 
 @pytest.mark.parametrize(

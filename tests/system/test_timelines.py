@@ -181,6 +181,14 @@ def test_marks_that_are_too_close_are_one_that_has_the_worst_kind_and_counts() -
     assert (again.kind, again.count, again.counts) == ("killed", 4, {"killed": 1, "lost": 1, "loaded": 2})
 
 
+def test_a_mark_with_a_count_beside_it_needs_more_room() -> None:
+    marks = [Mark(at, "loaded", "") for at in (0.0, 0.5, 1.5, 4.0)] + [Mark(4.5, "killed", "")]
+
+    assert [(mark.count, mark.label) for mark in merged_marks(marks, 1.0)] == [(2, "2"), (1, ""), (2, "+")]
+    assert [(mark.count, mark.label) for mark in merged_marks(marks, 1.0, 1.0)] == [(3, "3"), (2, "+")]
+    assert Mark(0.0, "killed", "", 12_500, {"killed": 12_000, "loaded": 500}).label == "12k+"
+
+
 def test_lives_that_are_too_short_are_one_bar_that_counts_them() -> None:
     lives = [Bar(number / 10, number / 10 + 0.05) for number in range(10)]
 

@@ -98,4 +98,14 @@ def test_chaos_with_as_little_patience_finds_nothing_where_nothing_is_broken(tmp
 def test_there_are_twenty_breakages_of_every_part() -> None:
     parts = {breakage.where for breakage in BREAKAGES.values()}
     assert len(BREAKAGES) >= 20
-    assert parts >= {"journal", "commit order", "recovery", "sweep", "fencing", "supervision"}
+    assert parts >= {
+        "journal",
+        "commit order",
+        "recovery",
+        "sweep",
+        "fencing",
+        "supervision",
+        "actions",
+        "choices",
+        "keeper",
+    }

@@ -20,7 +20,7 @@ from typing import Any, cast
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, Row, State
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, Row, ServedQuery, State
 from rr_actors.testing.callback_log import Journal, Line, check_journal, read_journal
 from rr_actors.testing.invariants import check_at_rest, check_empty, check_told
 from rr_actors.testing.load_threads import Consumer, Sent
@@ -44,7 +44,8 @@ def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
     assert report.kills >= 8
     assert sum(report.operations.values()) > 50
     assert sum(report.callbacks.values()) > 50
-    assert (report.catalogs, report.catalogs_damaged) == (12, 0)
+    assert report.catalogs >= 12  # of the managers; those of the applications are empty, and may have gone
+    assert report.catalogs_damaged == 0
     assert any("kills" in line for line in shown)
     assert json.loads(report.json())["passed"] is True
 
@@ -248,14 +249,15 @@ STANDSTILL = """
 """
 
 STANDING = {
-    "a deed": ("monkey.Monkey.step = lambda self: time.sleep(1000)", "after 0 faults, the next", 4),
-    "the checks": ("victim_system.check_at_rest = lambda state: time.sleep(1000)", "checking what is held", 10),
-    "the stop": ("victim_system.System.stop = lambda self: time.sleep(1000)", "stopping", 12),
+    "a deed": ("monkey.Monkey.step = lambda self: time.sleep(1000)", "after 0 faults, the next", 15),
+    "the checks": ("victim_system.check_at_rest = lambda state: time.sleep(1000)", "checking what is held", 20),
+    "the stop": ("victim_system.System.stop = lambda self: time.sleep(1000)", "stopping", 20),
     "the start": ("victim_system.System.start = lambda self: time.sleep(1000)", "starting", 4),
 }
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(120)
 @pytest.mark.parametrize("what", STANDING)
 def test_a_standstill_ends_in_its_time_is_named_and_is_a_failure(what: str, tmp_path: Path) -> None:
     breakage, phase, patience_s = STANDING[what]
@@ -265,7 +267,7 @@ def test_a_standstill_ends_in_its_time_is_named_and_is_a_failure(what: str, tmp_
         breakage=breakage, paths=paths, patience=patience_s, state=str(tmp_path / "state"), report=str(report)
     )
 
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=55)
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=110)
 
     assert ran.returncode == 1, ran.stderr
     said = json.loads(report.read_text())
@@ -380,7 +382,7 @@ def agreeing(*more: Row) -> dict[str, Contents]:
     """App holds query q on resource q of the maker; `more` rows come after these, or take their place."""
     resource = Resource("q", "thing", b"1", b"2", Phase.LOADED, State.OK, "", 1)
     held = Held("q", "maker", "thing", b"1", b"2", "q", "", 1, 1, Hold.HELD, State.OK)
-    of_maker = [resource, Query("q", "q", "app", "", 1, 1), *(row for row in more if not isinstance(row, Held))]
+    of_maker = [resource, ServedQuery("q", "q", "app", "", 1, 1), *(row for row in more if not isinstance(row, Held))]
     of_app = [held, *(row for row in more if isinstance(row, Held))]
     return {name: Contents(name, Path(name), rows) for name, rows in (("maker", of_maker), ("app", of_app))}
 
@@ -406,7 +408,7 @@ def test_whatever_moves_hangs_or_disagrees_is_found() -> None:
     assert "points to resource q, which does not exist" in wrong(lacks="resources")
     assert "is unknown to app" in wrong(lacks="held")
     assert "is owed" in wrong(owed)
-    assert "another resource" in wrong(Query("q", "r", "app", "", 1, 1))
+    assert "another resource" in wrong(ServedQuery("q", "r", "app", "", 1, 1))
     assert "is not delivered" in wrong(Notice("n", "q", "app", "q", "e", State.OK, "", "maker/thing"))
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Put, Resource, Row, ServedQuery, State
 from rr_actors.storage.opening import open_store
 from rr_actors.tools.inspection import check, read_state
 from support_cli import run_cli
@@ -25,8 +25,8 @@ def resource(id: str, *, phase: Phase = Phase.LOADED, request: bytes = REQUEST) 
     return Resource(id, "camera", request, RESPONSE, phase, State.OK, "", 1)
 
 
-def query(id: str, resource_id: str, origin: str = "app") -> Query:
-    return Query(id, resource_id, origin, "", 1, 1)
+def query(id: str, resource_id: str, origin: str = "app") -> ServedQuery:
+    return ServedQuery(id, resource_id, origin, "", 1, 1)
 
 
 def held(id: str, resource_id: str, *, parent: str = "", hold: Hold = Hold.HELD) -> Held:

@@ -610,6 +610,10 @@ def test_a_revocation_is_explained(app: rr.Registrar, shop: rr.System) -> None:
     revoking.start()
     assert heard.wait(60)
     assert "It is revoked (too hot): it is unloaded when its holders have let it go" in said("why", query.resource_id)
+    (row,) = said("resources", "--status", "revoked").splitlines()[1:]
+    assert row.split()[:3] == ["provider/thing", '"x"', "revoked"]
+    assert said("resources", "--status", "fatal").splitlines()[1:] == [row]
+    assert all(": revoked" in said("wait", query.resource_id, "--for", word) for word in ("revoked", "FATAL"))
     goes_on.set()
     revoking.join()
 

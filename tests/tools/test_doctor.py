@@ -14,8 +14,9 @@ from support import REPOSITORY
 from support_cli import run_cli
 
 EXAMINED = (
-    "versions", "threads", "descriptors", "processes", "control group: memory", "control group: tasks", "memfd",
-    "/dev/shm", "ptrace", "clock", "state: file system", "state: room", "state: fsync", "fork server", "terminal",
+    "versions", "threads", "descriptors", "processes", "control group: memory", "control group: tasks",
+    "control group: programs", "memfd", "/dev/shm", "ptrace", "clock", "state: file system", "state: room",
+    "state: fsync", "fork server", "terminal",
 )  # fmt: skip
 MAIN = "from rr_actors.tools.cli import main; main()"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Query, Resource, Row, State
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Resource, Row, ServedQuery, State
 from rr_actors.tools.inspection import Contents, check
 from support_steps import steps_of
 
@@ -25,12 +25,12 @@ def state_of(count: int) -> dict[str, Contents]:
     parts: list[Row] = []
     for n in range(count):
         shop.append(Resource(f"r{n}", "bike", str(n).encode(), EMPTY, Phase.LOADED, State.OK, "", 1))
-        shop += [Query(f"q{n}", f"r{n}", "app", "", 1, 1), Query(f"p{n}", f"r{n}", "app", "", 1, 1)]
+        shop += [ServedQuery(f"q{n}", f"r{n}", "app", "", 1, 1), ServedQuery(f"p{n}", f"r{n}", "app", "", 1, 1)]
         shop.append(Notice(f"n{n}", f"gone{n}", "app", f"r{n}", "e1", State.FATAL, "gone", f"r{n}", True))
         shop.append(Held(f"w{n}", "parts", "wheel", EMPTY, EMPTY, f"x{n}", f"r{n}", 1, n, Hold.HELD, State.OK))
         app += [held(f"q{n}", n), held(f"p{n}", n), held(f"gone{n}", n)]
         parts.append(Resource(f"x{n}", "wheel", str(n).encode(), EMPTY, Phase.LOADED, State.OK, "", 1))
-        parts.append(Query(f"w{n}", f"x{n}", "shop", f"r{n}", 1, 1))
+        parts.append(ServedQuery(f"w{n}", f"x{n}", "shop", f"r{n}", 1, 1))
     return {name: Contents(name, Path(name), rows) for name, rows in (("shop", shop), ("app", app), ("parts", parts))}
 
 

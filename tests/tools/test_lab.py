@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from rr_actors.tools.web.lab_runs import Place, Run, experiments
+from rr_actors.tools.web.lab.lab_catalog import EXPERIMENTS, experiment_called
+from rr_actors.tools.web.lab.lab_runs import Place, Run
+from rr_actors.tools.web.lab.lab_texts import texts_of
 from support import eventually
 from support_browser import Tab, needs_chromium, web
 
 pytestmark = pytest.mark.timeout(180)
 
 LONG_S = 60.0
+AT_ONCE = 10  # experiments side by side: more of them make each too slow to show what it should
 
 
 @pytest.fixture(autouse=True)
@@ -31,11 +37,12 @@ def left_behind() -> list[Path]:
 
 
 def test_each_experiment_says_what_it_is_and_what_to_look_for() -> None:
-    assert len({one.title for one in experiments()}) == 6
-    for one in experiments():
+    experiments = [texts_of(one) for one in EXPERIMENTS]
+    assert len({one.title for one in experiments}) == len(EXPERIMENTS) == 18
+    for one in experiments:
         assert one.about
         assert one.look_for
-        assert "def main(state_dir: str)" in one.code
+        assert "def main(" in one.code
         assert '"""' not in one.code
 
 
@@ -83,14 +90,18 @@ def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page
     with web("--lab") as url:
         tab.goes_to(url)
         tab.clicks("Sharing and dependencies")
-        tab.sees("body", "Look for:", "def main(state_dir: str)", "two consumers share it")
-        tab.sees('[data-path="root/lenses"]', "running", limit_s=LONG_S)
+        tab.clicks("run it")
+        tab.sees("body", "Look for:", "two consumers share it")
+        code = tab.do(tab.locate("textarea").input_value())
+        assert "def main(state_dir: str)" in code
+        tab.sees('button[data-path="root/lenses"]', "running", limit_s=LONG_S)
         tab.sees("[role=log]", "the mapper loads the front camera")
         tab.clicks("stop it")
         eventually(lambda: left_behind() == before, what="nothing left of it")
         tab.sees("[role=status]", "sharing_and_parts has ended")
         tab.clicks("Escalation")
-        tab.sees('[data-path="root/base/wheel/motor"]', "running", limit_s=LONG_S)
+        tab.clicks("run it")
+        tab.sees('button[data-path="root/base/wheel/motor"]', "running", limit_s=LONG_S)
         tab.do(tab.page.goto("about:blank"))
         eventually(lambda: left_behind() == before, what="nothing left of a page that was left")
 
@@ -102,18 +113,186 @@ def test_an_experiment_ends_with_the_lab(tab: Tab) -> None:
     with web("--lab") as url:
         tab.goes_to(url)
         tab.clicks("A poisoned message")
-        tab.sees('[data-path="root/parser"]', "running", limit_s=LONG_S)
+        tab.clicks("run it")
+        tab.sees('button[data-path="root/parser"]', "running", limit_s=LONG_S)
     assert left_behind() == before
 
 
+CHANGED = """
+import rr_actors as rr
+class Mine(rr.Actor):
+    def on_receive(self, message):
+        return f"my own answer to {message}"
+def main(state_dir, number):
+    with rr.System([rr.ChildSpec(Mine, id="mine")], state_dir=state_dir) as system:
+        print(system.ref("mine").ask(number, timeout=20), flush=True)
+"""
+
+
+SLEEPS = """
+import signal
+def main(state_dir):
+    signal.pause()
+"""
+
+
+def test_changed_code_runs_in_the_place_of_an_experiment_with_its_levers() -> None:
+    before = left_behind()
+    run = Run("sharing_and_parts", {"number": 7}, CHANGED)
+    eventually(lambda: not run.is_running, LONG_S)
+    assert run.lines == ["my own answer to 7"]
+    assert run.has_finished
+    assert left_behind() == before
+
+
+def test_a_run_that_fails_or_is_stopped_has_not_finished() -> None:
+    failed, stopped = Run("sharing_and_parts", {}, "1 / 0"), Run("sharing_and_parts", {}, SLEEPS)
+    eventually(lambda: not failed.is_running, LONG_S)
+    stopped.stop()
+    assert not failed.has_finished
+    assert not stopped.has_finished
+    assert "ZeroDivisionError" in failed.lines[-1]
+
+
+RIGHT = {
+    "four_strategies": {"b", "c"},
+    "your_own_tree": {"restart b"},
+    "restart_storm": {"branch", "root, too"},
+    "escalation_levels": {"wheel", "base"},
+    "back_off": {"about 4 s"},
+    "poisoned_actor": {"never see it"},
+    "frozen_child": {"another process takes its place"},
+    "sharing_and_parts": {"one"},
+    "kill_in_a_load": {"the map, a little later"},
+    "handled_status": {"the cameras' manager"},
+    "refused_ring": {"an error that names the ring"},
+    "crash_in_unload": {"its unload runs again"},
+    "brownout": {"radio", "lamp"},
+    "generator": {"the generator starts, and nobody is switched off"},
+    "tour_guide": {"it is paused"},
+    "rebinding": {"the lidar, and later the camera again"},
+    "keep": {"radio 0, radio 1 and radio 2"},
+    "umrf": {"the spare camera takes it"},
+}
+PULLED = (
+    ("your_own_tree", {"strategy": "one_for_all", "max_restarts": 0}, {"give up"}),
+    ("frozen_child", {"heartbeat_s": 0.0}, {"it goes on after that"}),
+    ("handled_status", {"handled": "no"}, {"the cameras' manager", "the consumer"}),
+    ("brownout", {"priority": 2}, {"nobody: the pump waits"}),
+    ("generator", {"fuel": "no"}, {"the radio and the lamp are switched off"}),
+    ("tour_guide", {"idle": "unload"}, {"it has been ended"}),
+    ("tour_guide", {"linger_s": 30.0}, {"it runs on"}),
+    ("rebinding", {"settle_s": 30.0}, {"the lidar, to the end"}),
+    ("rebinding", {"at_least_hz": 50}, {"nothing: it ends with an error"}),
+    ("keep", {"fault": "silent", "then_wanted": 5}, {"radio 0, radio 1 and radio 2"}),
+    ("keep", {"delay_s": 20.0}, {"radio 1 and radio 2"}),
+    ("umrf", {"killed": "actions"}, {"the spare camera takes it", "the spare camera begins again, as attempt 2"}),
+)
+
+
+@pytest.mark.slow
+def test_each_run_shows_which_answers_to_its_question_are_right() -> None:
+    before = left_behind()
+    wanted = [*((name, {}, right) for name, right in RIGHT.items()), *PULLED]
+    for first in range(0, len(wanted), AT_ONCE):
+        assert_right(wanted[first : first + AT_ONCE])
+    assert left_behind() == before
+    assert {one.name for one in EXPERIMENTS} == set(RIGHT)
+
+
+def assert_right(wanted: Sequence[tuple[str, dict[str, Any], set[str]]]) -> None:
+    """Let these experiments run side by side, and look at what each has shown."""
+    runs = [(Run(name, levers), right) for name, levers, right in wanted]
+    try:
+        for run, right in runs:
+            eventually(lambda run=run: not run.is_running, 2 * LONG_S, run.name)
+            declared = experiment_called(run.name)
+            assert declared is not None
+            assert declared.question is not None
+            assert run.has_finished, run.lines
+            assert declared.question.right(run.seen) == right, (run.name, run.lines)
+    finally:
+        for run, _ in runs:
+            run.stop()
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_the_lab_asks_runs_what_was_chosen_compares_and_plays_it_again(tab: Tab) -> None:
+    with web("--lab") as url:
+        tab.goes_to(url)
+        tab.clicks("A tree of your own")
+        tab.sees("body", "What will the supervisor team do?", "strategy")
+        tab.do(tab.page.get_by_label("strategy").click())
+        tab.do(tab.page.get_by_role("option", name="rest_for_one").click())
+        tab.do(tab.page.get_by_role("checkbox", name="restart b").click())
+        href = tab.do(tab.page.get_by_role("link", name="the same as a notebook").get_attribute("href"))
+        answer = tab.do(tab.page.request.get(url.partition("/lab")[0] + str(href)))
+        notebook = json.loads(tab.do(answer.text()))
+        assert "strategy='rest_for_one', max_restarts=2" in notebook["cells"][-1]["source"]
+        assert tab.do(tab.page.request.get(url.partition("/lab")[0] + "/lab/no.ipynb")).status == 404
+        tab.clicks("run it")
+        tab.sees("[role=log]", "SIGKILL to b", "restarted     root/team/c", limit_s=LONG_S)
+        tab.clicks("pause")
+        tab.sees("[role=toolbar]", "go on", "at ")
+        tab.clicks("go on")
+        tab.sees(".rr-verdict", "Not quite. You said: restart b. It was: restart b, restart c.", limit_s=LONG_S)
+        tab.clicks("again")
+        tab.clicks("step")
+        tab.waits(lambda: "SIGKILL" not in tab.text("[role=log]"), "the log as it was")
+        for _ in range(30):
+            tab.clicks("step")
+        tab.sees("[role=log]", "SIGKILL to b", "restarted     root/team/c")
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_code_cannot_be_changed_where_other_machines_reach_the_lab(tab: Tab) -> None:
+    with web("--lab", "--host", "0.0.0.0") as url:
+        tab.goes_to(url.replace("0.0.0.0", "127.0.0.1"))
+        tab.clicks("Sharing and dependencies")
+        tab.sees("body", "It can be changed where the lab listens at this machine alone.")
+        assert tab.do(tab.page.get_by_label("program").is_disabled())
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_a_child_is_killed_by_hand(tab: Tab) -> None:
+    with web("--lab") as url:
+        tab.goes_to(url)
+        tab.do(tab.page.goto(url.partition("?")[0] + "?experiment=sharing_and_parts"))
+        tab.clicks("run it")
+        tab.sees('button[data-path="root/lenses"]', "running", limit_s=LONG_S)
+        tab.do(tab.locate('button[data-path="root/lenses"]').click())
+        tab.clicks("kill -9 the chosen child")
+        tab.sees('button[data-path="root/lenses"]', "↻1")
+        tab.clicks("stop it")
+        tab.sees(".rr-verdict", "It did not come to its end.")
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_ten_questions_are_answered_with_what_the_docs_say(tab: Tab) -> None:
+    with web("--lab") as url:
+        tab.goes_to(url)
+        tab.clicks("Ten questions", role="link")
+        tab.do(tab.page.get_by_role("radio", name="one_for_all").click())
+        tab.sees("body", "Not quite. rest_for_one, with the driver first.", "0 of 10 right")
+        tab.do(tab.page.get_by_role("radio", name="the cameras, but not the count").click())
+        tab.sees("body", "Right. The three cameras", "1 of 10 right")
+
+
 RESULTS = {
-    "The four strategies side by side": (['[data-path="root/rest_for_one/c"]', "↻1"], "SIGKILL to template"),
-    "A restart storm against the intensity window": (['[data-path="root"]', "stopped"], "the tree has ended: shutdown"),
-    "Escalation": (['[data-path="root/base"]', "↻1"], "kill 4: SIGKILL"),
-    "A poisoned message": (['[data-path="root/parser"]', "stopped"], "four: nobody is there"),
-    "Sharing and dependencies": (['[data-path="root/cameras"]', "running"], "the guard releases it"),
+    "The four strategies side by side": (['button[data-path="root/rest_for_one/c"]', "↻1"], "SIGKILL to template"),
+    "A restart storm against the intensity window": (
+        ['button[data-path="root"]', "stopped"],
+        "the tree has ended: shutdown",
+    ),
+    "Escalation": (['button[data-path="root/base"]', "↻1"], "kill 4: SIGKILL"),
+    "A poisoned message": (['button[data-path="root/parser"]', "stopped"], "four: nobody is there"),
+    "Sharing and dependencies": (['button[data-path="root/cameras"]', "running"], "the guard releases it"),
     "kill -9 in the middle of a load": (
-        ['[data-path="root/maps"]', "↻1"],
+        ['button[data-path="root/maps"]', "↻1"],
         "loaded: the map of kitchen, from attempt 2",
     ),
 }
@@ -128,6 +307,7 @@ def test_each_button_shows_what_its_experiment_promises(button: str, tab: Tab) -
     with web("--lab") as url:
         tab.goes_to(url)
         tab.clicks(button)
+        tab.clicks("run it")
         tab.sees("[role=log]", printed, limit_s=LONG_S)
         tab.sees(selector, *shown, limit_s=LONG_S)
         tab.sees(".rr-status", "has ended", limit_s=LONG_S)

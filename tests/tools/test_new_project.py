@@ -20,6 +20,12 @@ from support import REPOSITORY, eventually
 from support_cli import run_cli
 
 
+def has_handler(pid: int, number: signal.Signals) -> bool:
+    """Whether the process has a handler of its own for a signal."""
+    status = dict(line.split(":\t") for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return bool(int(status["SigCgt"], 16) >> (number - 1) & 1)
+
+
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What `rr-actors new tea-robot` makes."""
@@ -66,6 +72,7 @@ def test_the_application_of_a_new_project_runs_as_its_unit_says_and_stops_in_ord
     try:
         eventually(lambda: "has a map of the kitchen" in log.read_text(), 30.0, "the application's line")
         assert (project / "state" / "cameras").is_dir()
+        eventually(lambda: has_handler(service.pid, signal.SIGTERM), what="run() handles SIGTERM")
         service.send_signal(signal.SIGTERM)
         assert service.wait(20) == 0
     finally:

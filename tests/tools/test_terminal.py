@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -13,7 +14,7 @@ import sys
 import threading
 import time
 import types
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from rr_actors.tools.process_usage import UsageWatch
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import Keys, Pane, Terminal
 from rr_actors.tools.terminal.terminal_rows import Served, Window
-from rr_actors.tools.terminal.terminal_tables import Tree
+from rr_actors.tools.terminal.terminal_tables import TreeTable
 from support import LIMIT_S, TEST_PATHS, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_respawned
 from support_managers import Order, Shop
 
@@ -265,6 +266,57 @@ def test_a_resource_of_several_holders_is_taken_from_one_of_them_or_from_all(sta
     served.unloads.wait()
 
 
+def test_a_resource_is_revoked_after_a_question(shop: rr.System, state_dir: Path) -> None:
+    app = shop.open_registrar("app")
+    app.load("shop/thing", Order("lamp"))
+
+    async def scene(person: Person) -> None:
+        await person.press("R")
+        await person.sees(lambda: "revoke: choose a resource" in person.terminal.status)
+        await person.press("2")
+        await person.sees(lambda: "lamp" in person.tree)
+        await person.press("R")
+        await person.sees(lambda: "y: yes, Esc: no" in person.terminal.status)
+        await person.press("escape")
+        await person.sees(lambda: "was not revoked" in person.terminal.status)
+        assert len(app.queries()) == 1
+        await person.press("R", "y")
+        await person.sees(lambda: "revoked shop/thing" in person.terminal.status)
+
+    sit_down(state_dir, scene)
+    assert app.queries() == []
+
+
+def test_a_priority_is_typed_and_given_and_what_is_none_is_refused(start: Start, state_dir: Path) -> None:
+    system = start(config=rr.SystemConfig(registrars={"guests": rr.RegistrarConfig(max_priority=2)}))
+    provider, guests = system.open_registrar("provider"), system.open_registrar("guests")
+    serve(provider, "thing")
+    query = guests.load("provider/thing", "lamp")
+
+    async def scene(person: Person) -> None:
+        await person.press("p")
+        await person.sees(lambda: "priority: choose a resource or a holder" in person.terminal.status)
+        await person.press("2")
+        await person.sees(lambda: "lamp" in person.tree)
+        await person.press("p", "2", "enter")
+        await person.sees(lambda: f"gave priority 2 to query {query.id[-8:]} of guests" in person.terminal.status)
+        await person.sees(lambda: "priority 2" in person.chosen)
+        await person.press("p", "x", "slash", "enter")
+        limits = "priority: expected a whole number from -1000 to 1000, or standby, got 'x/'"
+        await person.sees(lambda: limits in person.terminal.status)
+        await person.press("p", "9", "enter")
+        limit = "expected 2 at most, as the max_priority of registrar 'guests' says, got 9"
+        await person.sees(lambda: limit in person.terminal.status)
+        await person.press("p", "1", "escape")
+        await person.sees(lambda: "the priority stays as it was" in person.terminal.status)
+        assert query.priority == 2
+        await person.press("p", *"standby", "enter")
+        await person.sees(lambda: f"gave standby to query {query.id[-8:]}" in person.terminal.status)
+
+    sit_down(state_dir, scene)
+    assert query.priority is None
+
+
 def test_what_is_typed_filters_the_pane(shop: rr.System, state_dir: Path) -> None:
     app = shop.open_registrar("app")
     app.load("shop/thing", Order("lamp"))
@@ -311,7 +363,7 @@ def test_the_children_are_sorted_by_each_column_and_the_resources_by_their_state
     system.registrar("quiet").send_status(queries[1].resource_id, rr.Status("ERROR", "broken"))
 
     def first(person: Person) -> list[str]:
-        return person.tree.splitlines()[1].split()
+        return [*person.tree.splitlines(), "?", "?"][1].split() or ["?"]  # while it is painted there may be no line
 
     async def scene(person: Person) -> None:
         await person.sees(lambda: "often" in person.tree)
@@ -321,7 +373,9 @@ def test_the_children_are_sorted_by_each_column_and_the_resources_by_their_state
             await person.press("s")
             await person.sees(lambda head=head, top=top: f"▼{head}" in person.tree and top in first(person)[0])
         await person.press("s")
-        await person.sees(lambda: first(person)[0] == "root/quiet" and first(person)[-1] == "2")
+        await person.sees(lambda: first(person)[0] == "root/quiet" and first(person)[-2] == "2")
+        await person.press("s")
+        await person.sees(lambda: "▼loads/s" in person.tree)
         await person.press("s")
         await person.sees(lambda: "▼" not in person.tree and first(person)[0] == "root")
 
@@ -456,7 +510,7 @@ class Crowd(ConsoleLink):
                 numbers = range(self.RESOURCES)[offset : offset + limit]
                 return c.Resources(self.RESOURCES, [a_resource(number) for number in numbers])
             case questions.ListQueries():
-                return c.Queries(0, [])
+                return c.QueryPage(0, [])
             case _:
                 return super().ask(request, timeout_s)
 
@@ -497,7 +551,7 @@ def test_a_window_goes_on_from_one_list_to_the_next(start: Start, state_dir: Pat
     start()
     crowd = Crowd(state_dir)
     try:
-        listed = Tree().list(crowd, Window(offset=498, limit=10))
+        listed = TreeTable().list(crowd, Window(offset=498, limit=10))
     finally:
         crowd.close()
 
@@ -538,30 +592,78 @@ def test_without_the_extra_the_command_says_what_to_install(tmp_path: Path, shop
     assert len(ran.stderr.splitlines()) == 1
 
 
-@pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux: apt-get install tmux")
-def test_it_runs_in_a_real_terminal(shop: rr.System, state_dir: Path, tmp_path: Path) -> None:
-    pid = pid_of(shop, "shop")
+needs_tmux = pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux: apt-get install tmux")
+Tmux = Callable[..., str]
 
-    def tmux(*arguments: str) -> str:
+
+@pytest.fixture
+def tmux(state_dir: Path, tmp_path: Path) -> Iterator[Tmux]:
+    """`rr-actors top` in a real terminal: tmux("send-keys", "j")."""
+
+    def run(*arguments: str) -> str:
         command = ["tmux", "-S", str(tmp_path / "tmux"), "-f", "/dev/null", *arguments]
         environment = os.environ | {"PYTHONPATH": TEST_PATHS, "LC_ALL": "C.UTF-8"}
         return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
 
     top = shlex.join([sys.executable, "-m", "rr_actors", "top", "--state", str(state_dir)])
-    tmux("new-session", "-d", "-x", "80", "-y", "24", f"{top}; echo exit code $?; read line")
+    run("new-session", "-d", "-x", "80", "-y", "24", f"{top}; echo exit code $?; read line")
     try:
-        eventually(lambda: "  shop" in tmux("capture-pane", "-p"), timeout=30.0)
-        tmux("send-keys", "j", "K")
-        eventually(lambda: "kill root/shop?" in tmux("capture-pane", "-p"), timeout=30.0)
-        tmux("send-keys", "y")
-        eventually(lambda: f"(pid {pid})" in tmux("capture-pane", "-p"), timeout=30.0)
-        eventually(lambda: "restarted" in tmux("capture-pane", "-p"), timeout=30.0)
-        tmux("send-keys", "/", "k", "/", "t")  # at once, as a slow line has it: no letter of it is a command
-        eventually(lambda: "filter: k/t" in tmux("capture-pane", "-p"), timeout=30.0)
-        tmux("send-keys", "Escape")
-        eventually(lambda: "filter:" not in tmux("capture-pane", "-p"), timeout=30.0)
-        tmux("send-keys", "q")
-        eventually(lambda: "exit code 0" in tmux("capture-pane", "-p"), timeout=30.0)
+        yield run
     finally:
-        tmux("kill-server")
+        run("kill-server")
         (tmp_path / "tmux").unlink(missing_ok=True)
+
+
+@needs_tmux
+def test_it_runs_in_a_real_terminal(shop: rr.System, tmux: Tmux) -> None:
+    pid = pid_of(shop, "shop")
+    eventually(lambda: "  shop" in tmux("capture-pane", "-p"), timeout=30.0)
+    tmux("send-keys", "j", "K")
+    eventually(lambda: "kill root/shop?" in tmux("capture-pane", "-p"), timeout=30.0)
+    tmux("send-keys", "y")
+    eventually(lambda: f"(pid {pid})" in tmux("capture-pane", "-p"), timeout=30.0)
+    eventually(lambda: "restarted" in tmux("capture-pane", "-p"), timeout=30.0)
+    tmux("send-keys", "/", "k", "/", "t")  # at once, as a slow line has it: no letter of it is a command
+    eventually(lambda: "filter: k/t" in tmux("capture-pane", "-p"), timeout=30.0)
+    tmux("send-keys", "Escape")
+    eventually(lambda: "filter:" not in tmux("capture-pane", "-p"), timeout=30.0)
+    tmux("send-keys", "q")
+    eventually(lambda: "exit code 0" in tmux("capture-pane", "-p"), timeout=30.0)
+
+
+class Cameras(rr.Manager):
+    @rr.server("camera")
+    def open_camera(self, device: str) -> None:
+        self.images = rr.current().open_stream("images")
+        self.ended = threading.Event()
+        threading.Thread(target=self.grab, daemon=True).start()
+
+    @open_camera.unload
+    def close_camera(self, device: str, response: object) -> None:
+        self.ended.set()
+
+    def grab(self) -> None:
+        while not self.ended.wait(0.01):
+            self.images.publish(bytes(1000))
+
+
+@pytest.fixture
+def cameras(start: Start) -> rr.System:
+    return start(rr.ChildSpec(Cameras, id="cameras"))
+
+
+@needs_tmux
+def test_streams_are_listed_with_their_figures(cameras: rr.System, tmux: Tmux) -> None:
+    def shows(pattern: str) -> None:
+        eventually(lambda: re.search(pattern, tmux("capture-pane", "-p")), timeout=30.0)
+
+    with cameras.open_registrar("app").load(Cameras.open_camera, "front").stream("images", timeout_s=30.0) as frames:
+        next(frames)
+        shows("  cameras")
+        tmux("send-keys", "4", "z")
+        shows(r"rate +bytes +readers +missed")
+        shows(r"images  cameras/camera.* \d+\.\d/s +\d\.\d MiB/s +1 +\d")
+        tmux("send-keys", "z", "Enter")
+        shows(r"stream images: 1 read it +\d+\.\d/s, ")
+    tmux("send-keys", "q")
+    shows("exit code 0")

@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 from textual.pilot import Pilot
 
-from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
+from rr_actors.hosting.streams import ReaderRow, StreamInfo, StreamRow
+from rr_actors.registrar.pages import Holder, LoadRow, QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
@@ -66,6 +67,20 @@ SERVED = {
                     1, [Holder(id_of(6, 60), "app", "")], 1, [], 0),
     ],
 }  # fmt: skip
+_READERS = [ReaderRow("app", PID + 8, "latest", 311), ReaderRow("planner", PID + 9, "all", 0)]
+STREAMS = [
+    StreamRow(
+        StreamInfo(f"{FRONT}/images", "images", "cameras/camera", FRONT, 29.3, 182_000_000.0, 2, 311, 0.016),
+        '"/dev/video0"', 4096, _READERS,
+    ),
+    StreamRow(StreamInfo(f"{FRONT}/boxes", "boxes", "cameras/camera", FRONT, 0, 0, 0, 0, None), '"/dev/video0"', 0, []),
+]  # fmt: skip
+WAITS = QueryRow(id_of(5, 7.25), "app", "lenses/lens", "", "", '"wide"', "pending", "OK")
+LOADS = [
+    LoadRow("cameras/camera", 1204, 1180, 31, 2, 0, 1.34, 2.9, 4.1, 32.2),
+    LoadRow("lenses/lens", 3, 1, 2, 0, 1, 0.012, 0.02, 0.02, 0.024),
+    LoadRow("lenses/filter", 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
+]
 HISTORY = [
     Record("started", "root/inner/cameras", "manager", 2, NOW - 100, "running", PID + 2, ready_s=0.25),
     Record("exited", "root/inner/cameras", "manager", 2, NOW - 12.5, "restarting", PID + 2, "killed", "SIGKILL",
@@ -99,6 +114,9 @@ class Stage(ConsoleLink):
                 served = SERVED.get(registrar, []) if registrar else [row for rows in SERVED.values() for row in rows]
                 served = [row for row in served if match in row.request]
                 return c.Resources(len(served), served[offset : offset + limit])
+            case questions.ListStreams(match, offset, limit):
+                streams = [row for row in STREAMS if match in row.info.id]
+                return c.Streams(len(streams), streams[offset : offset + limit])
             case questions.ListHistory(path, _):
                 return c.Happenings([record for record in HISTORY if record.path.startswith(path)])
             case questions.ListLog(path):
@@ -107,8 +125,10 @@ class Stage(ConsoleLink):
                 part = QueryRow(id, "cameras", "lenses/lens", LENS, FRONT, '"front"', "held", "WARNING")
                 found = [row for rows in SERVED.values() for row in rows if row.id == id]
                 return c.Found(found, [part] if id == id_of(9, 88) else [])
+            case questions.ListLoads():
+                return c.Loads(1, [WAITS], LOADS)
             case _:
-                return c.Queries(0, [])
+                return c.QueryPage(0, [])
 
     def follow(self, found: Callable[[c.Welcome], None], hear: Callable[[c.Events | c.Missed], None]) -> str:
         found(c.Welcome(1, "robot", PID, "/srv/robot", NOW - 100))
@@ -158,7 +178,7 @@ async def the_tree(terminal: Terminal, pilot: Pilot[None]) -> None:
 
 async def a_chosen_child(terminal: Terminal, pilot: Pilot[None]) -> None:
     await goes_down_to(terminal, pilot, "    cameras")
-    await shows(terminal, pilot, "root/inner/cameras: history", "killed", "dusty")
+    await shows(terminal, pilot, "root/inner/cameras: now", "killed", "dusty")
 
 
 async def a_chosen_registrar(terminal: Terminal, pilot: Pilot[None]) -> None:
@@ -198,6 +218,18 @@ async def the_resources(terminal: Terminal, pilot: Pilot[None]) -> None:
     await shows(terminal, pilot, "resources by state", "unplugged", "id 00000003")
 
 
+async def the_streams(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await the_tree(terminal, pilot)
+    await pilot.press("4", "z")
+    await shows(terminal, pilot, "images", "29.3/s", "173.6 MiB/s", "311")
+
+
+async def the_loads(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await the_tree(terminal, pilot)
+    await pilot.press("5", "z", "s", "s")
+    await shows(terminal, pilot, "▼p95", "7.2 s", "1,204")
+
+
 async def the_help(terminal: Terminal, pilot: Pilot[None]) -> None:
     await the_tree(terminal, pilot)
     await pilot.press("question_mark")
@@ -216,7 +248,8 @@ SMALL = (80, 24)
     ("look", "size"),
     [
         *((look, SMALL) for look in (the_tree, a_chosen_child, a_chosen_registrar, a_chosen_resource, a_filter)),
-        *((look, SMALL) for look in (a_key_that_cannot, the_tree_alone, the_resources, the_help)),
+        *((look, SMALL) for look in (a_key_that_cannot, the_tree_alone, the_resources, the_streams)),
+        *((look, SMALL) for look in (the_loads, the_help)),
         (a_wide_screen, (250, 70)),
     ],
 )

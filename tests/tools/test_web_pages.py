@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.machinery
+import itertools
 import json
 import logging
 import os
@@ -19,11 +20,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy
 import psutil
 import pytest
-from playwright.async_api import Page
+from playwright.async_api import Page, Route
 
 import rr_actors as rr
+from rr_actors.managers import Actions, RunGraph
 from rr_actors.system import web_process
 from support import LIMIT_S, Workshop, child, kill, lives, pid_of, quickly, serve, wait_gone
 from support_browser import Chromium, Tab, needs_chromium, web
@@ -251,6 +254,115 @@ def test_a_chosen_resource_lights_up_with_its_holders_and_parts(camera: rr.Syste
             '["other \\"table\\"",0.15,0]',
             '["@app",1,0]',
         )
+        (lens,) = [row for row in camera.registrar("provider").resources() if row.request == "50 mm"]
+        camera.registrar("provider").send_status(lens.id, rr.Status("ERROR", "scratched"))
+        tab.sees(".rr-rows", "ERROR: scratched", "held, ERROR")  # so it comes from below
+
+
+def test_tree_and_counts_are_shown_before_the_libraries_of_graph_and_table_have_come(
+    camera: rr.System, tab: Tab
+) -> None:
+    held: list[str] = []
+    released = asyncio.Event()
+
+    async def hold(route: Route) -> None:
+        held.append(route.request.url)
+        await released.wait()
+        await route.continue_()
+
+    async def release() -> None:
+        released.set()
+
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.page.route("**/esm/**", hold))
+        tab.do(tab.page.goto(page.url.partition("?")[0] + "resources"))
+        tab.sees(".rr-split", "3 resources", "one_for_one")
+        tab.waits(lambda: len(held) > 1, "both libraries are asked for")
+        assert tab.do(tab.locate(".ag-row, canvas").count()) == 0
+        tab.do(tab.page.get_by_label("search in id").fill("glass-less"))  # before there is a table
+        tab.do(tab.page.get_by_label("search in id").fill("front"))
+        tab.do(release())
+        sees_drawn(tab, 'camera \\"front\\"')
+        tab.sees(".ag-center-cols-container", "front")
+        assert tab.do(tab.locate(".ag-row").count()) == 1
+
+
+class Cameras(rr.Manager):
+    """A camera with pictures that change, and with notes that are none."""
+
+    @rr.server("camera")
+    def open_camera(self, device: str) -> None:
+        images, notes = (rr.current().open_stream(name) for name in ("images", "notes"))
+        self.ended = threading.Event()
+
+        def grab() -> None:
+            for number in itertools.count():
+                if self.ended.wait(0.02):
+                    return
+                images.publish(numpy.full((480, 640, 3), number % 256, "u1"))
+                notes.publish("<img src=x onerror=alert(1)>")
+
+        threading.Thread(target=grab, daemon=True).start()
+
+    @open_camera.unload
+    def close_camera(self, device: str, response: object) -> None:
+        self.ended.set()
+
+
+class Steps(rr.Action):
+    go = threading.Event()
+
+    def run(self, given: object) -> None:
+        self.go.wait(60)
+        raise OSError("<b>blocked</b>")
+
+
+class Report(rr.Action):
+    def run(self, given: object) -> None:
+        return
+
+
+def test_a_running_graph_of_actions_is_drawn_with_its_states(start: Start, tab: Tab) -> None:
+    graph: dict[str, Any] = {
+        "actions": [
+            {"name": "Steps", "children": [{"name": "Report"}]},
+            {"name": "Report", "parents": [{"name": "Steps", "conditions": ["on_error -> run"]}]},
+        ]
+    }
+    Steps.go.clear()
+    kwargs = {"actions": [Steps, Report]}
+    system = start(rr.ChildSpec(Actions, id="actions", kwargs=kwargs, placement="thread"))
+    picture = ".rr-actions"
+    with system.open_registrar("app").load("actions/graph", RunGraph(graph)), system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.clicks("Resources", role="link")
+        tab.do(tab.locate('.ag-cell:has-text("actions/graph")').first.click())
+        tab.sees(".rr-rows", "graph RUNNING:", "Steps_0", "RUNNING", "Report_0", "UNINITIALIZED")
+        tab.sees(picture, "Steps_0", "RUNNING", "Report_0", "UNINITIALIZED")
+        Steps.go.set()
+        tab.sees(".rr-rows", "graph FINISHED:", "ERROR, actions/action: OSError: <b>blocked</b>")
+        tab.sees(picture, "Steps_0", "ERROR", "Report_0", "FINISHED")
+
+
+def test_the_pictures_of_a_chosen_resource_are_shown_live_and_small(start: Start, tab: Tab) -> None:
+    system = start(rr.ChildSpec(Cameras, id="cameras"))
+    camera = system.open_registrar("app").load(Cameras.open_camera, "front")
+    image = tab.locate('.rr-pictures img[alt="stream images"]')
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.clicks("Resources", role="link")
+        tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
+        tab.sees(".rr-rows", "stream images", "/s", "stream notes")
+        first = tab.do(image.get_attribute("src"))
+        assert first is not None
+        assert first.startswith("data:image/png;base64,")
+        tab.waits(lambda: tab.do(image.get_attribute("src")) != first, "another picture")
+        tab.waits(lambda: tab.do(image.evaluate("one => one.naturalWidth")) == 214, "a picture of 214 by 160")
+        assert tab.do(tab.locate(".rr-pictures img").count()) == 1
+        assert tab.do(tab.locate("img[src=x]").count()) == 0
+        camera.unload()
+        tab.waits(lambda: tab.do(image.count()) == 0, "no picture")
 
 
 @pytest.mark.slow
@@ -291,6 +403,55 @@ def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System,
         tab.waits(lambda: not app.queries(), "taken away")
         app.load("provider/other", "stool")
         sees_drawn(tab, '["other \\"stool\\"",1,0]')  # not dim, though what was chosen has gone
+
+
+@pytest.mark.slow
+def test_a_resource_is_revoked_by_a_button_after_a_question(camera: rr.System, tab: Tab) -> None:
+    app = camera.registrar("app")
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.do(tab.locate('.ag-cell:has-text("table")').first.click())
+        tab.sees(".rr-rows", "held by 1")
+        tab.clicks("revoke")
+        tab.sees(".q-dialog", "Revoke provider/other", "5 s to release it")
+        tab.clicks("cancel")
+        tab.waits(lambda: not tab.do(tab.locate(".q-dialog").count()), "the end of the question")
+        assert len(app.queries()) == 2
+        tab.clicks("revoke")
+        tab.clicks("revoke it")
+        tab.sees("body", "revoked provider/other")
+        tab.waits(lambda: [query.request for query in app.queries()] == ["front"], "revoked")
+
+
+@pytest.mark.slow
+def test_a_priority_is_given_by_a_button_after_a_question_and_a_limit_is_named(start: Start, tab: Tab) -> None:
+    system = start(config=rr.SystemConfig(registrars={"guests": rr.RegistrarConfig(max_priority=2)}))
+    provider, guests = system.open_registrar("provider"), system.open_registrar("guests")
+    serve(provider, "thing")
+    query = guests.load("provider/thing", "lamp")
+    with system.serve_web() as page:
+        tab.goes_to(page.url.partition("?")[0] + "resources?" + page.url.partition("?")[2])
+        tab.do(tab.locate('.ag-cell:has-text("lamp")').first.click())
+        tab.sees(".rr-rows", "held by 1")
+
+        def gives(typed: str, answer: str) -> None:
+            tab.clicks("priority")
+            tab.sees(".q-dialog", "The priority of guests, for itself")
+            tab.do(tab.locate(".q-dialog input").fill(typed))
+            tab.clicks(answer)
+            tab.waits(lambda: not tab.do(tab.locate(".q-dialog").count()), "the end of the question")
+
+        gives("1", "cancel")
+        gives("9", "give it")
+        tab.sees("body", "expected 2 at most, as the max_priority of registrar 'guests' says, got 9")
+        gives("high", "give it")
+        tab.sees("body", "priority: expected a whole number from -1000 to 1000, or standby, got 'high'")
+        assert query.priority == 0
+        gives("2", "give it")
+        tab.sees("body", f"gave priority 2 to query {query.id[-8:]} of guests")
+        tab.sees(".rr-rows", "guests, for itself, priority 2")
+    assert query.priority == 2
 
 
 @pytest.mark.slow
@@ -470,6 +631,10 @@ def test_a_load_and_a_crash_are_drawn_as_sequences_to_copy_and_to_save(
         tab.clicks("record")
         tab.sees(".rr-note", "recording")
         app.load("shop/thing", Order("chair"))
+        tab.clicks("Tree", role="link")
+        tab.sees(node("root/shop"), "running")
+        tab.clicks("Sequence", role="link")  # the recording has gone on meanwhile
+        tab.sees(".rr-note", ", recording")
         tab.do(tab.page.get_by_role("button", name="Load shop/thing").first.click())
         tab.waits(lambda: "participant" in tab.do(tab.page.get_by_label("Mermaid text").input_value()), "the text")
         tab.sees(".rr-sequence", "Load shop/thing", "load shop/thing returned")
@@ -615,6 +780,9 @@ def test_the_slider_shows_the_tree_as_it_was_and_now_again(start: Start, worksho
         system.supervisor().terminate_child("shop")
         tab.waits(lambda: "stopped" in tab.text("[role=log]"), "the event, while the past is shown")
         assert str(before) in tab.text(node("root/shop"))
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.sees(".rr-rows", "SIGKILL")
+        assert str(before) in tab.text(node("root/shop"))
         tab.clicks("now")
         tab.sees(node("root/shop"), "stopped")
 
@@ -724,12 +892,13 @@ def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(
     provider, app = system.open_registrar("provider"), system.open_registrar("app")
     serve(provider, "thing")
     thing = app.load("provider/thing", "one")
-    sent, stopped = 0, threading.Event()
+    sent, stood_s, stopped = 0, 0.0, threading.Event()
 
     def storm() -> None:
-        nonlocal sent
-        began = time.monotonic()
+        nonlocal sent, stood_s
+        began = last = time.monotonic()
         while not stopped.is_set():
+            stood_s, last = max(stood_s, time.monotonic() - last), time.monotonic()
             while sent < (time.monotonic() - began) * 1000:
                 provider.send_status(thing.resource_id, rr.Status("UPDATE", f"{sent} {time.time():.3f}"))
                 sent += 1
@@ -753,7 +922,7 @@ def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(
     assert sent > 55_000
     assert len(late) > 300
     print(f"{sent} events; behind: median {late[len(late) // 2]:.2f} s, most {late[-1]:.2f} s")
-    assert late[-1] < 1.0, late[-10:]
+    assert late[-1] < 1.0 + stood_s, late[-10:]  # while the storm itself stands, there is nothing newer to show
 
 
 @pytest.mark.parametrize(
@@ -790,7 +959,7 @@ def test_no_page_is_wider_than_the_screen_and_no_child_is_cut_off(start: Start, 
     inner = rr.Supervisor([rr.ChildSpec(rr.Actor, id="somewhat-long-name")], id="inner")
     with start(rr.ChildSpec(rr.Actor, id="a"), inner).serve_web() as page, chromium.tab(width, 900) as tab:
         tab.goes_to(page.url)
-        for path in ("", "timeline", "resources", "figures", "sequence"):
+        for path in ("", "timeline", "resources", "loads", "figures", "sequence"):
             tab.do(tab.page.goto(page.url.partition("?")[0] + path))
             tab.sees(".rr-status", "pid")
             assert tab.do(tab.page.evaluate("document.documentElement.scrollWidth")) <= width, path

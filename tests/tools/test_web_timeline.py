@@ -191,33 +191,69 @@ CUT = """[...document.querySelectorAll('svg text, button, .rr-tl-subject, .rr-tl
     return r.width && (r.left < -0.5 || r.right > innerWidth + 0.5);
 }).map(e => e.textContent)"""
 OVERLAPS = """(() => {
-    const marks = [...document.querySelectorAll('.rr-tl-mark .touch')].map(e => e.getBoundingClientRect());
-    const close = (one, other) => Math.abs(one.x - other.x) < 13 && Math.abs(one.y - other.y) < 5;
-    return marks.filter((one, i) => marks.some((other, j) => j < i && close(one, other))).length;
+    const boxOf = (e) => {
+        const one = e.getBoundingClientRect(), trimmed = e.tagName === "text" ? 1.5 : 0;
+        const [top, bottom] = [one.top + trimmed, one.bottom - trimmed];
+        return { left: one.left, right: one.right, top, bottom, of: e.parentNode };
+    };
+    const all = [...document.querySelectorAll("g > .mark, g > .count")].map(boxOf);
+    const lie = (one, other) => one.of !== other.of && one.left < other.right && other.left < one.right
+        && one.top < other.bottom && other.top < one.bottom;
+    const edge = Math.max(...[...document.querySelectorAll("svg")].map((e) => e.getBoundingClientRect().right));
+    const cut = all.filter((one) => one.right > edge).length;
+    return [all.length, all.filter((one, i) => all.some((other, j) => j < i && lie(one, other))).length, cut];
 })()"""
+
+
+def resource(after_s: float, event: str, registrar: str) -> Entry:
+    facts = {"registrar": registrar, "server": f"{registrar}/lamp", "resource_id": "x", "request": '"front"'}
+    return entry_of({"event": event, "at": BEGAN + after_s, "detail": ""} | facts)
+
+
+MANY = sorted(
+    (
+        entry
+        for number in range(40)
+        for turn in range(60)
+        for at, name in [(turn * 60.0 + number, f"a-long-name-{number}")]
+        for entry in (
+            child(at, "restarted", f"root/supervisor-{number % 4}/{name}", turn + 1),
+            killed(at + 5 * (turn % 9), f"root/supervisor-{number % 4}/{name}", turn + 1),
+            *(resource(at + step, "loaded", name) for step in range(0, 30, 3 + number)),
+        )
+    ),
+    key=lambda entry: entry.at,
+)
 
 
 @pytest.mark.parametrize("width", [420, 1400, 2560])
 def test_nothing_is_cut_off_and_no_mark_lies_on_another(chromium: Chromium, tmp_path: Path, width: int) -> None:
-    entries = [
-        entry
-        for number in range(40)
-        for turn in range(60)
-        for entry in (
-            child(turn * 60.0 + number, "restarted", f"root/supervisor-{number % 4}/a-long-name-{number}", turn + 1),
-            killed(
-                turn * 60.0 + number + 5 * (turn % 9), f"root/supervisor-{number % 4}/a-long-name-{number}", turn + 1
-            ),
-        )
-    ]
     file = tmp_path / "timeline.html"
-    file.write_text(html(timeline_of(sorted(entries, key=lambda entry: entry.at), "robot")))
+    file.write_text(html(timeline_of(MANY, "robot")))
     with chromium.tab(width, 800) as tab:
         tab.do(tab.page.goto(file.as_uri()))
         assert tab.do(tab.page.evaluate("document.documentElement.scrollWidth")) <= width
         assert tab.do(tab.page.evaluate(CUT)) == []
-        assert tab.do(tab.page.evaluate(OVERLAPS)) == 0
-        assert len(set(marks(tab, "root/supervisor-0/a-long-name-0"))) >= 1
+        for _ in range(6):
+            drawn, overlaps, cut = tab.do(tab.page.evaluate(OVERLAPS))
+            assert drawn > 20
+            assert (overlaps, cut) == (0, 0)
+            tab.clicks("zoom in")
+
+
+def test_in_an_svg_no_mark_lies_on_another(tab: Tab) -> None:
+    tab.do(tab.page.set_content(timeline_of(MANY, "robot").svg()))
+    drawn, overlaps, cut = tab.do(tab.page.evaluate(OVERLAPS))
+    assert drawn > 1000
+    assert (overlaps, cut) == (0, 0)
+
+
+def test_a_click_on_a_mark_of_many_lists_them(shown: Callable[[list[Entry]], Tab]) -> None:
+    tab = shown([killed(number / 10, pid=number) for number in range(30)] + [killed(HOUR)])
+    assert tab.do(tab.locate(f"{MARK} .count").first.text_content()) == "30"
+    tab.do(tab.locate(MARK).first.click())
+    assert tab.text(WHY).count("SIGKILL") == 30
+    assert tab.text(WHY).startswith("root/a: 30 × killed")
 
 
 @pytest.mark.slow

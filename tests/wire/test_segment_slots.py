@@ -22,7 +22,7 @@ steps = st.lists(
 
 @given(steps)
 def test_no_two_slots_overlap_and_the_memory_is_counted_to_the_page(steps: list[tuple[str, int, int]]) -> None:
-    slots = Slots(PAGE_BYTES, (PAGES + 1) * PAGE_BYTES, range(8, 14))
+    slots = Slots(bytearray(14), PAGE_BYTES, (PAGES + 1) * PAGE_BYTES, range(8, 14))
     warm: set[int] = set()  # pages
     held: dict[int, set[int]] = {}
     for what, number, room in steps:
@@ -40,14 +40,15 @@ def test_no_two_slots_overlap_and_the_memory_is_counted_to_the_page(steps: list[
             warm |= pages
         elif what == "share" and held:
             which = sorted(held)[number % len(held)]
-            other = slots.share(which, holder := object())
+            other = slots.share(which, holder := object(), 1)
             if other is not None:
                 assert other not in held
                 held[other] = held[which]
                 assert slots.numbers_of(holder) == [other]
         elif what == "give" and held:
             which = sorted(held)[number % len(held)]
-            slots.give_back(which)
+            slots.free(which)
+            slots.collect()
             del held[which]
         elif what == "cool":
             pieces = slots.cool(room * PAGE_BYTES)
@@ -81,15 +82,37 @@ def test_intervals_are_the_set_of_their_numbers(steps: list[tuple[bool, int, int
 
 
 def test_a_value_is_put_where_the_last_one_was() -> None:
-    slots = Slots(PAGE_BYTES, 100 * PAGE_BYTES, range(8, 20))
+    slots = Slots(bytearray(20), PAGE_BYTES, 100 * PAGE_BYTES, range(8, 20))
     first = slots.take(10 * PAGE_BYTES, 100 * PAGE_BYTES)
     assert first is not None
-    slots.give_back(first.number)
+    slots.free(first.number)
     again = slots.take(10 * PAGE_BYTES, 0)  # no page more
     assert again is not None
     assert (again.start, again.fresh) == (first.start, 0)
 
 
 def test_there_are_no_more_slots_than_numbers() -> None:
-    slots = Slots(PAGE_BYTES, 100 * PAGE_BYTES, range(8, 10))
+    slots = Slots(bytearray(20), PAGE_BYTES, 100 * PAGE_BYTES, range(8, 10))
     assert [slots.take(1, 10**9) is None for _ in range(3)] == [False, False, True]
+
+
+def test_a_holder_of_two_values_gets_more_while_they_are_small() -> None:
+    slots, holder = Slots(bytearray(20), PAGE_BYTES, 100 * PAGE_BYTES, range(8, 20)), object()
+    slot = slots.take(PAGE_BYTES, 10**9)
+    assert slot is not None
+    shared = [slots.share(slot.number, holder, 3 * PAGE_BYTES) for _ in range(4)]
+    assert [number is None for number in shared] == [False, False, False, True]
+    slots.take_back(holder)
+    assert slots.share(slot.number, holder, PAGE_BYTES) is not None
+
+
+def test_a_slot_is_free_when_the_last_of_its_numbers_is() -> None:
+    slots = Slots(bytearray(20), PAGE_BYTES, 2 * PAGE_BYTES, range(8, 20))  # one page
+    slot = slots.take(PAGE_BYTES, 10**9)
+    assert slot is not None
+    shared = [slots.share(slot.number, holder, 1) for holder in "ab"]
+    for number in (slot.number, *shared):
+        assert slots.take(PAGE_BYTES, 10**9) is None
+        assert number is not None
+        slots.free(number)
+    assert slots.take(PAGE_BYTES, 10**9) is not None

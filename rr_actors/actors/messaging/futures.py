@@ -477,15 +477,23 @@ for _name in ("filter", "join", "map", "reduce"):
 
 
 class StopReply(Reply[bool]):
-    """The future of a stop: True, or False if the actor was dead already."""
+    """The future of a stop: True, or False if the actor was dead already.
+
+    Attributes:
+        ended: called when the actor has ended, before anybody can read True.
+    """
+
+    ended: Callable[[], object] | None = None
 
     def set(self, value: Any = None) -> None:
         """Note that the actor has ended: set True."""
+        if self.ended is not None:
+            self.ended()
         super().set(True)
 
     def set_unopened(self, unpack: Any, *, raises: bool = False) -> None:
         """Note that the actor has ended, as its process reports: set True."""
-        super().set(True)
+        self.set()
 
     def set_exception(self, exc_info: ExcInfo | BaseException | None = None) -> None:
         """Set False if the actor was dead already or could not be asked; else set the exception."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import signal
 import threading
@@ -16,7 +15,7 @@ from pykka import ActorDeadError, ActorRegistry
 from rr_actors.actors.messaging import death_watch
 from rr_actors.actors.messaging.ask_cycles import Chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
-from rr_actors.actors.messaging.futures import Reply
+from rr_actors.actors.messaging.futures import Reply, StopReply
 from rr_actors.actors.messaging.mailbox import Mailbox, refuse_all
 from rr_actors.actors.remote.inbound import Asker, Visitor
 from rr_actors.actors.remote.peer import Call, Cut, Line, Whereabouts
@@ -181,16 +180,15 @@ class ActorHub:
         self._call(where, reply, lambda number, _: Inquire(number, where.target.urn, what))
         return reply
 
-    def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
+    def halt(self, where: Whereabouts, reply: StopReply, reason: str, *, final: bool) -> Callable[[], None]:
         """Send the actor a stop; `reply` is set when the actor has ended."""
         address = self._locate(where)
 
         def ended() -> None:
-            with contextlib.suppress(Exception):  # it was not stopped
-                if reply.get(timeout=0) and (where.path is None or self._has_own_process(where.path)):
-                    where.ended_at = address
+            if where.path is None or self._has_own_process(where.path):
+                where.ended_at = address
 
-        reply.when_set(ended)
+        reply.ended = ended
         return self._call(where, reply, lambda number, _: Halt(number, where.target.urn, reason, final))
 
     def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:

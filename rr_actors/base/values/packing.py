@@ -8,6 +8,7 @@ types, so nothing is added there, except in fields that may hold any value.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import datetime
 import weakref
@@ -215,12 +216,17 @@ def _with_packed(value: Any, names: Sequence[str]) -> Any:
         return _ordered(value)
     if not names:
         return value
+    if isinstance(value, msgspec.Struct):  # it has no __new__ without its fields
+        struct = copy.copy(value)
+        for name in names:
+            if hasattr(value, name):
+                msgspec.structs.force_setattr(struct, name, _pack(getattr(value, name)))
+        return struct
     clone: Any = cls.__new__(cls)
-    put = msgspec.structs.force_setattr if isinstance(value, msgspec.Struct) else object.__setattr__
     for name in field_names(value) or ():
         if hasattr(value, name):
             part = getattr(value, name)
-            put(clone, name, _pack(part) if name in names else part)
+            object.__setattr__(clone, name, _pack(part) if name in names else part)
     return clone
 
 

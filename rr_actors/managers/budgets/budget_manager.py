@@ -12,15 +12,21 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import msgspec
 
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import LoadFailed, NotFound, OverCapacity, RrError, UsageError, shown
+from rr_actors.base.names import short_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.budget_record import BudgetRecord
+from rr_actors.managers.budgets.gauge import Gauge
+from rr_actors.managers.budgets.measures import Measure, next_capacity
 from rr_actors.managers.budgets.planner import Asked, Plan, Running, Spare, plan
 from rr_actors.managers.budgets.pools import Pool, Reserve, check_amount, read_pools
+from rr_actors.managers.budgets.probes import probe_of
+from rr_actors.managers.budgets.words import Around, gives_way, has_room, waits
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current, current_or_none
 from rr_actors.registrar.engine.status import Status
@@ -28,6 +34,7 @@ from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import Phase, State
 from rr_actors.registrar.queries import ResourceInfo
 from rr_actors.registrar.registrar import NO_FIELDS
+from rr_actors.runtime.processes.control_groups import CONTROLLERS, ControlGroups
 
 logger = Log("rr_actors.managers.budgets")
 
@@ -42,6 +49,11 @@ def _whose() -> str:
     return "" if callback is None else callback.resource_id
 
 
+def _whose_name() -> str:
+    callback = current_or_none()
+    return "" if callback is None else callback.name
+
+
 class Share(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The request for a part of a pool. Load it as a part, in the load callback of what needs it.
 
@@ -52,12 +64,14 @@ class Share(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             others that are revoked, is waited for in any case. `timeout_s` of the load should be longer.
         instance: a name that distinguishes requests that are otherwise the same, which would be one share. By default
             the resource whose callback makes the request.
+        whose: for people, the name of what the share is for. By default that of the same resource.
     """
 
     pool: str
     amount: float
     wait_s: float = 0.0
     instance: str = msgspec.field(default_factory=_whose)
+    whose: str = msgspec.field(default_factory=_whose_name)
 
 
 class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -68,21 +82,37 @@ class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     instance: str = msgspec.field(default_factory=_whose)
 
 
+_REQUESTS = {"share": Share, "supply": Supply}
+
+
 class PoolInfo(msgspec.Struct, frozen=True):
-    """A pool at one moment: `capacity` with its supplies, `used`, and how many loads are `waiting`."""
+    """A pool at one moment: `capacity` with its supplies, `used`, and how many loads are `waiting`.
+
+    `problem`: what is wrong with the probe of its measure; meanwhile the last measured capacity holds. `enforced`:
+    external programs can use no more of it than their shares. That is so of the pools "cpu" and "memory_bytes", where
+    control groups can be made.
+    """
 
     name: str
     capacity: float
     used: float
     waiting: int
+    problem: str = ""
+    enforced: bool = False
+
+    @property
+    def free(self) -> float:
+        """What is left of the capacity, at least 0."""
+        return max(0.0, self.capacity - self.used)
 
 
 class _Waiting(msgspec.Struct):
-    """A share that is being loaded. `outcome` is set when it is decided."""
+    """A share that is being loaded. `admitted` is set when it is decided; `said`: behind whom it waits until then."""
 
     share: Share
     since: float
     deadline: float
+    said: str = ""
     admitted: bool | None = None
     error: LoadFailed | None = None
 
@@ -92,19 +122,27 @@ class _Book(msgspec.Struct):
 
     pool: Pool
     capacity: float
+    measured: float = math.inf
+    problem: str = ""  # of its probe
     shares: dict[str, float] = {}
     since: dict[str, float] = {}
     supplies: dict[str, float] = {}
     waiting: dict[str, _Waiting] = {}
     leaving: set[str] = set()
-    starting: set[str] = set()
+    starting: dict[str, float] = {}  # reserves, and when what is over the capacity cannot wait for them any more
     stopping: dict[str, float] = {}  # the capacity without the reserve, until it has stopped
     failed: dict[str, float] = {}  # reserves that could not be loaded, and when they may be tried again
     looked: float = -math.inf
 
     def total(self) -> float:
         """Return the capacity with the supplies, without those that are about to end."""
-        return min([self.capacity + math.fsum(self.supplies.values()), *self.stopping.values()])
+        own = min(self.capacity, self.measured)
+        return min([own + math.fsum(self.supplies.values()), *self.stopping.values()])
+
+    def info(self) -> PoolInfo:
+        name = self.pool.name
+        enforced = name in CONTROLLERS and name in ControlGroups.of_this_process().limits()
+        return PoolInfo(name, self.total(), self.used(), len(self.waiting), self.problem, enforced)
 
     def used(self) -> float:
         return math.fsum(self.shares.values())
@@ -130,6 +168,16 @@ class Budgets(Manager):
         check_amount(None, "grace_s", grace_s)
         self._grace_s = grace_s
         self._changed = threading.Condition(threading.RLock())
+        self._gauges = [
+            Gauge(
+                pool.measure,
+                probe_of(pool.measure.probe),
+                functools.partial(self._measured, name, pool.measure),
+                functools.partial(self._troubled, name),
+            )
+            for name, pool in self._pools.items()
+            if pool.measure is not None
+        ]
 
     def on_start(self) -> None:
         """Go on with what was held, and with the reserves; look whether all of it still fits."""
@@ -145,11 +193,20 @@ class Budgets(Manager):
                 self.registrar.on_status(server_id, self._reserve_status)
             for name in self._books:
                 self._settle(name)
+        for gauge in self._gauges:
+            gauge.start()
+
+    def on_stop(self) -> None:
+        """Measure no more."""
+        for gauge in self._gauges:
+            gauge.stop()
 
     # -- messages --------------------------------------------------------------------------------------------------
 
     def set_capacity(self, pool: str, capacity: float) -> None:
         """Set what a pool has without its supplies, also after a restart, until the file says something else.
+
+        With a measure it is the most that the pool has.
 
         If that is less than what is held, a reserve is started, or the lowest priorities are revoked.
 
@@ -167,7 +224,15 @@ class Budgets(Manager):
     def pools(self) -> list[PoolInfo]:
         """Return all pools as they are now."""
         with self._changed:
-            return [PoolInfo(name, book.total(), book.used(), len(book.waiting)) for name, book in self._books.items()]
+            return [book.info() for book in self._books.values()]
+
+    def on_receive(self, message: Any) -> list[dict[str, Any]]:
+        """Answer what `rr-actors budgets` asks."""
+        match message:
+            case {"pools": None}:
+                return [msgspec.structs.asdict(info) | {"free": info.free} for info in self.pools()]
+            case _:
+                raise UsageError(f"{self.registrar.name}: expected a question to Budgets, got {shown(message)}")
 
     # -- servers ---------------------------------------------------------------------------------------------------
 
@@ -231,13 +296,15 @@ class Budgets(Manager):
         self._settle(pool)
         said = ""
         while one.admitted is None:
-            if said != (said := self._room(book, one.share)):
-                current().progress(0.0, said)  # `rr-actors why`, `resources` and `top` show it
+            if said != (said := one.said):
+                current().progress(0.0, said)  # an event; `rr-actors why`, `loads` and `resources` show it, too
             self._changed.wait(_POLL_S)
             if one.admitted is None and time.monotonic() - book.looked >= _POLL_S:
                 self._settle(pool)
         if one.error is not None:
             raise one.error
+        if said:
+            current().progress(1.0, has_room(pool, one.share.amount, max(0.0, time.time() - one.since)))
 
     def _admit(self, book: _Book, id: str) -> None:
         one = book.waiting[id]
@@ -279,6 +346,10 @@ class Budgets(Manager):
         self._carry_out(book, infos, plan(book.total(), book.pool.policy, running, asked, self._spares(book)))
         self._changed.notify_all()
 
+    def _look(self, pool: str) -> None:
+        with self._changed:
+            self._settle(pool)
+
     def _asked(self, book: _Book, id: str, one: _Waiting, infos: dict[str, ResourceInfo]) -> Asked:
         most = max(book.pool.capacity, book.capacity) + math.fsum(book.supplies.values())
         most += math.fsum(spare.amount for spare in self._spares(book) if spare.state != "on")
@@ -292,19 +363,30 @@ class Budgets(Manager):
             self._admit(book, id)
         for id in made.refuse:
             self._refuse(book, id, infos)
-        for id in made.revoke:
+        reasons = {id: self._reason(book, id, infos, made) for id in made.revoke}
+        for id, why in reasons.items():
             book.leaving.add(id)
-            self._in_thread(self._revoke, book, id)
+            self._in_thread(self._revoke, book, id, why)
         for key in made.start:
-            book.starting.add(key)
+            book.starting[key] = time.monotonic() + self._grace_s
             self._in_thread(self._start_reserve, book, key)
         for key in made.stop:
             book.stopping[key] = book.total() - self._reserve(book, key).amount
             self._in_thread(self._stop_reserve, book, key)
+        holding = [id for id in book.shares if id not in book.leaving]
+        for at, id in enumerate(made.wait):
+            one, around = book.waiting[id], Around(made.wait[:at], [*book.leaving], holding, len(book.starting))
+            one.said = waits(self._room(book, one.share), around, functools.partial(_name, infos))
 
-    def _revoke(self, book: _Book, id: str) -> None:
+    def _reason(self, book: _Book, id: str, infos: dict[str, ResourceInfo], made: Plan) -> str:
+        """Return why a share is revoked."""
+        stays = math.fsum(amount for one, amount in book.shares.items() if one not in book.leaving)
+        less = book.total() if stays > book.total() else None
+        needing = [one for one in made.wait if _is_above(infos, one, id)]
+        return gives_way(book.pool.name, less, needing, functools.partial(_name, infos))
+
+    def _revoke(self, book: _Book, id: str, why: str) -> None:
         """Revoke a share, and return when it is gone. A share that was admitted a moment ago may not be loaded yet."""
-        why = f"pool {book.pool.name!r} has no room for it"
         while True:
             try:
                 self.registrar.revoke(id, why, grace_s=self._grace_s)
@@ -318,13 +400,18 @@ class Budgets(Manager):
     def _start_reserve(self, book: _Book, key: str) -> None:
         reserve = self._reserve(book, key)
         request = NO_FIELDS if reserve.request is None else reserve.request
+        late = threading.Timer(self._grace_s, self._in_thread, (self._look, book.pool.name))
+        late.daemon = True
+        late.start()
         try:
             query = self.registrar.load(reserve.server, request, timeout_s=_RESERVE_S)
         except RrError as error:
             logger.warning("pool %s: reserve %s cannot be loaded: %s", book.pool.name, reserve.server, error)
             query = None
+        finally:
+            late.cancel()
         with self._changed:
-            book.starting.discard(key)
+            book.starting.pop(key, None)
             if query is None:
                 book.failed[key] = time.monotonic() + _RETRY_S
             else:
@@ -370,7 +457,7 @@ class Budgets(Manager):
         for i, reserve in enumerate(book.pool.reserve):
             key = f"{book.pool.name}/{i}"
             if key in book.starting:
-                spares.append(Spare(key, reserve.amount, "starting"))
+                spares.append(Spare(key, reserve.amount, "starting" if now < book.starting[key] else "late"))
             elif key in held and key not in book.stopping:
                 spares.append(Spare(key, reserve.amount, "on"))
             elif key not in held and book.failed.get(key, 0.0) <= now:
@@ -395,6 +482,33 @@ class Budgets(Manager):
 
         threading.Thread(target=run, name="budgets", daemon=True).start()
 
+    # -- measures --------------------------------------------------------------------------------------------------
+
+    def _measured(self, pool: str, measure: Measure, reading: float) -> None:
+        """Take a reading of a pool's probe."""
+        with self._changed:
+            book = self._books[pool]
+            if book.problem:
+                logger.info("pool %s: its probe answers again", pool)
+                book.problem = ""
+            capacity = next_capacity(measure, book.capacity, book.measured, reading)
+            if capacity == book.measured:
+                return
+            book.measured = capacity
+            self._settle(pool)
+            try:
+                self._record.keep_measured(pool, capacity)
+            except OSError as error:  # the disk is full, say; the next change is kept again
+                logger.warning("pool %s: its measured capacity is not kept: %s", pool, error)
+
+    def _troubled(self, pool: str, problem: str) -> None:
+        """Keep the last measured capacity, and say once what is wrong."""
+        with self._changed:
+            book = self._books[pool]
+            if book.problem != problem:
+                book.problem = problem
+                logger.warning("pool %s: its probe %s; the capacity stays %g", pool, problem, book.total())
+
     # -- books -----------------------------------------------------------------------------------------------------
 
     def _book(self, pool: str) -> _Book:
@@ -411,18 +525,41 @@ class Budgets(Manager):
     @functools.cached_property
     def _books(self) -> dict[str, _Book]:
         """The books; at first of what the catalog has: a callback that runs again after a crash needs all of it."""
-        books = {name: _Book(pool, self._record.capacity(name, pool.capacity)) for name, pool in self._pools.items()}
+        books = {name: self._new_book(pool) for name, pool in self._pools.items()}
         for info in self.registrar.resources():
-            book = books.get(info.request.pool) if info.phase in _HELD else None
+            if info.phase not in _HELD or info.server not in _REQUESTS:
+                continue
+            request = msgspec.convert(info.request, _REQUESTS[info.server])  # a dict until its server is there again
+            book = books.get(request.pool)
             if book is None:
                 continue
             if info.server == "supply":
-                book.supplies[info.id] = info.request.amount
+                book.supplies[info.id] = request.amount
                 continue
-            book.shares[info.id], book.since[info.id] = info.request.amount, float(len(book.shares))
+            book.shares[info.id], book.since[info.id] = request.amount, float(len(book.shares))
             if info.status is State.FATAL:
                 book.leaving.add(info.id)
         return books
+
+    def _new_book(self, pool: Pool) -> _Book:
+        measured = math.inf if pool.measure is None else self._record.measured(pool.name)
+        return _Book(pool, self._record.capacity(pool.name, pool.capacity), measured)
+
+
+def _name(infos: dict[str, ResourceInfo], id: str) -> str:
+    """Return what a share is for, with its priority, for people."""
+    if (info := infos.get(id)) is None:
+        return f"share {short_id(id)}"
+    share = msgspec.convert(info.request, Share)
+    name = share.whose or share.instance or ", ".join(dict.fromkeys(info.holders)) or "nobody"
+    return f"{name} ({'standby' if info.priority is None else f'priority {info.priority}'})"
+
+
+def _is_above(infos: dict[str, ResourceInfo], one: str, other: str) -> bool:
+    """Return whether a share has a higher priority than another."""
+    upper = infos[one].priority if one in infos else None
+    lower = infos[other].priority
+    return upper is not None and (lower is None or upper > lower)
 
 
 def _check_request(value: float, field: str) -> None:

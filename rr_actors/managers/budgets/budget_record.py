@@ -1,7 +1,11 @@
-"""The record of a Budgets manager, on disk: the capacities that were set while it ran, and the reserves it holds."""
+"""The record of a Budgets manager, on disk.
+
+It has the capacities that were set or measured while the manager ran, and the reserves that it holds.
+"""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import msgspec
@@ -11,6 +15,7 @@ from rr_actors.managers.kept_record import KeptRecord
 
 class _Record(msgspec.Struct):
     capacities: dict[str, tuple[float, float]] = {}  # of the pool: the file's, and the one that was set in its place
+    measured: dict[str, float] = {}  # the last measured capacity of the pool
     reserves: dict[str, str] = {}  # "pool/number": the id of the query that holds it
 
 
@@ -28,6 +33,15 @@ class BudgetRecord:
     def set_capacity(self, pool: str, configured: float, capacity: float) -> None:
         """Keep a capacity that was set."""
         self._record.now.capacities[pool] = (configured, capacity)
+        self._record.save()
+
+    def measured(self, pool: str) -> float:
+        """Return the capacity that was measured last; infinite: none was."""
+        return self._record.now.measured.get(pool, math.inf)
+
+    def keep_measured(self, pool: str, capacity: float) -> None:
+        """Keep a capacity that was measured."""
+        self._record.now.measured[pool] = capacity
         self._record.save()
 
     def reserves(self) -> dict[str, str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 
@@ -40,11 +40,14 @@ class Asked(msgspec.Struct, frozen=True):
 
 
 class Spare(msgspec.Struct, frozen=True):
-    """A reserve that could add to the capacity. What an `on` one adds is in the capacity already."""
+    """A reserve that could add to the capacity. What an `on` one adds is in the capacity already.
+
+    A `late` one has been starting for so long that what is over the capacity cannot wait for it.
+    """
 
     id: str
     amount: float
-    state: Literal["off", "starting", "on"] = "off"
+    state: Literal["off", "starting", "late", "on"] = "off"
 
 
 class Plan(msgspec.Struct):
@@ -77,6 +80,10 @@ def plan(
 
     No victim has the priority of the one that gets its room, or a higher one, unless the capacity has become less than
     what runs. Then the lowest are shed, whatever the policy is. `capacity` includes every supply that is on.
+
+    A reserve may fail to start. So as long as room for somebody depends on one that is starting, the steps after
+    "supply" revoke nobody for it: it could be in vain. Nor is anybody revoked for those who come after him. To shed,
+    all is done at once.
     """
     planning = _Planning(capacity, running, reserves)
     planning.shed()
@@ -90,12 +97,21 @@ def _rank(priority: int | None) -> float:
     return _IDLE if priority is None else priority
 
 
+class _Room(NamedTuple):
+    """Shares that are to be revoked, by steps of the policy before "supply", and by later ones."""
+
+    first: list[Running]
+    later: list[Running]
+
+
 class _Planning:
     """One run of the planner.
 
     Attributes:
         free: what is free now.
         ahead: what will be free for those who have not been looked at, when all that is begun has ended.
+        coming: the part of `ahead` that depends on reserves that are starting.
+        holding: somebody waits for a reserve first.
     """
 
     def __init__(self, capacity: float, running: Sequence[Running], reserves: Sequence[Spare]) -> None:
@@ -109,24 +125,39 @@ class _Planning:
                 self._levels.setdefault(_rank(share.priority), []).append(share)
         self._amounts = {rank: total(shares) for rank, shares in self._levels.items()}
         self.free = capacity - total(running)
-        starting = total([spare for spare in reserves if spare.state == "starting"])
-        self.ahead = capacity - math.fsum(self._amounts.values()) + starting
+        self._late = total([spare for spare in reserves if spare.state == "late"])
+        self.coming = total([spare for spare in reserves if spare.state == "starting"]) + self._late
+        self.ahead = capacity - math.fsum(self._amounts.values()) + self.coming
+
+        self.holding = False
 
     def shed(self) -> None:
         """Make room for what runs already, if the capacity has become less."""
-        need = -self.ahead - self._slack
-        if need > 0 and not self._make_room(need, math.inf, ("reclaim", "supply", "preempt")):
-            self.made.revoke += [share.id for _, level in sorted(self._levels.items()) for share in reversed(level)]
-            self.made.start += [spare.id for spare in self._off]
-            self.ahead += math.fsum(self._amounts.values()) + total(self._off)
-            self._levels, self._amounts, self._off = {}, {}, []
+        need = self._late - self.ahead - self._slack
+        if need <= 0:
+            return
+        room = self._make_room(need, math.inf, ("reclaim", "supply", "preempt"))
+        if room is None:  # all there is
+            room = _Room([], [share for _, level in sorted(self._levels.items()) for share in reversed(level)])
+            self.ahead += total(room.later)
+            self._levels, self._amounts = {}, {}
+            self._start(list(self._off))
+        self._revoke(room.first + room.later)
 
     def place(self, one: Asked, policy: Sequence[Step]) -> None:
         """Admit one, or make room for it, or let it wait, or refuse it."""
         need = one.amount - self.ahead - self._slack
-        if need > 0 and not self._make_room(need, _rank(one.priority), policy):
+        room = self._make_room(need, _rank(one.priority), policy) if need > 0 else _Room([], [])
+        if room is None:
             (self.made.wait if one.patient and "wait" in policy else self.made.refuse).append(one.id)
             return
+        if not self.holding:
+            self._revoke(room.first)
+        depends = one.amount - (self.ahead - self.coming)
+        self.holding = self.holding or depends > self._slack
+        if not self.holding:
+            self._revoke(room.later)
+        self.coming -= max(0.0, depends)
         self.ahead -= one.amount
         if one.amount <= self.free + self._slack:
             self.free -= one.amount
@@ -144,8 +175,10 @@ class _Planning:
                 self.made.stop.append(spare.id)
                 spare_room -= spare.amount
 
-    def _make_room(self, need: float, rank: float, policy: Sequence[Step]) -> bool:
-        """Begin what makes `need` more room for somebody of this rank; return False if nothing makes as much.
+    def _make_room(self, need: float, rank: float, policy: Sequence[Step]) -> _Room | None:
+        """Start reserves, and choose shares, that make `need` more room for somebody of this rank.
+
+        Return None if nothing makes as much; then nothing is started.
 
         The groups of what may make room are in the order of their use. All before the last one that is needed are
         taken for granted while as little as possible of the last is chosen, and so on back to the first.
@@ -154,15 +187,22 @@ class _Planning:
         amounts: list[float] = []
         while math.fsum(amounts) < need:
             if len(amounts) == len(groups):
-                return False
+                return None
             level = groups[len(amounts)]
             amounts.append(total(self._off) if level is None else self._amounts[level])
+        room = _Room([], [])
         for level in reversed(groups[: len(amounts)]):
             amounts.pop()
             missing = need - math.fsum(amounts)
-            if missing > 0:
-                need -= self._use_reserves(missing) if level is None else self._revoke(level, missing)
-        return True
+            if missing <= 0:
+                continue
+            if level is None:
+                need -= self._use_reserves(missing)
+                continue
+            victims = self._victims(level, missing)
+            need -= total(victims)
+            (room.later if None in groups[: len(amounts)] else room.first).extend(victims)
+        return room
 
     def _groups(self, rank: float, policy: Sequence[Step]) -> list[float | None]:
         """Return the priorities that may give way to this rank, and None for the reserves, in the policy's order."""
@@ -179,17 +219,23 @@ class _Planning:
 
     def _use_reserves(self, need: float) -> float:
         chosen = first_that_do(self._off, need)
-        self._off = [spare for spare in self._off if spare not in chosen]
-        self.made.start += [spare.id for spare in chosen]
-        self.ahead += total(chosen)
+        self._start(chosen)
         return total(chosen)
 
-    def _revoke(self, level: float, need: float) -> float:
+    def _start(self, spares: list[Spare]) -> None:
+        self._off = [spare for spare in self._off if spare not in spares]
+        self.made.start += [spare.id for spare in spares]
+        self.coming += total(spares)
+        self.ahead += total(spares)
+
+    def _revoke(self, shares: list[Running]) -> None:
+        self.made.revoke += [share.id for share in shares]
+
+    def _victims(self, level: float, need: float) -> list[Running]:
         shares = sorted(self._levels[level], key=lambda share: share.since)
         chosen = fewest_newest(shares, need)
         ids = {share.id for share in chosen}
         self._levels[level] = [share for share in shares if share.id not in ids]
         self._amounts[level] = total(self._levels[level])
-        self.made.revoke += [share.id for share in chosen]
         self.ahead += total(chosen)
-        return total(chosen)
+        return chosen

@@ -11,6 +11,12 @@ A file has one table for each pool::
     server = "power/generator"
     request = "diesel"
     amount = 50
+
+    [pool.measure]                                       # what the capacity follows; see measures.py
+    probe = "psi:cpu"
+    shed_at = 60
+    restore_at = 30
+    step = 5
 """
 
 from __future__ import annotations
@@ -18,14 +24,17 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import msgspec
 
 from rr_actors.base.checks import is_number
-from rr_actors.base.errors import shown
+from rr_actors.base.errors import InvalidName, is_a, shown
+from rr_actors.base.names import parse_server_id
 from rr_actors.base.toml import read_typed, wrong
+from rr_actors.managers.budgets.measures import Measure, faults
 from rr_actors.managers.budgets.planner import Step
+from rr_actors.managers.budgets.probes import NoProbe, probe_of
 
 POLICY: tuple[Step, ...] = get_args(Step)
 
@@ -46,17 +55,19 @@ class Pool(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: such as "watts".
-        capacity: how much there is without supplies.
+        capacity: how much there is without supplies. With a measure, at most.
         policy: what makes room for a share that does not fit, in this order. "reclaim": revoke shares that are idle.
             "supply": load a reserve. "preempt": revoke shares of lower priority. "wait": wait until others release
             theirs. What is left out is not done.
         reserve: what can be loaded to add to the capacity, the preferred first.
+        measure: how the capacity is measured.
     """
 
     name: str
     capacity: float
     policy: tuple[Step, ...] = POLICY
     reserve: tuple[Reserve, ...] = ()
+    measure: Measure | None = None
 
 
 class PoolFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -75,7 +86,7 @@ def read_pools(file_or_pools: str | os.PathLike[str] | Sequence[Pool]) -> dict[s
         file: str | None = str(Path(file_or_pools).absolute())
         pools: Sequence[Pool] = read_typed(file, PoolFile).pool
     else:
-        file, pools = None, file_or_pools
+        file, pools = None, _given(file_or_pools)
     found: dict[str, Pool] = {}
     for i, pool in enumerate(pools):
         key = f"pool[{i}]"
@@ -84,11 +95,48 @@ def read_pools(file_or_pools: str | os.PathLike[str] | Sequence[Pool]) -> dict[s
             raise wrong(file, f"{key}.name", "a name that no other pool has", pool.name, where="Budgets", said=said)
         check_amount(file, f"{key}.capacity", pool.capacity)
         for j, reserve in enumerate(pool.reserve):
+            _check_server(file, f"{key}.reserve[{j}].server", reserve.server)
             check_amount(file, f"{key}.reserve[{j}].amount", reserve.amount)
         if unknown := [step for step in pool.policy if step not in POLICY]:
             raise wrong(file, f"{key}.policy", f"of {', '.join(POLICY)}", unknown[0], where="Budgets")
+        _check_measure(file, f"{key}.measure", pool.measure)
         found[pool.name] = pool
     return found
+
+
+def _given(pools: object) -> Sequence[Pool]:
+    """Return what a program has given, if it is pools; a type checker sees most of this, and not all use one."""
+    if not is_a(pools, (list, tuple)):
+        raise wrong(
+            None, "pools", "a list of rr_actors.managers.Pool, or the path of a TOML file", pools, where="Budgets"
+        )
+    for i, pool in enumerate(cast("Sequence[object]", pools)):
+        if not is_a(pool, Pool):
+            raise wrong(None, f"pool[{i}]", "an rr_actors.managers.Pool", pool, where="Budgets")
+        if not is_a(pool.name, str):
+            raise wrong(None, f"pool[{i}].name", "a str", pool.name, where="Budgets")
+        for j, reserve in enumerate(pool.reserve):
+            if not is_a(reserve, Reserve):
+                raise wrong(None, f"pool[{i}].reserve[{j}]", "an rr_actors.managers.Reserve", reserve, where="Budgets")
+    return cast("Sequence[Pool]", pools)
+
+
+def _check_server(file: str | None, key: str, server: str) -> None:
+    try:
+        parse_server_id(server)
+    except InvalidName as error:
+        raise wrong(file, key, "a server, 'registrar/server'", server, where="Budgets") from error
+
+
+def _check_measure(file: str | None, key: str, measure: Measure | None) -> None:
+    if measure is None:
+        return
+    for field, expected in faults(measure):
+        raise wrong(file, f"{key}.{field}", expected, getattr(measure, field), where="Budgets")
+    try:
+        probe_of(measure.probe)
+    except NoProbe as error:
+        raise wrong(file, f"{key}.probe", error.expected, measure.probe, where="Budgets", said=error.found) from error
 
 
 def check_amount(file: str | None, key: str, amount: float) -> None:

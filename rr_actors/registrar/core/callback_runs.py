@@ -28,7 +28,7 @@ TRIAL_S = 5.0
 _REFUSED_S = 5.0
 _REFUSED_AT_MOST_S = 600.0
 
-ROLES = ("recover", "status", "unload", "pause", "resume")
+ROLES = ("recover", "status", "unload", "pause", "resume", "health")
 """The callbacks whose runs have rows of their own."""
 
 

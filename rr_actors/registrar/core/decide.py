@@ -126,6 +126,8 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.PauseErred: recovery.pause_ended,
     c.ResumeDone: recovery.resume_ended,
     c.ResumeErred: recovery.resume_ended,
+    c.BeginProbe: recovery.begin_probe,
+    c.ProbeDone: recovery.probe_done,
     c.BeginTrial: recovery.begin_trial,
     c.TrialOver: recovery.trial_over,
     c.RefusalOver: callback_runs.refusal_over,

@@ -49,8 +49,8 @@ from rr_actors.registrar.model.rows import (
     RESTING,
     STANDBY,
     UNLOADING,
-    Query,
     Resource,
+    ServedQuery,
     State,
 )
 
@@ -112,18 +112,20 @@ def _join(decision: Decision, message: Load, resource: Resource) -> None:
         touch(decision, resource.id)
     _begin_query(decision, message, resource.id)
     if resource.phase is LOADED or (resource.phase in (PAUSING, PAUSED) and message.priority <= STANDBY):
+        decision.note(catalog.joined, message.server, catalog.joined.get(message.server, 0) + 1)
         if alone:
             decision.forget(catalog.idle, resource.id)
             decision.cause(SetTimer("linger:" + resource.id, None, None))
         decision.cause(Reply(message.origin, loaded(catalog, message.query_id, resource)))
         return
     decision.note(catalog.waiting, message.query_id, resource.id)
+    decision.note(catalog.waited, message.server, catalog.waited.get(message.server, 0) + 1)
     if alone and resource.phase is LOADING:
         limit_load(decision, resource)
     _look_for_ring(decision, message, resource)
 
 
-def join(catalog: Catalog, message: Load) -> Query | None:
+def join(catalog: Catalog, message: Load) -> ServedQuery | None:
     """Return the one row that a Load adds if it can be answered at once; None if load() has to decide it.
 
     This fast path decides as load() does: a resource that is loaded and held gets one more holder, and nothing else
@@ -150,7 +152,7 @@ def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:
     return Loaded(query_id, resource.id, resource.response or b"", types, resource.state)
 
 
-def _load_again(decision: Decision, message: Load, query: Query) -> None:
+def _load_again(decision: Decision, message: Load, query: ServedQuery) -> None:
     """Decide a Load of a known query: its answer was lost, or is still to come."""
     catalog = decision.catalog
     resource = catalog.resources[query.resource_id]
@@ -180,8 +182,8 @@ def _begin_query(decision: Decision, message: Load, resource_id: str) -> None:
         drop_notices(decision, message.origin, message.query_id)
 
 
-def _query_of(message: Load, resource_id: str) -> Query:
-    return Query(
+def _query_of(message: Load, resource_id: str) -> ServedQuery:
+    return ServedQuery(
         message.query_id,
         resource_id,
         message.origin,

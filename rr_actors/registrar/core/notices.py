@@ -19,7 +19,7 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import FellBehind, LoadResolved, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, LoadRefused, Noticed, NoticesHandled, Unload
-from rr_actors.registrar.model.rows import Hold, Notice, Query, Resource, State, is_own
+from rr_actors.registrar.model.rows import Hold, Notice, Resource, ServedQuery, State, is_own
 
 _HEARD_REMEMBERED = 20_000
 _SWEPT_EVERY = 1024
@@ -33,7 +33,7 @@ Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 # wait than Catalog.backlog, the oldest are dropped, which newer ones have made out of date.
 
 
-def notify(decision: Decision, query: Query, said: Notice, *, repeated: bool = False) -> None:
+def notify(decision: Decision, query: ServedQuery, said: Notice, *, repeated: bool = False) -> None:
     """Add a notice for the query's holder with what `said` says of the resource, and send it in its turn."""
     catalog = decision.catalog
     notice = replace(said, id=f"{said.event}:{query.id}", query_id=query.id, origin=query.origin)
@@ -163,7 +163,7 @@ def drop_notice(decision: Decision, notice: Notice) -> None:
             decision.note(catalog.behind, notice.query_id, catalog.behind[notice.query_id] - 1)
 
 
-def drop_query(decision: Decision, query: Query) -> None:
+def drop_query(decision: Decision, query: ServedQuery) -> None:
     """Remove a query that its holder has released, and the notices about it that the holder has not heard."""
     decision.forget(decision.catalog.waiting, query.id)
     decision.forget(decision.catalog.unanswered, query.id)
@@ -179,7 +179,7 @@ def drop_notices(decision: Decision, origin: str, query_id: str) -> None:
         drop_notice(decision, notice)
 
 
-def send_notices(decision: Decision, query: Query) -> None:
+def send_notices(decision: Decision, query: ServedQuery) -> None:
     """Send the notices about a query again that are on their way."""
     for notice in _notices_of(decision, query.origin, query.id):
         if decision.catalog.told.get(notice.id) and notice.origin in decision.catalog.consumers:

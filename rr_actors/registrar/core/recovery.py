@@ -52,9 +52,11 @@ from rr_actors.registrar.core.unloading import (
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.commands import (
+    BeginProbe,
     BeginTrial,
     PauseDone,
     PauseErred,
+    ProbeDone,
     RecoverDone,
     RecoverErred,
     RecoverOverdue,
@@ -64,7 +66,7 @@ from rr_actors.registrar.model.commands import (
     ResumeErred,
     TrialOver,
 )
-from rr_actors.registrar.model.effects import Died, Happened, Reply, SetTimer, StartRecover
+from rr_actors.registrar.model.effects import Died, Happened, Reply, SetTimer, StartProbe, StartRecover
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import (
     NOT_BEGUN,
@@ -227,7 +229,9 @@ def _to_recover(catalog: Catalog, server: Server) -> list[Resource]:
     """Return the server's resources that need a decision."""
     ids = catalog.by_server.get(server.name, ())
     if (
-        server.recovery == "keep" and not server.pauses and not catalog.resting and not server.has_recover
+        server.recovery == "keep"
+        and not (server.pauses or catalog.resting or server.has_recover)
+        and not catalog.callback_runs  # a health callback may have been given up
     ):  # held resources, which are most, need no decision then
         moving, holders = catalog.moving, catalog.holders
         if len(holders) == len(catalog.resources):  # every resource is held
@@ -246,10 +250,8 @@ def _recover(decision: Decision, resource: Resource, server: Server, event: str)
             retire(decision, resource)
     elif resource.state is State.FATAL:
         return  # parts of an interrupted reload stay with it until its holders release it
-    elif is_given_up(decision.catalog, "recover", resource.id):
-        why = failures.not_run_again(
-            decision.catalog, resource, "recover", deaths_of(decision.catalog, "recover", resource.id)
-        )
+    elif role := next((it for it in ("recover", "health") if is_given_up(decision.catalog, it, resource.id)), None):
+        why = failures.not_run_again(decision.catalog, resource, role, deaths_of(decision.catalog, role, resource.id))
         spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
     elif has_recover or policy == "reload":
         decision.note(decision.catalog.recovering, resource.id, ())
@@ -380,6 +382,26 @@ def _not_resumed(decision: Decision, resource: Resource, event: str, failure: Fa
     spread(decision, resource, event, State.FATAL, failure.message, catalog.origin_of(resource))
 
 
+# -- health callbacks after a crash ------------------------------------------------------------------------------------
+
+
+def begin_probe(decision: Decision, command: BeginProbe) -> None:
+    """Run a health callback in which the process before may have died: the disk has it first."""
+    if not awaits_trial(decision, "health", command.resource_id):
+        _run_probe(decision, command.resource_id, command.server)
+
+
+def _run_probe(decision: Decision, resource_id: str, server: str) -> None:
+    if resource_id in decision.catalog.resources:
+        note_begun(decision, "health", resource_id)
+    decision.cause(StartProbe(resource_id, server))
+
+
+def probe_done(decision: Decision, command: ProbeDone) -> None:
+    """Note that the process lives after the health callback."""
+    note_ended(decision, "health", command.resource_id)
+
+
 # -- callbacks that run alone ------------------------------------------------------------------------------------------
 
 
@@ -404,6 +426,8 @@ def begin_trial(decision: Decision, command: BeginTrial) -> None:
             _run_recover(decision, resource, server)
         case "pause" | "resume" if resource.phase in (PAUSING, RESUMING):
             go_on(decision, resource)
+        case "health":
+            _run_probe(decision, id, server.name)
         case "status" if catalog.deferred.get(id) and not is_busy(catalog, resource):
             start_deferred(decision, id)
         case _:

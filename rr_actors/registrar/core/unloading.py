@@ -49,8 +49,8 @@ from rr_actors.registrar.model.rows import (
     UNLOADING,
     Notice,
     Phase,
-    Query,
     Resource,
+    ServedQuery,
     State,
 )
 
@@ -73,7 +73,7 @@ def unload(decision: Decision, message: Unload) -> None:
         _release(decision, query)
 
 
-def _release(decision: Decision, query: Query) -> None:
+def _release(decision: Decision, query: ServedQuery) -> None:
     catalog = decision.catalog
     resource = catalog.resources[query.resource_id]
     last = len(catalog.holders[resource.id]) == 1

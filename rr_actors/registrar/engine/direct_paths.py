@@ -43,6 +43,7 @@ class DirectPaths(RegistrarState):
                 written = self.commits.commit_row(query)
                 if written:
                     catalog.set("queries", query.id, query)
+                    catalog.joined[load.server] = catalog.joined.get(load.server, 0) + 1
                 catalog.unfinished = None
             except Exception:  # a defect: decide() will meet it again, and report it
                 return None

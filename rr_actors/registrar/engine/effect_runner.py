@@ -51,6 +51,7 @@ class EffectRunner:
             e.StartLoad: self._start_load,
             e.StartUnload: self._start_unload,
             e.StartRecover: self._start_recover,
+            e.StartProbe: self._start_probe,
             e.StartPause: self._start_pause,
             e.StartResume: self._start_resume,
             e.StartStatus: self._start_status,
@@ -175,6 +176,11 @@ class EffectRunner:
         if server is not None:
             self._before("recover", effect.resource)
             server.start_recover(effect.resource, effect.reload)
+
+    def _start_probe(self, effect: e.StartProbe) -> None:
+        server = self._servers.get(effect.server)
+        if server is not None:
+            server.start_probe(effect.resource_id)
 
     def _start_pause(self, effect: e.StartPause) -> None:
         server = self._servers.get(effect.resource.server)

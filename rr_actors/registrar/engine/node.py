@@ -52,6 +52,9 @@ _HEARD_S = 1.0
 _TELL_S = 5.0  # how long a provider may take to write that a registrar is gone
 _LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile sends nothing
 
+MESSAGES: dict[str, Any] = {"registrar": Message, THREADS: Message, KIND: HandleMessage}
+"""The message type of each kind of link to a registrar."""
+
 
 class Node(ProcessNode):
     """This process's part of a system, with its registrars, and the handles on registrars of other processes.
@@ -70,8 +73,7 @@ class Node(ProcessNode):
         open_catalog: Callable[[RegistrarConfig, str], Store],
         remove_unneeded: Callable[[Sequence[str], str], None],
     ) -> None:
-        messages = {"registrar": Message, THREADS: Message, KIND: HandleMessage}
-        super().__init__(info, path, messages, on_event=on_event)
+        super().__init__(info, path, MESSAGES, on_event=on_event)
         self.registrars: dict[str, RegistrarActor] = {}
         self.recorder = Recorder(path, self.dispatcher, self.emit)
         self._open_catalog = open_catalog

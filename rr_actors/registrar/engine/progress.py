@@ -1,4 +1,6 @@
-"""Progress: how far a load has come. Its callback reports it, and the consumers that wait for the load hear it.
+"""Progress: how far a load has come, and how long loads have taken.
+
+A load's callback reports how far it has come, and the consumers that wait for the load hear it.
 
 Best effort: reports are not in the catalog and are not sent again, and no callback waits for them. A report is kept,
 and the event loop sends the newest one, ten times a second at most. The last report of a load leaves before the answer.
@@ -9,8 +11,10 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
+from itertools import chain
 from typing import Protocol, cast
 
 import msgspec
@@ -28,6 +32,7 @@ INTERVAL_S = 0.1
 """The time between two reports of one load, at least."""
 TEXT_LIMIT = 500
 """The number of characters that the text of a report may have."""
+_NEWEST = 500  # load callbacks of a server, of which the times are kept
 
 
 class Progress(msgspec.Struct, frozen=True):
@@ -68,6 +73,38 @@ def checked(fraction: object, text: object) -> tuple[float, str]:
     if len(exact) > TEXT_LIMIT:
         raise UsageError(f"progress: text: expected at most {TEXT_LIMIT} characters, got {len(exact)}")
     return float(number), readable(exact)
+
+
+class LoadTimes:
+    """How many load callbacks of one server have ended since it was registered, and how long they took. Any thread.
+
+    Attributes:
+        loaded, failed: how many have returned, and raised.
+        seconds: how long they took together.
+        longest_s: how long the longest took.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest: deque[float] = deque(maxlen=_NEWEST)
+        self.loaded = self.failed = 0
+        self.seconds = self.longest_s = 0.0
+
+    def take(self, began_s: float, *, failed: bool) -> None:
+        """Count a callback that began at this time of the monotonic clock, and has ended now."""
+        took_s = time.monotonic() - began_s
+        with self._lock:
+            self.failed += failed
+            self.loaded += not failed
+            self.seconds += took_s
+            self.longest_s = max(self.longest_s, took_s)
+            self._newest.append(took_s)
+
+    def p95_s(self) -> float:
+        """Return the time within which 95 % of the newest 500 callbacks ended; 0.0 if none has ended."""
+        with self._lock:
+            newest = sorted(self._newest)
+        return newest[math.ceil(0.95 * len(newest)) - 1] if newest else 0.0
 
 
 class _Reports:
@@ -135,6 +172,17 @@ class ProgressReports:
         """Return the last report of a load that runs; None if it has made none."""
         reports = self._loads.get(resource_id)
         return None if reports is None else reports.newest
+
+    @any_thread
+    def said(self) -> dict[str, str]:
+        """Return the last reports of all loads that run, as texts, by the queries that wait for them."""
+        reports = {id: shown_progress(*one.newest) for id, one in self._loads.copy().items()}
+        if not reports:
+            return {}
+        with self._registrar.lock:
+            catalog = self._registrar.whole()
+            waiting = {id: chain.from_iterable(_waiting(catalog, id).values()) for id in reports}
+            return {query_id: reports[id] for id, query_ids in waiting.items() for query_id in query_ids}
 
     def greet(self, origin: str, query_id: str) -> None:
         """Send the newest report to a consumer that has just begun to wait for a load."""

@@ -43,7 +43,7 @@ class RegistrarActor(RegistrarBase):
         self.callers: set[UnloadWaiter] = set()  # the callbacks of commands whose end somebody waits for
         self.on_failure: Callable[[BaseException], None] | None = None
         self.progress = ProgressReports(self)
-        self.publishers = Publishers(self.node.config.segments_limit_bytes)
+        self.publishers = Publishers(self.node.config.segments_limit_bytes, self.node.dispatcher.loop)
         self.consumers = Consumers(self)
         self.servers = Servers(self, self.consumers)
         self.clients = ProviderLinks(self)

@@ -28,7 +28,7 @@ from rr_actors.registrar.core.decide import Item, decide
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.rows import Held, Phase
+from rr_actors.registrar.model.rows import LOADING, Drop, Held, Phase, Put, Resource
 from rr_actors.registrar.model.store import Store
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.workers import Workers
@@ -65,6 +65,28 @@ def answered_by_line(_error: RrError | None) -> None:
     """Do nothing: this waiter marks an unload whose thread reads the answer on its own direct line."""
 
 
+class Stop(threading.Event):
+    """Says that nobody needs the result of a run of a callback any more.
+
+    `cancel`: called when it is set. `is_told`: whether the registrar has set it. User code may set it, too: to end its
+    own run, and not because the result is not needed.
+    """
+
+    cancel: Callable[[], object] | None = None
+    is_told = False
+
+    def tell(self) -> None:
+        """Say so for the registrar."""
+        self.is_told = True
+        self.set()
+
+    def set(self) -> None:
+        """Say so."""
+        super().set()
+        if self.cancel is not None:
+            self.cancel()
+
+
 class RegistrarState:
     """The catalog of one registrar, in memory and on disk.
 
@@ -93,7 +115,8 @@ class RegistrarState:
         self.sequence = itertools.count(self.catalog.since + 1)
         self.loads: dict[str, LoadWaiter] = {}
         self.unloads: dict[str, UnloadWaiter] = {}
-        self.stops: dict[tuple[str, Phase, int], threading.Event] = {}
+        self._stops: dict[str, dict[tuple[Phase, int], Stop]] = {}  # of runs of callbacks, by resource
+        self._loads_over: dict[str, threading.Event] = {}  # set when a load is over, by resource
         self.closed = False
         self._why_down = "closed"
 
@@ -147,39 +170,83 @@ class RegistrarState:
                 decision.undo()
                 raise
             decision.close()
-            if self.stops:
-                self._stop_unwanted()
+            if self._stops:
+                self._stop_unwanted(decision)
+            if self._loads_over:
+                self._say_loads_over()
+            self.catalog.deserted.clear()
             return decision
 
-    def stop_event(self, resource_id: str, phase: Phase, attempt: int) -> threading.Event:
+    def stop_event(
+        self, resource_id: str, phase: Phase, attempt: int, cancel: Callable[[], object] | None = None
+    ) -> threading.Event:
         """Return the event that is set when nobody needs this run of a callback any more, or the registrar is closed.
 
         It is the same one as long as the callback runs.
+
+        Args:
+            cancel: called when it is set, with the lock; at once if it is set already.
         """
         with self.lock:
-            event = self.stops.setdefault((resource_id, phase, attempt), threading.Event())
-            if self.closed:
-                event.set()
-            else:
-                self._stop_unwanted()
+            stop = self._stops.setdefault(resource_id, {}).setdefault((phase, attempt), Stop())
+            stop.cancel = cancel or stop.cancel
+            catalog = self.whole()
+            unwanted = self.closed or is_unwanted(catalog, resource_id, phase, attempt)
+            if unwanted:
+                stop.tell()
+            resource = catalog.resources.get(resource_id)
+            if unwanted is None or resource is None or resource.attempt != attempt:  # it cannot be needed again
+                self.end_run(resource_id, phase, attempt)
+            return stop
+
+    def end_run(self, resource_id: str, phase: Phase, attempt: int) -> bool:
+        """Forget the event of a run that ends; return whether it was told, and somebody needs the result again."""
+        if resource_id not in self._stops:
+            return False
+        with self.lock:
+            runs = self._stops.get(resource_id, {})
+            stop = runs.pop((phase, attempt), None)
+            if not runs:
+                self._stops.pop(resource_id, None)
+            was_told = stop is not None and stop.is_told
+            return was_told and not self.closed and is_unwanted(self.whole(), resource_id, phase, attempt) is False
+
+    @with_lock
+    def _stop_unwanted(self, decision: Decision) -> None:
+        catalog = self.whole()
+        rows = [change.row for change in decision.changes if type(change) is Put]
+        gone = [change.id for change in decision.changes if type(change) is Drop and change.table == "resources"]
+        for id in (*(row.id for row in rows if type(row) is Resource), *gone, *catalog.deserted):
+            for (phase, attempt), stop in self._stops.get(id, {}).items():
+                if not stop.is_told and is_unwanted(catalog, id, phase, attempt):
+                    stop.tell()
+
+    def load_over(self, resource_id: str) -> threading.Event:
+        """Return the event that is set when the load of a resource is over, or the registrar is closed."""
+        with self.lock:
+            event = self._loads_over.setdefault(resource_id, threading.Event())
+            self._say_loads_over()
             return event
 
     @with_lock
-    def _stop_unwanted(self) -> None:
+    def _say_loads_over(self) -> None:
         catalog = self.whole()
-        for run, event in list(self.stops.items()):
-            unwanted = is_unwanted(catalog, *run)
-            if unwanted:
-                event.set()
-            if unwanted is not False:
-                del self.stops[run]
+        for id in list(self._loads_over):
+            resource = catalog.resources.get(id)
+            loads = resource is not None and (resource.phase is LOADING or id in catalog.recovering)
+            if self.closed or not loads:
+                self._loads_over.pop(id).set()
 
     def stop_callbacks(self) -> None:
-        """Tell all callbacks to stop that have asked for their event."""
+        """Tell all callbacks to stop that have asked for their event, and those who wait for the end of a load."""
         with self.lock:
-            for event in self.stops.values():
+            for event in self._loads_over.values():
                 event.set()
-            self.stops.clear()
+            self._loads_over.clear()
+            for runs in self._stops.values():
+                for stop in runs.values():
+                    stop.tell()
+            self._stops.clear()
 
     def held_at(self, provider: str) -> list[Held] | None:
         """Return the rows held at a provider; None while messages wait that could change them."""

@@ -7,6 +7,7 @@ hand do not; they pass ``parent=rr.current()``.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import inspect
@@ -14,16 +15,17 @@ import threading
 import time
 import typing
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextvars import ContextVar
 from typing import Any, NoReturn, cast
 
 import msgspec
 
-from rr_actors.base.checks import check_takes, examined, is_number
+from rr_actors.base.checks import check_takes, examined, is_number, wrong_label
 from rr_actors.base.errors import (
     CircularDependency,
+    GraphError,
     InvalidResponse,
     InvalidSpec,
     LoadFailed,
@@ -40,7 +42,7 @@ from rr_actors.base.errors import (
     shown,
     text_of,
 )
-from rr_actors.base.names import check_name, new_id, short_id
+from rr_actors.base.names import check_name, named, new_id, short_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode, shown_plain, text_of_value
 from rr_actors.base.values.failure import Failure, failure_of
@@ -50,12 +52,12 @@ from rr_actors.registrar.core.callback_runs import running
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.fields import by_fields, field_names, fields_type
 from rr_actors.registrar.engine.monitor import RegistrarBase
-from rr_actors.registrar.engine.progress import checked
+from rr_actors.registrar.engine.progress import LoadTimes, checked
 from rr_actors.registrar.engine.status import Status, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
-from rr_actors.registrar.model.health import WELL, Counts, Found, Health, first_counts, judged
+from rr_actors.registrar.model.health import WELL, Found, Health, ProbeCounts, first_counts, judged
 from rr_actors.registrar.model.messages import Described, Load
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -74,6 +76,7 @@ from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.time_limits import Probes
 from rr_actors.runtime.user_loop import Done, closing, is_coroutine
 from rr_actors.runtime.workers import is_async
+from rr_actors.wire.name_service import LABELS_BYTES
 
 
 class Role(msgspec.Struct, frozen=True, eq=False):
@@ -129,6 +132,12 @@ class Current(msgspec.Struct, frozen=True):
     _registrar: RegistrarBase
     _role: Role
     interrupted: bool = False
+    _request: bytes = b""
+
+    @property
+    def name(self) -> str:
+        """The resource's name for people, its server and its request, shortened: `cameras/camera "/dev/video7"`."""
+        return named(f"{self._registrar.name}/{self.server}", text_of_value(self._request))
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Report how far the load has come, in its load or recover callback, from any thread.
@@ -156,7 +165,10 @@ class Current(msgspec.Struct, frozen=True):
 
         It is set when all who waited for the load have withdrawn it, and when the callback is overdue. It is set when
         the registrar is closed, as when its process stops. The callback is not interrupted: it waits or asks, as in
-        ``while not rr.current().stopping.wait(0.1)``, cleans up, and raises. If the load succeeds, it is not set.
+        ``while not rr.current().stopping.wait(0.1)``, cleans up, and raises. If the load succeeds, it is not set. An
+        ``async def`` callback need not ask: it is cancelled then.
+
+        If somebody asks for the resource again before a stopped callback has raised, the callback runs once more.
 
         Raises:
             UsageError: this is another callback.
@@ -166,6 +178,21 @@ class Current(msgspec.Struct, frozen=True):
             what = f"{self._registrar.name}/{self.server}: stopping in its {self._role.name} callback"
             raise UsageError(f"{what}: only load and recover callbacks have it")
         return self._registrar.stop_event(self.resource_id, phase, self.attempt)
+
+    @property
+    def loaded(self) -> threading.Event:
+        """The event that is set when the load is over, for a thread that its load or recover callback has started.
+
+        The response is on disk then, and can be replaced (`update_response`). It is set as well when the load has
+        failed, or the registrar is closed: what the thread calls then raises.
+
+        Raises:
+            UsageError: this is another callback.
+        """
+        if not self._role.reports:
+            what = f"{self._registrar.name}/{self.server}: loaded in its {self._role.name} callback"
+            raise UsageError(f"{what}: only load and recover callbacks have it")
+        return self._registrar.load_over(self.resource_id)
 
     def open_stream(self, name: str = "stream") -> Publisher:
         """Open a stream of the resource, in its load or recover callback: its holders read it with Query.stream().
@@ -279,7 +306,11 @@ _TOO_GREAT = 2**63  # as a console's answer has room for
 RECOVER_S = 30.0
 """How long a recover callback may take, if its server says nothing else."""
 
+Labels = Mapping[str, Mapping[str, str | int | float | bool]]
+"""What the resources of a server provide, by kind: `{"range": {"rate_hz": 30}}`."""
+
 _NO_HEALTH = Health()
+_CAREFUL_S = 60.0  # so long after its start, a process writes down which health callbacks run
 _ROW_BYTES = 1024  # room for the names and ids that are sent with a request, a response, or types
 
 
@@ -305,6 +336,12 @@ class ServerSpec(msgspec.Struct, frozen=True):
     resume: Callback | None = None
     health: Health | None = None
     probe: Callback | None = None
+    provides: Labels | None = None
+
+    @property
+    def labels(self) -> str:
+        """What it provides, as JSON; "" for nothing."""
+        return msgspec.json.encode(self.provides).decode() if self.provides else ""
 
 
 class Usages(dict[str, dict[str, float]]):
@@ -363,11 +400,14 @@ class ServerActor:
             RESUME: self._described(RESUME, both, self._new_response),
             PROBE: self._described(PROBE, self._probe_arguments, self._found),
         }
+        self.load_times = LoadTimes()
         self._measuring: dict[str, Future[Measured]] = {}
         health = spec.health or _NO_HEALTH
         loop, rounds = registrar.node.dispatcher.loop, (health.every_s, health.timeout_s)
         self.probes = Probes(loop, *rounds, self._probed, self._probe, self._probe_late)
-        self._health, self._counts = health, dict[str, Counts]()  # by resource
+        self._health, self._counts = health, dict[str, ProbeCounts]()  # by resource
+        self._inherited = self._held_before() if spec.health else frozenset[str]()
+        self._careful_until = time.monotonic() + _CAREFUL_S
 
     def _described(
         self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
@@ -448,22 +488,27 @@ class ServerActor:
     @on_loop
     def start_load(self, resource: Resource) -> None:
         """Run the load callback."""
-        done = functools.partial(self._load_ended, resource)
-        at_once = functools.partial(self._loaded, resource)
+        began_s = time.monotonic()
+        done = functools.partial(self._load_ended, resource, began_s)
+        at_once = functools.partial(self._loaded, resource, began_s)
         self._submit(LOAD, resource, resource.attempt, done, at_once=at_once)
 
-    def _loaded(self, resource: Resource, response: bytes) -> bool:
+    def _loaded(self, resource: Resource, began_s: float, response: bytes) -> bool:
         """Decide LoadDone in the thread that ran the callback; return False if the loop has to."""
         progress = self.registrar.progress
         if self.too_long(resource, response) is not None or progress.has_unsent(resource.id):
             return False
         progress.forget(resource.id)
         self._let_in(resource)
-        return self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
+        is_decided = self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
+        if is_decided:
+            self.load_times.take(began_s, failed=False)
+        return is_decided
 
-    def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
+    def _load_ended(self, resource: Resource, began_s: float, response: bytes, error: BaseException | None) -> None:
         self.registrar.progress.end(resource.id)
         error = error or self.too_long(resource, response)
+        self.load_times.take(began_s, failed=error is not None)
         if error is None:
             self._let_in(resource)
             self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
@@ -505,7 +550,7 @@ class ServerActor:
             return error.details[0]
         error = _alone(error)
         described = failure_of(error, self.origin)
-        if isinstance(error, (CircularDependency, OverCapacity)):
+        if isinstance(error, (CircularDependency, GraphError, OverCapacity)):
             return described
         if isinstance(error, LoadFailed):
             text, lines = described.message, error.traceback
@@ -676,12 +721,42 @@ class ServerActor:
         try:
             for id in ids:
                 resource = self.registrar.catalog.resources.get(id)
-                if resource is None:
+                if resource is not None and self._is_suspect(id):
+                    self.registrar.post(c.BeginProbe(id, self.spec.name))
+                elif resource is None:
                     self.probes.ended(id)
                 else:
                     self._submit(PROBE, resource, resource.attempt, functools.partial(self._probe_ended, id))
         finally:
             self.registrar.workers.threads.go()
+
+    def _held_before(self) -> frozenset[str]:
+        with self.registrar.lock:
+            return frozenset(self.registrar.whole().by_server.get(self.spec.name, ()))
+
+    def _is_suspect(self, resource_id: str) -> bool:
+        """Return whether the process before may have died in this callback: the disk has its next runs first.
+
+        A row for each run would cost too much for ever. The first death of a process in a health callback counts as any
+        other crash does.
+        """
+        return resource_id in self._inherited and time.monotonic() < self._careful_until
+
+    @on_loop
+    def start_probe(self, resource_id: str) -> None:
+        """Run a health callback that the disk has."""
+        resource = self.registrar.catalog.resources.get(resource_id)
+        if not self.probes.is_waiting(resource_id):  # for a server of this name that was here before
+            self.registrar.post(c.ProbeDone(resource_id))
+        elif resource is None:
+            self.probes.ended(resource_id)
+        else:
+            done = functools.partial(self._suspect_ended, resource_id)
+            self._submit(PROBE, resource, resource.attempt, done)
+
+    def _suspect_ended(self, resource_id: str, found: Found | None, error: BaseException | None) -> None:
+        self.registrar.post(c.ProbeDone(resource_id))
+        self._probe_ended(resource_id, found, error)
 
     def _probe_arguments(self, resource: Resource) -> tuple[Any, Any]:
         if not self.probes.begins(resource.id, self._is_probed):
@@ -733,7 +808,8 @@ class ServerActor:
     ) -> None:
         holder = self.registrar.catalog.holder_of(resource.id)
         interrupted = role is UNLOAD and resource.response is None
-        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, role, interrupted)
+        facts = resource.id, attempt, holder, self.spec.name, self.registrar, role, interrupted, resource.request
+        current = Current(*facts)
         run = self._runs[role] if run is None else run
         workers = self.registrar.workers
         if self.registrar.node.watched.recording:
@@ -779,26 +855,72 @@ def _wrap(
     callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
 ) -> Callback:
     """Return a function that decodes the arguments, calls the callback, and encodes its result. Off the loop."""
-    if is_async(callback):
 
-        async def run_async(current: Current, resource: Resource, *more: Any) -> Any:
-            if _is_over(current):
-                return None
+    async def run_async(current: Current, resource: Resource, *more: Any, begun: Any = None) -> Any:
+        while not _is_over(current):
             begin(current)
-            return result(await callback(*arguments(resource), *more))
-
-        return run_async
+            try:
+                answer = result(await _heeding(current, begun or callback(*arguments(resource), *more)))
+            except BaseException as error:
+                begun = None
+                if not _may_run_again(current, error):
+                    raise
+            else:
+                _end_run(current)
+                return answer
+        return None
 
     def run(current: Current, resource: Resource, *more: Any) -> Any:
-        if _is_over(current):
-            return None
-        begin(current)
-        answer = callback(*arguments(resource), *more)
-        if is_coroutine(answer):  # the callback is a wrapper or a lambda around an async function
-            return closing(answer, _then(answer, result))
-        return result(answer)
+        while not _is_over(current):
+            begin(current)
+            try:
+                answer = callback(*arguments(resource), *more)
+                if is_coroutine(answer):  # the callback is a wrapper or a lambda around an async function
+                    return closing(answer, run_async(current, resource, *more, begun=answer))
+                answer = result(answer)
+            except BaseException as error:
+                if not _may_run_again(current, error):
+                    raise
+            else:
+                _end_run(current)
+                return answer
+        return None
 
-    return run
+    return run_async if is_async(callback) else run
+
+
+async def _heeding(current: Current, answer: Awaitable[Any]) -> Any:
+    """Await the answer of a callback. If it may be stopped, it is cancelled when nobody needs it any more."""
+    role, task = _role_of(current), asyncio.current_task()
+    if role.phase is None or not role.reports or task is None:
+        return await answer
+    cancel = functools.partial(_cancel, asyncio.get_running_loop(), task)
+    serving(current).stop_event(current.resource_id, role.phase, current.attempt, cancel)
+    return await answer
+
+
+def _cancel(loop: asyncio.AbstractEventLoop, task: asyncio.Task[Any]) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop is closed, and has cancelled its tasks
+        loop.call_soon_threadsafe(task.cancel)
+
+
+def _may_run_again(current: Current, error: BaseException) -> bool:
+    """Note that a run has ended by an error; return whether it was told to stop, and its result is needed again."""
+    if not _end_run(current):
+        return False
+    if not isinstance(error, asyncio.CancelledError):
+        return isinstance(error, Exception)
+    if (task := asyncio.current_task()) is not None:
+        while task.cancelling():
+            task.uncancel()
+    return True
+
+
+def _end_run(current: Current) -> bool:
+    role = _role_of(current)
+    if role.phase is None or not role.reports:
+        return False
+    return serving(current).end_run(current.resource_id, role.phase, current.attempt)
 
 
 def _is_over(current: Current) -> bool:
@@ -811,10 +933,6 @@ def _is_over(current: Current) -> bool:
         return registrar.closed
     resource = registrar.catalog.resources.get(current.resource_id)
     return resource is None or resource.phase is UNLOADING
-
-
-async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
-    return result(await answer)
 
 
 def _text_of(error: BaseException) -> str:
@@ -854,6 +972,7 @@ class Servers:
         if old is not None and not old.restored:
             text = f"server {server.origin}: registered already; unregister it first, or take another name"
             raise NameTaken(text, name=name)
+        registrar.node.directory.put_labels(registrar.name, name, server.spec.labels)
         self._by_name[name] = server
         if old is not None:
             old.probes.close()
@@ -885,6 +1004,7 @@ class Servers:
         def ended(error: RrError | None) -> None:
             if name not in registrar.catalog.servers and (server := self._by_name.pop(name, None)) is not None:
                 server.probes.close()
+                registrar.node.directory.put_labels(registrar.name, name, "")
             done(error)
 
         registrar.post(c.Unregister(name, new_id(), ended))
@@ -990,7 +1110,29 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
             request_type=request,
             response_type=response if spec.response_type is None else spec.response_type,
             linger_s=float(spec.linger_s),
+            provides=_checked_labels(name, spec.provides),
         )
+
+
+def _checked_labels(name: str, provides: object) -> Labels | None:
+    """Return the labels as plain dicts, which can travel."""
+    if provides is None:
+        return None
+    expected = "a dict of kinds, each with a dict of what it provides"
+    if not is_a(provides, Mapping):
+        _invalid(name, "provides", expected, provides)
+    found: dict[object, Any] = {}
+    for kind, labels in cast("Mapping[object, object]", provides).items():
+        if not is_a(kind, str) or not kind:
+            _invalid(name, "provides", "kinds, each a text", kind)
+        if not is_a(labels, Mapping):
+            _invalid(name, f"provides.{kind}", expected, labels)
+        if (wrong := wrong_label(cast("Mapping[str, object]", labels))) is not None:
+            _invalid(name, ".".join(filter(None, ("provides", kind, wrong.key))), wrong.expected, wrong.got)
+        found[kind] = dict(cast("Mapping[object, object]", labels))
+    if (size := len(msgspec.json.encode(found))) > LABELS_BYTES:
+        _invalid(name, "provides", f"at most {LABELS_BYTES} bytes as JSON", size)
+    return cast("Labels", found)
 
 
 def _check_idle(name: str, spec: ServerSpec) -> None:

@@ -37,10 +37,10 @@ from rr_actors.registrar.model.rows import (
     Notice,
     Peer,
     Put,
-    Query,
     Resource,
     Revocation,
     Row,
+    ServedQuery,
     ServerType,
     State,
     StoredServer,
@@ -121,6 +121,7 @@ class Catalog:
       has ended by another way. `fresh`: queries that such a connection answered while the provider's link was down, and
       the epoch of the provider that did: a list of the same epoch over the next link may be older. `in_flight`: the
       rows of loads sent by such connections, until a decision concerns them; the threads add to it.
+    - `joined`, `waited`: by server, how many loads have joined a resource that was loaded, and one that was not yet.
     - `kept`: held queries that were owed for a while, until their unload failed. A second try may still succeed.
       Statuses of that time were passed over, so for these a response that is sent again may be newer than the row's;
       for other queries it is older.
@@ -147,6 +148,7 @@ class Catalog:
       when their parts are: the parts that have not said so, or None before they were asked.
       `unsent`: queries whose priority has changed while the provider's link was not reconciled.
       `listed`: by provider, the epoch of its run that made the last list.
+    - `deserted`: resources that were loading when their last query ended, until the engine has looked at them.
     - `shut`: why this registrar loads nothing any more for others (False), or for itself (True): it is being closed.
 
     Args:
@@ -168,7 +170,7 @@ class Catalog:
         self.epoch = epoch
         self.tables = content_of(()) if content is None else content
         self.resources: dict[str, Resource] = self.tables["resources"]
-        self.queries: dict[str, Query] = self.tables["queries"]
+        self.queries: dict[str, ServedQuery] = self.tables["queries"]
         self.held: dict[str, Held] = self.tables["held"]
         self.notices: dict[str, Notice] = self.tables["notices"]
         self.peers: dict[str, Peer] = self.tables["peers"]
@@ -216,6 +218,8 @@ class Catalog:
         self.kept: dict[str, bool] = {}
         self.fresh: dict[str, int] = {}
         self.in_flight: dict[str, Held] = {}
+        self.joined: dict[str, int] = {}
+        self.waited: dict[str, int] = {}
         self.leaving: dict[str, Any] = {}
         self.statuses: dict[str, int] = {}
         self.late: dict[str, dict[str, StartStatus]] = {}
@@ -223,6 +227,7 @@ class Catalog:
         self.trial: dict[str, bool] = {}
         self.refusing: dict[str, bool] = {}
         self.consumers: dict[str, bool] = {}
+        self.deserted: set[str] = set()
         self.unfinished: Undo | None = None  # how to undo the decision that is being applied; None between decisions
         # this Catalog asked for all queries with a greater number, and knows all about them
         self.since = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
@@ -301,7 +306,7 @@ class Catalog:
             resource = self.resources[query.resource_id]
         return resource
 
-    def queries_of(self, resource_id: str) -> list[Query]:
+    def queries_of(self, resource_id: str) -> list[ServedQuery]:
         """Return the queries on a resource."""
         return [self.queries[id] for id in self.holders.get(resource_id, ())]
 
@@ -412,10 +417,14 @@ class Catalog:
         if row is not None and (resource := self.resources.get(row.id)) is not None:
             (discard if new is None else add)(self.unloading, (resource.server, resource.request), resource.id)
 
-    def _index_query(self, old: Query | None, new: Query | None) -> None:
+    def _index_query(self, old: ServedQuery | None, new: ServedQuery | None) -> None:
         if old is not None:
             discard(self.holders, old.resource_id, old.id)
             discard(self.by_origin, old.origin, old.id)
+            if new is None and old.resource_id not in self.holders:
+                resource = self.resources.get(old.resource_id)
+                if resource is not None and resource.phase is LOADING:
+                    self.deserted.add(resource.id)
             if old.priority:
                 discard(self.ranked, old.resource_id, old.id)
         if new is not None:

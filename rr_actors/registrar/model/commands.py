@@ -179,6 +179,19 @@ class ResumeErred(Command, frozen=True):
     event: str
 
 
+class BeginProbe(Command, frozen=True):
+    """The health callback of a resource is due that was there when this process began."""
+
+    resource_id: str
+    server: str
+
+
+class ProbeDone(Command, frozen=True):
+    """That health callback has ended."""
+
+    resource_id: str
+
+
 class BeginTrial(Command, frozen=True):
     """It is this callback's turn to run, alone among those in whose runs the process has died."""
 

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import HELD, Held, Query, Resource
+from rr_actors.registrar.model.rows import HELD, Held, Resource, ServedQuery
 
 R = TypeVar("R")
 
@@ -68,13 +68,13 @@ def cut(rows: list[Held]) -> Iterator[tuple[int, bytes]]:
         yield some[-1].seq, _digest([list(map(fact, some)) for fact in _FACTS])
 
 
-def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[Query]]:
+def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[ServedQuery]]:
     """Compare a consumer's spans with the catalog; return the bounds where nothing differs, and all other queries."""
     queries = sorted(_rows(catalog.queries, catalog.by_origin.get(origin, ())), key=_number)
     resource_ids = list(map(_resource_id, queries))
     resources = _resources(catalog, resource_ids)
     same: Bounds = []
-    differing: list[Query] = []
+    differing: list[ServedQuery] = []
     begin, above = 0, _FIRST
     for last, digest in spans:
         end = bisect_right(queries, last, begin, key=_number)
@@ -121,7 +121,7 @@ def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:
     return list(map(resources.__getitem__, ids))
 
 
-def _facts(catalog: Catalog, queries: list[Query], ids: list[str], resources: list[Resource]) -> list[list[Any]]:
+def _facts(catalog: Catalog, queries: list[ServedQuery], ids: list[str], resources: list[Resource]) -> list[list[Any]]:
     """Return the facts about these queries that a digest covers, in the form in which their holder has them."""
     responses = list(map(_response, resources))
     if catalog.moving:

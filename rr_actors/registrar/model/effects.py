@@ -58,6 +58,13 @@ class StartRecover(Effect, frozen=True):
     reload: bool
 
 
+class StartProbe(Effect, frozen=True):
+    """Run the health callback of a resource, if it still is there; then post ProbeDone."""
+
+    resource_id: str
+    server: str
+
+
 class StartPause(Effect, frozen=True):
     """Run the pause callback."""
 

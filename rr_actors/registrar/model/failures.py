@@ -98,6 +98,7 @@ def not_run_again(catalog: Catalog, resource: Resource, role: str, deaths: int) 
 _BECOMES = {
     "recover": "the resource is lost",
     "reload": "the resource is lost",
+    "health": "the resource is lost",
     "pause": "the resource runs on, or is unloaded if nobody holds it",
     "resume": "the resource is lost",
     "status": "statuses of the resource go on to its holders without it",

@@ -67,7 +67,7 @@ class Found(msgspec.Struct, frozen=True):
 WELL = Found(State.OK)
 
 
-class Counts(msgspec.Struct, frozen=True):
+class ProbeCounts(msgspec.Struct, frozen=True):
     """The results of a resource's latest probes.
 
     Attributes:
@@ -87,12 +87,12 @@ class Counts(msgspec.Struct, frozen=True):
     failing_since: float | None = None
 
 
-def first_counts(state: State) -> Counts:
+def first_counts(state: State) -> ProbeCounts:
     """Return the counters of a resource that has this state, and is not probed yet."""
-    return Counts(state if state in _NOT_WELL else State.OK)
+    return ProbeCounts(state if state in _NOT_WELL else State.OK)
 
 
-def judged(health: Health, counts: Counts, found: Found, now_s: float) -> tuple[Counts, State | None]:
+def judged(health: Health, counts: ProbeCounts, found: Found, now_s: float) -> tuple[ProbeCounts, State | None]:
     """Return the counters after one more result, and the state to announce; None if it has not changed.
 
     Args:
@@ -105,16 +105,16 @@ def judged(health: Health, counts: Counts, found: Found, now_s: float) -> tuple[
     return msgspec.structs.replace(counted, state=state), state
 
 
-def _counted(counts: Counts, found: State, now_s: float) -> Counts:
+def _counted(counts: ProbeCounts, found: State, now_s: float) -> ProbeCounts:
     if found is State.OK:
-        return Counts(counts.state, passed=counts.passed + 1, unfailed=counts.unfailed + 1)
+        return ProbeCounts(counts.state, passed=counts.passed + 1, unfailed=counts.unfailed + 1)
     if found is State.WARNING:
-        return Counts(counts.state, unwell=counts.unwell + 1, unfailed=counts.unfailed + 1)
+        return ProbeCounts(counts.state, unwell=counts.unwell + 1, unfailed=counts.unfailed + 1)
     since = now_s if counts.failing_since is None else counts.failing_since
-    return Counts(counts.state, unwell=counts.unwell + 1, failed=counts.failed + 1, failing_since=since)
+    return ProbeCounts(counts.state, unwell=counts.unwell + 1, failed=counts.failed + 1, failing_since=since)
 
 
-def _state_after(health: Health, counts: Counts, found: State, now_s: float) -> State:
+def _state_after(health: Health, counts: ProbeCounts, found: State, now_s: float) -> State:
     """Return the state of a resource after its latest result, which `counts` has already."""
     if found is State.FATAL or _is_lost(health, counts, now_s):
         return State.FATAL
@@ -129,6 +129,6 @@ def _state_after(health: Health, counts: Counts, found: State, now_s: float) -> 
     return counts.state
 
 
-def _is_lost(health: Health, counts: Counts, now_s: float) -> bool:
+def _is_lost(health: Health, counts: ProbeCounts, now_s: float) -> bool:
     limit_s, since = health.fatal_after_s, counts.failing_since
     return limit_s is not None and since is not None and now_s - since >= limit_s

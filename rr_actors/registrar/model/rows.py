@@ -99,7 +99,7 @@ class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
     tries: Int64 = 0
 
 
-class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
+class ServedQuery(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One hold on a resource of this registrar, by `origin` (a registrar's name).
 
     `parent` is the origin's resource that depends on it ("" for none), and `attempt` that resource's attempt when it
@@ -241,14 +241,14 @@ class Revocation(msgspec.Struct, frozen=True, array_like=True, gc=False):
     grace_ms: Int64
 
 
-Row = Resource | Query | Held | Notice | Peer | StoredServer | ServerType | CallbackRun | Revocation
+Row = Resource | ServedQuery | Held | Notice | Peer | StoredServer | ServerType | CallbackRun | Revocation
 Table = Literal[
     "resources", "queries", "held", "notices", "peers", "stored_servers", "server_types", "callback_runs", "revocations"
 ]
 
 TABLES: dict[Table, type[Row]] = {
     "resources": Resource,
-    "queries": Query,
+    "queries": ServedQuery,
     "held": Held,
     "notices": Notice,
     "peers": Peer,

@@ -125,6 +125,12 @@ class Process:
             return False
         return True
 
+    def wait(self, timeout_s: float) -> Exited | None:
+        """Wait for the end of a process that is not watched, and return it; None: it has not ended in time."""
+        if self.exited is None and lifeline.is_readable(self._status, timeout_s):
+            self._collect()
+        return self.exited
+
     def close(self) -> None:
         """Kill the process if it lives, and close its descriptors. On the loop's thread if it is watched."""
         self.kill()

@@ -36,7 +36,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, check_significant
-from rr_actors.supervision.core.state import Call, Child, Decision, Phase, Tree, Why
+from rr_actors.supervision.core.state import Call, Decision, Phase, SupervisedChild, SupervisorState, Why
 from rr_actors.supervision.core.transition import Draft
 
 # -- messages ------------------------------------------------------------------------------------------------------
@@ -66,7 +66,9 @@ class ChildUpdated(SupervisorCall, frozen=True):
 # -- changes -------------------------------------------------------------------------------------------------------
 
 
-def start_child(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, now: float) -> Decision:
+def start_child(
+    tree: SupervisorState, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, now: float
+) -> Decision:
     """Add a child after the others and start it; under simple_one_for_one `spec` is a list of additional arguments.
 
     Reply: the child's id, or None if its on_start returned IGNORE. (The specification is kept then, unless it is
@@ -84,7 +86,7 @@ def start_child(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller
     return _perform(draft, Call("start", child.id, caller, child))
 
 
-def terminate_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decision:
+def terminate_child(tree: SupervisorState, id: str, caller: Hashable, now: float) -> Decision:
     """Stop a child that runs, starts or is about to be restarted.
 
     Its specification stays, unless it is temporary or dynamic. Reply when the child is down, at once for a dynamic
@@ -93,7 +95,7 @@ def terminate_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decisi
     return _perform(Draft(tree, now), Call("terminate", id, caller))
 
 
-def restart_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decision:
+def restart_child(tree: SupervisorState, id: str, caller: Hashable, now: float) -> Decision:
     """Start a stopped child again.
 
     Reply: its id, or None (IGNORE). Errors: ChildRunning, ChildRestarting, NotFound, NotForDynamic, StartFailed (the
@@ -102,12 +104,12 @@ def restart_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decision
     return _perform(Draft(tree, now), Call("restart", id, caller))
 
 
-def delete_child(tree: Tree, id: str, caller: Hashable, now: float) -> Decision:
+def delete_child(tree: SupervisorState, id: str, caller: Hashable, now: float) -> Decision:
     """Drop a stopped child's specification. Errors: ChildRunning, ChildRestarting, NotFound, NotForDynamic."""
     return _perform(Draft(tree, now), Call("delete", id, caller))
 
 
-def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decision:
+def update(tree: SupervisorState, spec: Supervisor, caller: Hashable, now: float) -> Decision:
     """Give the supervisor a new specification (OTP: code_change).
 
     Children that it names stay as they are, and get their new specification at their next start. New children are
@@ -124,7 +126,7 @@ def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decisi
     if tree.dynamic:
         draft.children = Children({id: replace(child, spec=new[0]) for id, child in draft.children.items()})
     else:
-        named = {s.id: replace(draft.children.get(s.id) or Child(s.id, s), spec=s) for s in new}
+        named = {s.id: replace(draft.children.get(s.id) or SupervisedChild(s.id, s), spec=s) for s in new}
         draft.children = Children(named | {id: child for id, child in draft.children.items() if id not in named})
     draft.tree = replace(tree, spec=spec)
     draft.reply([caller])
@@ -132,7 +134,7 @@ def update(tree: Tree, spec: Supervisor, caller: Hashable, now: float) -> Decisi
     return draft.done()
 
 
-def update_child(tree: Tree, id: str, spec: Supervisor) -> Tree:
+def update_child(tree: SupervisorState, id: str, spec: Supervisor) -> SupervisorState:
     """Note that the child supervisor `id` has been given a new specification, and use that one at its next start.
 
     The specification of a static child is also kept in `tree.spec`. The supervisor's own parent must hear of that.
@@ -161,12 +163,12 @@ class Counts(NamedTuple):
     workers: int
 
 
-def which_children(tree: Tree) -> list[Child]:
+def which_children(tree: SupervisorState) -> list[SupervisedChild]:
     """Return all children, newest first, as OTP lists them."""
     return list(tree.children.values())[::-1]
 
 
-def count_children(tree: Tree) -> Counts:
+def count_children(tree: SupervisorState) -> Counts:
     """Count the children. Under simple_one_for_one `specs` is 1, the template."""
     children = tree.children.values()
     supervisors = sum(child.spec.type == "supervisor" for child in children)
@@ -174,7 +176,7 @@ def count_children(tree: Tree) -> Counts:
     return Counts(1 if tree.dynamic else len(children), active, supervisors, len(children) - supervisors)
 
 
-def get_childspec(tree: Tree, id: str) -> ChildSpec:
+def get_childspec(tree: SupervisorState, id: str) -> ChildSpec:
     """Return the specification of a child, or the template for the template's id; raise NotFound if there is none.
 
     The specification of a dynamic child has the child's own id and all its arguments.
@@ -184,7 +186,7 @@ def get_childspec(tree: Tree, id: str) -> ChildSpec:
     return find_child(tree, id).start_spec
 
 
-def find_child(tree: Tree, id: str) -> Child:
+def find_child(tree: SupervisorState, id: str) -> SupervisedChild:
     """Return the child of that id; raise NotFound, with the existing children, if there is none."""
     child = tree.children.get(id)
     if child is None:
@@ -225,7 +227,7 @@ def _do(draft: Draft, call: Call) -> None:
         _do_when_settled(draft, child, call)
 
 
-def _do_when_settled(draft: Draft, child: Child, call: Call) -> None:
+def _do_when_settled(draft: Draft, child: SupervisedChild, call: Call) -> None:
     standing = _standing(child)
     if standing is None:
         draft.put(child, waiting=(*child.waiting, call))
@@ -238,7 +240,7 @@ def _do_when_settled(draft: Draft, child: Child, call: Call) -> None:
         draft.reply([call.caller])
 
 
-def _terminate(draft: Draft, child: Child, caller: Hashable) -> None:
+def _terminate(draft: Draft, child: SupervisedChild, caller: Hashable) -> None:
     if child.starters:
         draft.reply(child.starters, error=draft.start_error(child, "terminate_child() ended it"))
         child = draft.put(child, starters=())
@@ -255,7 +257,7 @@ def _terminate(draft: Draft, child: Child, caller: Hashable) -> None:
             draft.put(child, phase=Phase.STOPPING, stoppers=(*child.stoppers, caller))
 
 
-def _standing(child: Child) -> Literal["running", "restarting", "stopped"] | None:
+def _standing(child: SupervisedChild) -> Literal["running", "restarting", "stopped"] | None:
     """Return a child's state for a call; None if the call must wait for a start or stop that a caller asked for."""
     match child.phase:
         case Phase.STOPPED:
@@ -268,7 +270,7 @@ def _standing(child: Child) -> Literal["running", "restarting", "stopped"] | Non
             return "restarting" if child.why is Why.RESTART else None
 
 
-def _refusal(draft: Draft, child: Child, call: Call, standing: str) -> RrError:
+def _refusal(draft: Draft, child: SupervisedChild, call: Call, standing: str) -> RrError:
     match call.kind, standing:
         case "start", "running":
             error, what = AlreadyStarted, "is running"
@@ -283,13 +285,13 @@ def _refusal(draft: Draft, child: Child, call: Call, standing: str) -> RrError:
     return error(f"{call.kind}_child({child.id!r}): {draft.tree.path}/{child.id} {what}", id=child.id)
 
 
-def _not_found(tree: Tree, id: str) -> NotFound:
+def _not_found(tree: SupervisorState, id: str) -> NotFound:
     known = ", ".join(child.id for child in Children.of(tree.children).first(10, *Phase)) or "none"
     more = ", ..." if len(tree.children) > 10 else ""
     return NotFound(f"supervisor {tree.path} has no child {shown(id)} (it has: {known}{more})", id=id)
 
 
-def _absent(tree: Tree, id: str) -> RrError | None:
+def _absent(tree: SupervisorState, id: str) -> RrError | None:
     """Return the answer to terminate_child for an unknown id: an error, or None for a past dynamic child, as in OTP."""
     if tree.dynamic and id == tree.template.id:
         return NotForDynamic(f"terminate_child({id!r}): this is the template of {tree.path}; name a child", id=id)
@@ -300,7 +302,7 @@ def _absent(tree: Tree, id: str) -> RrError | None:
     return _not_found(tree, id)
 
 
-def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable) -> Child:
+def _newcomer(tree: SupervisorState, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable) -> SupervisedChild:
     """Return the child that start_child adds; raise InvalidSpec or TooManyChildren if there must not be one."""
     who = f"start_child of {tree.path}"
     if tree.dynamic:
@@ -311,13 +313,13 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
             text = f"{who}: it has {len(tree.children)} children, and max_children is {limit}: terminate one first"
             raise TooManyChildren(text, id=tree.path, limit=limit)
         id = tree.dynamic_id(str(tree.last_dynamic + 1))
-        child = Child(id, tree.template, tuple(spec), why=Why.NEW, starters=(caller,))
+        child = SupervisedChild(id, tree.template, tuple(spec), why=Why.NEW, starters=(caller,))
         _ = child.start_spec  # raises InvalidSpec if the arguments are wrong
         return child
     if not isinstance(spec, ChildSpec | Supervisor):
         raise _wrong_type(who, "spec", "a ChildSpec or Supervisor", spec)
     check_significant(spec, tree.spec, spec.id)
-    return Child(spec.id, as_child_spec(spec), why=Why.NEW, starters=(caller,))
+    return SupervisedChild(spec.id, as_child_spec(spec), why=Why.NEW, starters=(caller,))
 
 
 def _wrong_type(who: str, field: str, expected: str, got: object) -> InvalidSpec:
@@ -326,7 +328,7 @@ def _wrong_type(who: str, field: str, expected: str, got: object) -> InvalidSpec
     return InvalidSpec(text, field=field, expected=expected, got=got)
 
 
-def _update_error(tree: Tree, spec: object) -> InvalidSpec | None:
+def _update_error(tree: SupervisorState, spec: object) -> InvalidSpec | None:
     who = f"update of {tree.path}"
     if not isinstance(spec, Supervisor):
         return invalid(who, "spec", "a Supervisor", spec)

@@ -12,10 +12,10 @@ from collections.abc import Collection, Iterator, Mapping
 from heapq import merge
 from itertools import islice
 
-from rr_actors.supervision.core.state import Child, Phase, Why
+from rr_actors.supervision.core.state import Phase, SupervisedChild, Why
 
 _Kind = tuple[Phase, Why, bool]
-_Place = tuple[int, Child]  # its number in the order, and the child
+_Place = tuple[int, SupervisedChild]  # its number in the order, and the child
 
 _ALL = tuple(Why)
 
@@ -48,11 +48,11 @@ class _Table:
         return before
 
 
-def _kind(child: Child) -> _Kind:
+def _kind(child: SupervisedChild) -> _Kind:
     return child.phase, child.why, child.spec.significant
 
 
-class Children(Mapping[str, Child]):
+class Children(Mapping[str, SupervisedChild]):
     """Children by id, in start order. A child with a new id is put after the others.
 
     Iterating goes through all of them as they are at its begin.
@@ -60,7 +60,7 @@ class Children(Mapping[str, Child]):
 
     __slots__ = ("_id", "_newer", "_place", "_table")
 
-    def __init__(self, children: Mapping[str, Child]) -> None:
+    def __init__(self, children: Mapping[str, SupervisedChild]) -> None:
         self._table: _Table | None = None  # None: it has the children of another version
         self._newer: Children  # it differs from this one in what is at `_id`; here that is `_place`
         self._id = ""
@@ -72,11 +72,11 @@ class Children(Mapping[str, Child]):
         self._table = table
 
     @classmethod
-    def of(cls, children: Mapping[str, Child]) -> Children:
+    def of(cls, children: Mapping[str, SupervisedChild]) -> Children:
         """Return the same children as a value of this class."""
         return children if isinstance(children, Children) else cls(children)
 
-    def put(self, id: str, child: Child) -> Children:
+    def put(self, id: str, child: SupervisedChild) -> Children:
         """Return the children with this one in the place of the one of that id, or after the others."""
         table = self._own()
         before = table.places.get(id)
@@ -88,18 +88,18 @@ class Children(Mapping[str, Child]):
         """Return the children but that one."""
         return self._next(self._own(), id, None)
 
-    def first(self, count: int, *phases: Phase, whys: Collection[Why] = _ALL) -> list[Child]:
+    def first(self, count: int, *phases: Phase, whys: Collection[Why] = _ALL) -> list[SupervisedChild]:
         """Return the first children, `count` at most, that are in one of these phases for one of these purposes."""
         table = self._own()
         return [self[table.ids[number]] for number in islice(merge(*_having(table, phases, whys)), count)]
 
-    def last(self, *phases: Phase) -> Child | None:
+    def last(self, *phases: Phase) -> SupervisedChild | None:
         """Return the last child that is in one of these phases."""
         table = self._own()
         found = max((numbers[-1] for numbers in _having(table, phases, _ALL)), default=None)
         return None if found is None else self[table.ids[found]]
 
-    def after(self, id: str) -> list[Child]:
+    def after(self, id: str) -> list[SupervisedChild]:
         """Return the children that follow the one of that id."""
         table = self._own()
         number = table.places[id][0]
@@ -114,7 +114,7 @@ class Children(Mapping[str, Child]):
         """Return whether a significant child is not stopped."""
         return any(significant and phase is not Phase.STOPPED for phase, _, significant in self._own().numbers)
 
-    def __getitem__(self, id: str) -> Child:
+    def __getitem__(self, id: str) -> SupervisedChild:
         return self._own().places[id][1]
 
     def __iter__(self) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Decides what a supervisor does when a child starts, fails to start, ends or has been stopped.
 
-Every function takes the Tree, and returns the next Tree with the actions to perform. (state.py has them, and the duties
-of the performer.) `now` is monotonic seconds, `chance` a random number in [0, 1] for the backoff's jitter.
+Every function takes the state of a supervisor, and returns the next state with the actions to perform. (state.py has
+them, and the duties of the performer.) `now` is monotonic seconds, `chance` a random number in [0, 1] for the jitter.
 Administrative calls (start_child, terminate_child ...) are in child_calls.py.
 """
 
@@ -17,7 +17,6 @@ from rr_actors.supervision.core.child_calls import replay
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import Backoff, RestartType
 from rr_actors.supervision.core.state import (
-    Child,
     Decision,
     Event,
     Exit,
@@ -25,7 +24,8 @@ from rr_actors.supervision.core.state import (
     Mode,
     Phase,
     Reason,
-    Tree,
+    SupervisedChild,
+    SupervisorState,
     Why,
 )
 from rr_actors.supervision.core.transition import Draft
@@ -50,7 +50,7 @@ def needs_restart(restart: RestartType, reason: Reason) -> bool:
 # -- the supervisor ------------------------------------------------------------------------------------------------
 
 
-def decide_start(tree: Tree, now: float) -> Decision:
+def decide_start(tree: SupervisorState, now: float) -> Decision:
     """Start the supervisor: start each child when the child before it is ready.
 
     SupervisorStarted follows when all children are ready. If one fails, the children before it are stopped in reverse
@@ -65,7 +65,7 @@ def decide_start(tree: Tree, now: float) -> Decision:
     return draft.done()
 
 
-def decide_stop(tree: Tree, now: float) -> Decision:
+def decide_stop(tree: SupervisorState, now: float) -> Decision:
     """Stop the children in reverse order (under simple_one_for_one all at once), then the supervisor.
 
     Starts and backoffs in progress are cut short. A second call changes nothing.
@@ -82,12 +82,12 @@ def decide_stop(tree: Tree, now: float) -> Decision:
 # -- starts --------------------------------------------------------------------------------------------------------
 
 
-def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool = False) -> Decision:
+def decide_started(tree: SupervisorState, id: str, run: int, now: float, *, ignored: bool = False) -> Decision:
     """Note that this run is ready, or, with `ignored`, that its on_start returned IGNORE and nothing of it runs."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case Child(phase=Phase.STARTING):
+        case SupervisedChild(phase=Phase.STARTING):
             if ignored:
                 draft.down(replace(child, why=Why.RESTART), "ignored", keep=child.why is Why.MANUAL)
             else:
@@ -104,9 +104,9 @@ def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool =
                 )
             draft.reply(child.starters, id=None if ignored else id)
             replay(draft, child.waiting)
-        case Child(phase=Phase.CONDEMNED) if ignored:
+        case SupervisedChild(phase=Phase.CONDEMNED) if ignored:
             draft.put(child, phase=Phase.DUE)
-        case Child(phase=Phase.CONDEMNED):
+        case SupervisedChild(phase=Phase.CONDEMNED):
             draft.put(child, up_at=now)
         case _:
             return tree, []  # the child is being stopped: decide_stopped follows
@@ -115,15 +115,15 @@ def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool =
 
 
 def decide_start_failed(
-    tree: Tree, id: str, run: int, reason: BaseException, now: float, chance: float = 0.0
+    tree: SupervisorState, id: str, run: int, reason: BaseException, now: float, chance: float = 0.0
 ) -> Decision:
     """Decide on a run that did not become ready and has ended. `reason` is the error of its on_start or of its end."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case Child(phase=Phase.STARTING):
+        case SupervisedChild(phase=Phase.STARTING):
             _start_failed(draft, child, reason, chance)
-        case Child(phase=Phase.CONDEMNED):  # a group restart was about to stop it: the failure does not count
+        case SupervisedChild(phase=Phase.CONDEMNED):  # a group restart was about to stop it: the failure does not count
             draft.report("start_failed", child, child.state, error=reason)
             draft.put(child, phase=Phase.DUE)
         case _:
@@ -132,7 +132,7 @@ def decide_start_failed(
     return draft.done()
 
 
-def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: float) -> None:
+def _start_failed(draft: Draft, child: SupervisedChild, reason: BaseException, chance: float) -> None:
     if is_resources(reason) and not child.doubted:
         draft.report("start_failed", child, child.state, error=reason)
         draft.start(draft.put(child, doubted=True))
@@ -155,7 +155,7 @@ def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: flo
                 _restart(draft, child, "start_failed", f"start failed: {text_of(reason)}", chance, error=reason)
 
 
-def _wait_for_want(draft: Draft, child: Child, reason: BaseException, chance: float) -> None:
+def _wait_for_want(draft: Draft, child: SupervisedChild, reason: BaseException, chance: float) -> None:
     """Start the child or its group again after a pause, and count no restart."""
     delay_s = PAUSE.delay(child.wanting, chance)
     if child.spec.backoff:
@@ -177,20 +177,20 @@ def is_resources(reason: BaseException) -> bool:
 # -- ends ----------------------------------------------------------------------------------------------------------
 
 
-def decide_exit(tree: Tree, id: str, run: int, exit: Exit, now: float, chance: float = 0.0) -> Decision:
+def decide_exit(tree: SupervisorState, id: str, run: int, exit: Exit, now: float, chance: float = 0.0) -> Decision:
     """Decide on a run that had been ready and has ended without a StopChild."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case Child(phase=Phase.RUNNING):
+        case SupervisedChild(phase=Phase.RUNNING):
             _exited(draft, child, exit, chance)
-        case Child(phase=Phase.CONDEMNED):  # a group restart was about to stop it: its end does not count
+        case SupervisedChild(phase=Phase.CONDEMNED):  # a group restart was about to stop it: its end does not count
             if child.spec.restart == "temporary" and child.why is Why.RESTART:
                 draft.down(child, "exited", exit)
             else:
                 draft.report("exited", child, child.state, exit=exit)
                 draft.put(child, phase=Phase.DUE)
-        case Child(phase=Phase.STARTING):
+        case SupervisedChild(phase=Phase.STARTING):
             return decide_start_failed(tree, id, run, StartFailed(f"ended before it was ready: {exit}"), now, chance)
         case _:
             return tree, []
@@ -198,7 +198,7 @@ def decide_exit(tree: Tree, id: str, run: int, exit: Exit, now: float, chance: f
     return draft.done()
 
 
-def decide_uncounted(tree: Tree, id: str, run: int) -> Decision:
+def decide_uncounted(tree: SupervisorState, id: str, run: int) -> Decision:
     """Note that the run before this one ended in a callback of a resource: its restart does not count."""
     child = tree.children.get(id)
     if child is None or child.run != run:
@@ -208,15 +208,15 @@ def decide_uncounted(tree: Tree, id: str, run: int) -> Decision:
     return replace(tree, restarts=counted, children=children), []
 
 
-def decide_stopped(tree: Tree, id: str, run: int, exit: Exit, now: float) -> Decision:
+def decide_stopped(tree: SupervisorState, id: str, run: int, exit: Exit, now: float) -> Decision:
     """Note that the StopChild of this run is done. `exit` is normal or shutdown, or killed after the time limit."""
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case Child(phase=Phase.RECYCLING):
+        case SupervisedChild(phase=Phase.RECYCLING):
             draft.report("stopped", child, child.state, exit=exit)
             draft.put(child, phase=Phase.DUE, stoppers=())
-        case Child(phase=Phase.STOPPING):
+        case SupervisedChild(phase=Phase.STOPPING):
             draft.down(child, "stopped", exit)
         case _:
             return tree, []
@@ -227,7 +227,7 @@ def decide_stopped(tree: Tree, id: str, run: int, exit: Exit, now: float) -> Dec
     return draft.done()
 
 
-def _exited(draft: Draft, child: Child, exit: Exit, chance: float) -> None:
+def _exited(draft: Draft, child: SupervisedChild, exit: Exit, chance: float) -> None:
     backoff = child.spec.backoff
     if backoff and child.up_at is not None and draft.now - child.up_at >= backoff.maximum_s:
         child = draft.put(child, attempts=0)
@@ -239,7 +239,7 @@ def _exited(draft: Draft, child: Child, exit: Exit, chance: float) -> None:
         _auto_shutdown(draft, child)
 
 
-def _restart(draft: Draft, child: Child, event: Event, reason: str, chance: float, **details: Any) -> None:
+def _restart(draft: Draft, child: SupervisedChild, event: Event, reason: str, chance: float, **details: Any) -> None:
     """Count a restart of a child that is down, and start it or its group; give up if that restart is one too many."""
     count = draft.count_restart(child, reason)
     if count > draft.tree.spec.max_restarts:
@@ -254,7 +254,7 @@ def _restart(draft: Draft, child: Child, event: Event, reason: str, chance: floa
         draft.restart(replace(child, attempts=child.attempts + 1), delay_s)
 
 
-def _auto_shutdown(draft: Draft, child: Child) -> None:
+def _auto_shutdown(draft: Draft, child: SupervisedChild) -> None:
     """Stop the supervisor if this child's own end demands it (OTP: any_significant, all_significant)."""
     when = draft.tree.spec.auto_shutdown
     if when == "never" or not child.spec.significant:

@@ -1,11 +1,11 @@
 """The state of one supervisor as a value, and the actions that its decisions ask for.
 
-A Tree is never changed: every decision in restarts.py and child_calls.py returns a new one with the actions to perform.
-Nothing here starts, stops or waits for anything; supervision/engine.py does.
+A SupervisorState is never changed: every decision in restarts.py and child_calls.py returns a new one, with the actions
+to perform. Nothing here starts, stops or waits for anything; supervision/engine.py does.
 
 The duties of the performer, without which the decisions are wrong:
 
-- It calls the decisions one at a time, keeps the Tree that each returns, and performs the actions at once, in order.
+- It calls the decisions one at a time, keeps the state that each returns, and performs the actions at once, in order.
 - Every StartChild has a number of its own, `run`. For each it calls one `decide_started` or `decide_start_failed`
   (after the delay, the start, the time limit). Late reports do no harm: those about an earlier run of the child are
   ignored.
@@ -77,10 +77,10 @@ class Call(Struct, frozen=True):
     kind: Literal["start", "terminate", "restart", "delete"]
     id: str
     caller: Hashable
-    child: Child | None = None
+    child: SupervisedChild | None = None
 
 
-class Child(Struct, frozen=True):
+class SupervisedChild(Struct, frozen=True):
     """One child of a supervisor.
 
     Attributes:
@@ -155,8 +155,8 @@ class Mode(enum.Enum):
     STOPPED = enum.auto()
 
 
-class Tree(Struct, frozen=True):
-    """The state of one supervisor. Make it with `Tree.of(spec, path)`.
+class SupervisorState(Struct, frozen=True):
+    """The state of one supervisor. Make it with `SupervisorState.of(spec, path)`.
 
     Attributes:
         spec: its specification as last given (strategy, intensity, auto_shutdown ...; the children are in `children`).
@@ -172,7 +172,7 @@ class Tree(Struct, frozen=True):
     spec: Supervisor
     path: str
     mode: Mode = Mode.NEW
-    children: Mapping[str, Child] = field(default_factory=dict[str, Child])
+    children: Mapping[str, SupervisedChild] = field(default_factory=dict[str, SupervisedChild])
     restarts: tuple[Restart, ...] = ()
     last_run: int = 0
     last_dynamic: int = 0
@@ -181,14 +181,16 @@ class Tree(Struct, frozen=True):
     error: RrError | None = None
 
     @staticmethod
-    def of(spec: Supervisor, path: str | None = None, generation: str = "") -> Tree:
+    def of(spec: Supervisor, path: str | None = None, generation: str = "") -> SupervisorState:
         """Return a supervisor before its start: its static children stopped, or a template and no children.
 
         Dynamic children are called "template-1", "template-2" ...; with a generation "a7", "template-a7.1". Give each
         incarnation of a supervisor another one. A reference to an earlier dynamic child must not reach a new one.
         """
         specs = () if spec.strategy == "simple_one_for_one" else spec.child_specs
-        return Tree(spec, path or spec.id, children={s.id: Child(s.id, s) for s in specs}, generation=generation)
+        return SupervisorState(
+            spec, path or spec.id, children={s.id: SupervisedChild(s.id, s) for s in specs}, generation=generation
+        )
 
     @property
     def dynamic(self) -> bool:
@@ -290,4 +292,4 @@ class ExitSupervisor(Struct, frozen=True):
 
 
 Action = StartChild | StopChild | Report | Reply | SupervisorStarted | ExitSupervisor
-Decision = tuple[Tree, list[Action]]
+Decision = tuple[SupervisorState, list[Action]]

@@ -1,4 +1,4 @@
-"""Draft: the working copy of a Tree during one decision, and the steps of which all decisions are made.
+"""Draft: the working copy of a SupervisorState during one decision, and the steps of which all decisions are made.
 
 Nothing remembers what to do next: `advance` derives it from the children's phases, whatever came before.
 
@@ -23,7 +23,6 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.state import (
     Action,
-    Child,
     ChildState,
     Decision,
     Event,
@@ -36,8 +35,9 @@ from rr_actors.supervision.core.state import (
     Restart,
     StartChild,
     StopChild,
+    SupervisedChild,
     SupervisorStarted,
-    Tree,
+    SupervisorState,
     Why,
 )
 
@@ -45,14 +45,14 @@ from rr_actors.supervision.core.state import (
 class Draft:
     """The working copy of one decision. `done()` ends it."""
 
-    def __init__(self, tree: Tree, now: float = 0.0) -> None:
+    def __init__(self, tree: SupervisorState, now: float = 0.0) -> None:
         self.tree = tree
         self.now = now
         self.children = Children.of(tree.children)
         self.actions: list[Action] = []
 
     def done(self) -> Decision:
-        """Return the new Tree and the actions."""
+        """Return the new SupervisorState and the actions."""
         return replace(self.tree, children=self.children), self.actions
 
     @property
@@ -62,24 +62,24 @@ class Draft:
 
     # -- one child ---------------------------------------------------------------------------------------------------
 
-    def find(self, id: str, run: int) -> Child | None:
+    def find(self, id: str, run: int) -> SupervisedChild | None:
         """Return the child if that run is its present one."""
         child = self.children.get(id)
         return child if child is not None and child.run == run else None
 
-    def put(self, child: Child, **changes: Any) -> Child:
+    def put(self, child: SupervisedChild, **changes: Any) -> SupervisedChild:
         """Put the child with these changes in its place, and return it."""
         changed = replace(child, **changes)
         self.children = self.children.put(child.id, changed)
         return changed
 
-    def start(self, child: Child, delay_s: float = 0.0) -> None:
+    def start(self, child: SupervisedChild, delay_s: float = 0.0) -> None:
         """Start the child, as the next run."""
         self.tree = replace(self.tree, last_run=self.tree.last_run + 1)
         child = self.put(child, phase=Phase.STARTING, run=self.tree.last_run, previous=child.run, up_at=None)
         self.actions.append(StartChild(child.id, child.run, child.start_spec, delay_s, child.why))
 
-    def due(self, child: Child, delay_s: float = 0.0) -> None:
+    def due(self, child: SupervisedChild, delay_s: float = 0.0) -> None:
         """Start the child now, or, in a group, make it due until its turn comes."""
         if self.tree.grouped:
             self.tree = replace(self.tree, delay_s=max(delay_s, self.tree.delay_s))
@@ -87,16 +87,18 @@ class Draft:
         else:
             self.start(child, delay_s)
 
-    def stop(self, child: Child, phase: Phase = Phase.STOPPING) -> Child:
+    def stop(self, child: SupervisedChild, phase: Phase = Phase.STOPPING) -> SupervisedChild:
         """Stop the child's present run; `phase` is STOPPING or RECYCLING."""
         self.actions.append(StopChild(child.id, child.run, child.spec.shutdown_s))
         return self.put(child, phase=phase)
 
-    def forgets(self, child: Child) -> bool:
+    def forgets(self, child: SupervisedChild) -> bool:
         """Return whether a child is dropped when down: dynamic, temporary, or its start_child has not succeeded."""
         return self.tree.dynamic or child.spec.restart == "temporary" or child.why is Why.NEW
 
-    def down(self, child: Child, event: Event, exit: Exit | None = None, *, keep: bool = False, **details: Any) -> None:
+    def down(
+        self, child: SupervisedChild, event: Event, exit: Exit | None = None, *, keep: bool = False, **details: Any
+    ) -> None:
         """Note that a child is down and stays so. The caller answers its callers before, or afterwards from `child`.
 
         With `keep`, the specification even of a temporary child stays: so it does after a restart_child that failed.
@@ -110,7 +112,7 @@ class Draft:
 
     # -- what to tell ------------------------------------------------------------------------------------------------
 
-    def report(self, event: Event, child: Child, state: ChildState | None, **details: Any) -> None:
+    def report(self, event: Event, child: SupervisedChild, state: ChildState | None, **details: Any) -> None:
         """Add a report for the log and the history."""
         self.actions.append(Report(event, child.id, child.run, state, **details))
 
@@ -118,7 +120,7 @@ class Draft:
         """Give all these callers the same answer."""
         self.actions.extend(Reply(caller, id, error) for caller in callers)
 
-    def start_error(self, child: Child, cause: BaseException | str) -> StartFailed:
+    def start_error(self, child: SupervisedChild, cause: BaseException | str) -> StartFailed:
         """Return the error for a start that failed or was cut short."""
         text = cause if isinstance(cause, str) else text_of(cause)
         wanted = wanted_by(cause) if isinstance(cause, BaseException) else ""
@@ -140,7 +142,7 @@ class Draft:
 
     # -- restarts ----------------------------------------------------------------------------------------------------
 
-    def count_restart(self, child: Child, reason: str) -> int:
+    def count_restart(self, child: SupervisedChild, reason: str) -> int:
         """Count one more restart, and return the number of those that count now."""
         counted = within(self.tree.restarts, self.now, self.tree.spec.max_seconds)
         self.tree = replace(self.tree, restarts=(*counted, Restart(self.now, child.id, reason, child.run)))
@@ -161,7 +163,7 @@ class Draft:
             max_seconds=spec.max_seconds,
         )
 
-    def restart(self, child: Child, delay_s: float) -> None:
+    def restart(self, child: SupervisedChild, delay_s: float) -> None:
         """Start a child that is down, or its group, again."""
         self.due(replace(child, why=Why.RESTART, starters=()), delay_s)
         if self.tree.grouped:

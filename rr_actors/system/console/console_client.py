@@ -26,6 +26,7 @@ from rr_actors.system.console.console_protocol import ANSWERS, answer_of, decode
 from rr_actors.system.console.console_questions import (
     ListChildren,
     Listing,
+    ListLoads,
     ListQueries,
     ListRegistrars,
     ListResources,
@@ -38,7 +39,7 @@ from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_at
 
 _A = TypeVar("_A")
-_Page = TypeVar("_Page", c.Children, c.Registrars, c.Resources, c.Queries, c.Usages, c.Streams)
+_Page = TypeVar("_Page", c.Children, c.Registrars, c.Resources, c.QueryPage, c.Loads, c.Usages, c.Streams)
 _GREETING_S = 5.0
 _RETRY_S = 0.01
 _IDLE = 8  # connections that are kept for the next call
@@ -127,7 +128,11 @@ class ConsoleClient:
         """Return the open streams that ListStreams(match) finds, of a registrar's resources, or of all."""
         return self._all(ListStreams(match, registrar=registrar))
 
-    def queries(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> c.Queries:
+    def loads(self, registrar: str = "", match: str = "") -> c.Loads:
+        """Return the loads that wait, of one registrar or of all, and how often those of each server did."""
+        return self._all(ListLoads(match, registrar=registrar))
+
+    def queries(self, registrar: str = "", match: str = "", limit: int = sys.maxsize) -> c.QueryPage:
         """Return the queries that a registrar holds, or all, that ListQueries(match) finds; at most `limit`."""
         return self._all(ListQueries(match, registrar=registrar), limit)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from typing import Annotated, Any, Literal
 
@@ -23,6 +24,7 @@ from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id,
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.registrar.queries import response_bytes
 from rr_actors.registrar.registrar import load_bytes
@@ -74,6 +76,20 @@ class Load(Command[c.Done], frozen=True):
             return c.Done(f"loaded {server}: {holder} holds it as query {short_id(query.id)}", facts)
         query.unload(timeout_s=self.timeout_s)
         return c.Done(f"loaded {server} and released it again", facts | {"kept": False})
+
+
+def priority_from(what: str, text: str) -> int | None:
+    """Return the priority that a person has typed; None for "standby".
+
+    Raises:
+        UsageError: it is none.
+    """
+    if text == "standby":
+        return None
+    with contextlib.suppress(ValueError):
+        if LOWEST <= (number := int(text)) <= HIGHEST:
+            return number
+    raise UsageError(f"{what}: expected a whole number from {LOWEST} to {HIGHEST}, or standby, got {shown(text)}")
 
 
 class GivePriority(Command[c.Done], frozen=True):

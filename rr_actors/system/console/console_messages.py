@@ -19,7 +19,7 @@ from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.pages import QueryRow, ResourceRow, ServerRow
+from rr_actors.registrar.pages import LoadRow, QueryRow, ResourceRow, ServerRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.recording.figures import Figure
 
@@ -162,7 +162,7 @@ class Resources(Message, frozen=True):
     notes: list[str] = []
 
 
-class Queries(Message, frozen=True):
+class QueryPage(Message, frozen=True):
     """A page of queries. `notes`: registrars that could not be asked, and why."""
 
     total: int
@@ -175,6 +175,24 @@ class Servers(Message, frozen=True):
 
     total: int
     rows: list[ServerRow]
+    notes: list[str] = []
+
+
+class Response(Message, frozen=True):
+    """The whole response of a resource, as JSON; "" if there is no such resource, or its load has not returned."""
+
+    text: str
+
+
+class Loads(Message, frozen=True):
+    """A page of the queries whose loads wait, oldest first for each holder, and how often loads of each server waited.
+
+    `notes`: registrars that could not be asked, and why.
+    """
+
+    total: int
+    rows: list[QueryRow]
+    servers: list[LoadRow]
     notes: list[str] = []
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TypeVar
 
+import msgspec
+
+from rr_actors.base.errors import NotSerializable, RrError
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_view import Caller, Verb, View, room_for
 
@@ -52,6 +56,24 @@ class ListServers(Verb[c.Servers], frozen=True):
         return c.Servers(found.total, found.servers[: c.SERVERS_LIMIT], notes)
 
 
+class ListLoads(Listing[c.Loads], frozen=True):
+    """A page of the loads that wait, of one registrar or of all, and how often and how long those of its servers did.
+
+    With `match`: those with this text in ids, server or request, and the servers with it in their names.
+    """
+
+    registrar: c.Text = ""
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Loads:
+        found, notes = view.page("loads", self.registrar, self.match, self.offset, self.limit)
+        said = found.said
+        for provider in {row.server.partition("/")[0] for row in found.queries if self.registrar}:
+            with contextlib.suppress(RrError):  # it is gone, and its load as well
+                said |= view.page("loads", provider, "")[0].said
+        rows = [msgspec.structs.replace(row, said=said.get(row.id, "")) for row in found.queries]
+        return c.Loads(found.total, rows, found.loads[: c.SERVERS_LIMIT], notes)
+
+
 class ListUsages(Listing[c.Usages], frozen=True):
     """A page of resources as ListResources finds them, with what each of them uses now."""
 
@@ -77,14 +99,14 @@ class ListStreams(Listing[c.Streams], frozen=True):
         return c.Streams(found.total, found.streams[: room_for(found.streams, notes)], notes)
 
 
-class ListQueries(Listing[c.Queries], frozen=True):
+class ListQueries(Listing[c.QueryPage], frozen=True):
     """A page of the queries that one registrar holds, or all: the rows with `match` in ids, server or request."""
 
     registrar: c.Text = ""
 
-    def _carry_out(self, view: View, caller: Caller) -> c.Queries:
+    def _carry_out(self, view: View, caller: Caller) -> c.QueryPage:
         found, notes = view.page("queries", self.registrar, self.match, self.offset, self.limit)
-        return c.Queries(found.total, found.queries, notes)
+        return c.QueryPage(found.total, found.queries, notes)
 
 
 class Find(Verb[c.Found], frozen=True):
@@ -95,6 +117,19 @@ class Find(Verb[c.Found], frozen=True):
 
     def _carry_out(self, view: View, caller: Caller) -> c.Found:
         return view.find(self.id, self.registrar)
+
+
+class ReadResponse(Verb[c.Response], frozen=True):
+    """The whole response of the resource with this id."""
+
+    id: c.Text
+    registrar: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Response:
+        text = view.page("response", self.registrar, self.id)[0].response
+        if len(text.encode()) > c.RESPONSE_LIMIT_BYTES:
+            raise NotSerializable(f"resource {self.id}: its response is longer than {c.RESPONSE_LIMIT_BYTES:,} bytes")
+        return c.Response(text)
 
 
 class ListHistory(Verb[c.Happenings], frozen=True):

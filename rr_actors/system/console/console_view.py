@@ -16,7 +16,7 @@ import time
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import msgspec
 
@@ -29,7 +29,7 @@ from rr_actors.base.names import child_meant, no_child
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.pages import Page, QueryRow, ResourceRow, ServerRow, Wanted
+from rr_actors.registrar.pages import LoadRow, Page, QueryRow, ResourceRow, ServerRow, Wanted, What
 from rr_actors.registrar.registrar import Registrar, page
 from rr_actors.runtime.processes.lifeline import stopped
 from rr_actors.supervision.event_history import Record, TreeLog, records_of
@@ -44,6 +44,7 @@ from rr_actors.wire.name_service import Presence
 _LOOK_S = 5.0
 """Seconds that one supervisor may take to answer; after that, a console shows the others without it."""
 _USAGE_S = 2.0
+_ALIKE = 20  # queries of one name
 REGISTRAR = "console"
 """The registrar of the system that holds the resources that a console loads and keeps. The first such load opens it."""
 _A = TypeVar("_A")
@@ -217,17 +218,11 @@ class View:
         except RrError as error:
             return c.RegistrarRow(name, status.value, error=readable(text_of(error)))
 
-    def page(
-        self,
-        what: Literal["resources", "queries", "id", "servers", "streams"],
-        registrar: str,
-        match: str,
-        offset: int = 0,
-        limit: int = 0,
-    ) -> tuple[Page, list[str]]:
+    def page(self, what: What, registrar: str, match: str, offset: int = 0, limit: int = 0) -> tuple[Page, list[str]]:
         """Return a page over several registrars, and notes on registrars that do not answer."""
-        total, resources, queries, notes = 0, list[ResourceRow](), list[QueryRow](), list[str]()
-        servers, streams = list[ServerRow](), list[StreamRow]()
+        total, resources, queries, notes, response = 0, list[ResourceRow](), list[QueryRow](), list[str](), ""
+        said = dict[str, str]()
+        servers, loads, streams = list[ServerRow](), list[LoadRow](), list[StreamRow]()
         for name in self.up(registrar):
             left = limit - len(resources) - len(queries) - len(streams)
             wanted = Wanted(what, match, max(0, offset - total), left)
@@ -240,8 +235,11 @@ class View:
                 resources += found.resources
                 queries += found.queries
                 servers += found.servers
+                loads += found.loads
                 streams += found.streams
-        return Page(total, resources, queries, servers, streams), notes
+                said |= found.said
+                response = response or found.response
+        return Page(total, resources, queries, servers, loads, streams, response, said), notes
 
     def usages(
         self, resources: Sequence[tuple[str, str]], notes: list[str]
@@ -273,13 +271,20 @@ class View:
             part = request.partition("…")[0]
             found, notes = self.page("resources", server.partition("/")[0], part, limit=c.PAGE_LIMIT)
             rows = [row for row in found.resources if id in (row.name, f"{row.server} {row.request}")]
-            return c.Found(rows, [], notes)
+            return c.Found(rows or self._as_its_holder_names_it(id, part), [], notes)
         found, notes = self.page("id", registrar, id)
         resources, queries = found.resources, found.queries
         if any(row.id == id for row in (*resources, *queries)):
             resources = [row for row in resources if id in (row.id, *(holder.query_id for holder in row.holders))]
             queries = [row for row in queries if row.id == id]
         return c.Found(resources, queries, notes)
+
+    def _as_its_holder_names_it(self, name: str, part: str) -> list[ResourceRow]:
+        """Return the resource of this name at its holders: they have 60 in a request that its server reads as 60.0."""
+        queries = self.page("queries", "", part, limit=c.PAGE_LIMIT)[0].queries
+        named = [row for row in queries if name in (row.name, f"{row.server} {row.request}")]
+        found = [self.page("id", row.server.partition("/")[0], row.id)[0].resources for row in named[:_ALIKE]]
+        return list({row.id: row for rows in found for row in rows}.values())
 
 
 def _last_seen(records: list[Record], root: str, why: str) -> Iterator[c.ChildRow]:

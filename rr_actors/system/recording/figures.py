@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.pages import LoadRow
 
 HELP = {
     "rr_children": "Children of the supervisor tree, by state.",
@@ -23,6 +24,13 @@ HELP = {
     "rr_registrar_commits_total": "Commits of a registrar's catalog since it was opened.",
     "rr_registrar_timed_commits_total": "Those of them that were timed: the ones during a recording.",
     "rr_registrar_commit_seconds_total": "Seconds that the timed commits took together.",
+    "rr_server_loads_total": "Loads of a server since it was registered, also those that shared a resource.",
+    "rr_server_shared_loads_total": "Those of them that shared a resource, which others had loaded or were loading.",
+    "rr_server_waited_loads_total": "Those of them that were not answered at once.",
+    "rr_server_waiting_loads": "Loads of a server that wait now.",
+    "rr_server_load_failures_total": "Load callbacks of a server that raised.",
+    "rr_server_load_callback_seconds_total": "Seconds that the load callbacks of a server took together.",
+    "rr_server_load_callback_p95_seconds": "Time within which 95 % of a server's newest 500 load callbacks ended.",
     "rr_callback_failures_total": "Status callbacks that raised.",
     "rr_dead_letters_total": "Messages that reached nobody.",
     "rr_loads_total": "Loads that ended during a recording, by server and outcome.",
@@ -82,12 +90,15 @@ class Counters:
 _OPEN = 100_000  # how many loads may wait for their answers
 
 
-def figures_of(tree: Mapping[str, Any], registrars: Mapping[str, Mapping[str, Any]], dead: int) -> Iterator[Figure]:
+def figures_of(
+    tree: Mapping[str, Any], registrars: Mapping[str, Mapping[str, Any]], servers: Iterable[LoadRow], dead: int
+) -> Iterator[Figure]:
     """Return the figures of a moment.
 
     Args:
         tree: System.snapshot()["tree"].
         registrars: their stats(), by name; empty for a registrar that does not answer.
+        servers: how often and how long loads of each server waited.
         dead: the number of dead letters.
     """
     states: Counter[str] = Counter()
@@ -102,6 +113,9 @@ def figures_of(tree: Mapping[str, Any], registrars: Mapping[str, Mapping[str, An
         for key, figure in _OF_STATS.items():
             if key in stats:
                 yield Figure(figure, labels, stats[key] / 1e6 if key.endswith("_us") else stats[key])
+    for row in servers:
+        for field, figure in _OF_SERVERS.items():
+            yield Figure(figure, {"server": row.server}, getattr(row, field))
     yield Figure("rr_dead_letters_total", {}, dead)
 
 
@@ -115,6 +129,16 @@ _OF_STATS = {
     "timed_commits": "rr_registrar_timed_commits_total",
     "commit_us": "rr_registrar_commit_seconds_total",
     "callback_failures": "rr_callback_failures_total",
+}
+
+_OF_SERVERS = {
+    "loads": "rr_server_loads_total",
+    "shared": "rr_server_shared_loads_total",
+    "waited": "rr_server_waited_loads_total",
+    "loading": "rr_server_waiting_loads",
+    "failed": "rr_server_load_failures_total",
+    "seconds": "rr_server_load_callback_seconds_total",
+    "p95_s": "rr_server_load_callback_p95_seconds",
 }
 
 

@@ -7,7 +7,7 @@ ends where the next one begins.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -76,6 +76,11 @@ class Mark(msgspec.Struct, frozen=True):
     text: str
     count: int = 1
     counts: dict[str, int] = {}
+
+    @property
+    def label(self) -> str:
+        """How many events of the worst kind, and "+" if there are others: "12+"; "" for one event."""
+        return _label(self.counts or {self.kind: self.count}, self.kind)
 
 
 class Bar(msgspec.Struct, frozen=True):
@@ -276,22 +281,43 @@ def _mark_of(entry: Entry) -> Mark | None:
 # -- what is too close to be told apart --------------------------------------------------------------------------------
 
 
-def merged_marks(marks: Iterable[Mark], step_s: float) -> list[Mark]:
-    """Return the marks, with one in place of those that follow each other within step_s seconds."""
+def merged_marks(marks: Iterable[Mark], step_s: float, letter_s: float = 0.0) -> list[Mark]:
+    """Return the marks, with one in place of those that follow each other within step_s seconds.
+
+    Args:
+        letter_s: how much longer a mark is for each letter of its label.
+    """
     groups: list[list[Mark]] = []
+    counts: Counter[str] = Counter()  # of the last group
     for mark in marks:
-        if groups and mark.at - groups[-1][0].at < step_s:
+        wide_s = step_s
+        if counts:
+            wide_s += letter_s * len(_label(counts, min(counts, key=_badness)))
+        if groups and mark.at - groups[-1][0].at < wide_s:
             groups[-1].append(mark)
         else:
             groups.append([mark])
+            counts.clear()
+        if letter_s:
+            counts.update(mark.counts or {mark.kind: mark.count})
     return [group[0] if len(group) == 1 else _one_mark(group) for group in groups]
+
+
+def _label(counts: Mapping[str, int], worst: str) -> str:
+    count = counts[worst]
+    number = "" if count == 1 else f"{count}" if count < 1000 else f"{count // 1000}k"
+    return number + "+" * (len(counts) > 1)
+
+
+def _badness(kind: str) -> int:
+    return _WORST[kind]
 
 
 def _one_mark(group: list[Mark]) -> Mark:
     counts: Counter[str] = Counter()
     for mark in group:
         counts.update(mark.counts or {mark.kind: mark.count})
-    kinds = sorted(counts, key=_WORST.__getitem__)
+    kinds = sorted(counts, key=_badness)
     parts = ", ".join(f"{counts[kind]} × {KINDS[kind]}" for kind in kinds)
     lines = [line for mark in group for line in mark.text.splitlines()[1 if mark.counts else 0 :]]
     worst = [mark.text for mark in group if mark.kind == kinds[0] and not mark.counts]

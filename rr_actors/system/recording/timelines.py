@@ -39,10 +39,10 @@ MOST_LANES = 150
 MOST_SENT_LANES, MOST_SENT = 400, 20_000
 """The most lanes, and the most bars and marks, of a picture that a browser draws."""
 
-_WIDTH, _LABEL, _RIGHT = 1100, 210, 14
+_WIDTH, _LABEL, _RIGHT = 1100, 210, 36
 _TOP, _ROW = 52, 32
-_BAR_PX, _MARK_PX = 3.0, 15.0
-"""Bars that begin and end within so many pixels are merged, and marks within so many of each other."""
+_BAR_PX, _MARK_PX, _LETTER_PX = 3.0, 15.0, 7.0
+"""Bars that begin and end within so many pixels are merged. A mark is so wide, and a letter of the count beside it."""
 _TICK_PX = 96
 _STEPS_S = (
     *(0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0),
@@ -79,7 +79,7 @@ _RULES = """\
   --tl-warn: #f2b53c; --tl-good: #4fd0a8; --tl-fact: #7db9f5; --tl-calm: #a5b2ba; } }
 .rr-tl text { font: 12px system-ui, sans-serif; fill: var(--tl-text); }
 .rr-tl .dim { fill: var(--tl-dim); } .rr-tl .small { font-size: 11px; }
-.rr-tl .count { font-size: 9px; font-weight: 700; }
+.rr-tl .count { font-size: 9px; font-weight: 700; stroke: var(--tl-back); stroke-width: 2; paint-order: stroke; }
 .rr-tl .grid { stroke: var(--tl-line); } .rr-tl .back { fill: var(--tl-back); }
 .rr-tl .bar { fill: var(--tl-bar); stroke: var(--tl-edge); stroke-width: 0.7; } .rr-tl .many { fill: var(--tl-edge); }
 .rr-tl .unknown { stroke-dasharray: 3 2; } .rr-tl .starting { fill: var(--tl-start); }
@@ -119,6 +119,10 @@ class Timeline:
         self.until = max(until, since + 0.001)
         self.title = title
         self.missed = missed
+
+    def as_of(self, at: float) -> Timeline:
+        """Return the timeline as it was at a time: without what began or happened later."""
+        return Timeline([_as_of(lane, at) for lane in self.lanes], self.since, min(at, self.until), self.title)
 
     def svg(self) -> str:
         """Return an SVG document, 1,100 pixels wide, with at most 150 lanes.
@@ -166,6 +170,15 @@ class Timeline:
 def looks() -> dict[str, Any]:
     """Return what a browser needs to draw any timeline: each kind's name, shape, and whether it is about children."""
     return {kind: [name, SHAPES[kind], kind in OF_CHILDREN, kind in BAD] for kind, name in KINDS.items()}
+
+
+def _as_of(lane: Lane, at: float) -> Lane:
+    begun = [bar for bar in lane.bars if bar.begin is None or bar.begin <= at]
+    bars = [
+        bar if bar.end is not None and bar.end <= at else msgspec.structs.replace(bar, end=None, how="")
+        for bar in begun
+    ]
+    return msgspec.structs.replace(lane, bars=bars, marks=[mark for mark in lane.marks if mark.at <= at])
 
 
 def timeline_of(entries: Iterable[Entry], title: str = "", missed: int = 0) -> Timeline:
@@ -279,7 +292,7 @@ class _Drawing:
         return "".join(parts)
 
     def _lane(self, lane: Lane, y: int) -> str:
-        merged = _merged(lane, _BAR_PX * self._s_per_px, _MARK_PX * self._s_per_px)
+        merged = _merged(lane, *(pixels * self._s_per_px for pixels in (_BAR_PX, _MARK_PX, _LETTER_PX)))
         depth = min(lane.path.count("/"), 6)
         name, x = lane.path.rpartition("/")[2], 10 + 14 * depth
         label = in_short(name, (_LABEL - x) // 7)
@@ -304,9 +317,7 @@ class _Drawing:
     def _mark(self, mark: Mark, y: int) -> str:
         x = self._x(mark.at)
         shape = f'<path class="mark k-{mark.kind}" transform="translate({x:.1f} {y})" d="{SHAPES[mark.kind]}"/>'
-        count = mark.counts.get(mark.kind, mark.count)
-        label = f"{count if count > 1 else ''}{'+' if mark.count > count else ''}"
-        number = f'<text class="count" x="{x + 5:.1f}" y="{y - 3}">{label}</text>' if label else ""
+        number = f'<text class="count" x="{x + 8:.1f}" y="{y + 3}">{mark.label}</text>' if mark.label else ""
         return f"<g>{shape}{number}<title>{_text(mark.text)}</title></g>"
 
     def _legend(self, y: int) -> tuple[str, int]:
@@ -334,9 +345,9 @@ def bar_text(bar: Bar, path: str) -> str:
     return ", ".join(filter(None, (path, what, f"{begin} to {end}", how)))
 
 
-def _merged(lane: Lane, bar_s: float, mark_s: float) -> Lane:
-    tree = merged_marks((mark for mark in lane.marks if mark.kind in OF_CHILDREN), mark_s)
-    resources = merged_marks((mark for mark in lane.marks if mark.kind not in OF_CHILDREN), mark_s)
+def _merged(lane: Lane, bar_s: float, mark_s: float, letter_s: float = 0.0) -> Lane:
+    tree = merged_marks((mark for mark in lane.marks if mark.kind in OF_CHILDREN), mark_s, letter_s)
+    resources = merged_marks((mark for mark in lane.marks if mark.kind not in OF_CHILDREN), mark_s, letter_s)
     marks = sorted([*tree, *resources], key=lambda mark: mark.at)
     return msgspec.structs.replace(lane, bars=merged_bars(lane.bars, bar_s), marks=marks)
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from rr_actors.base.notebook import escape
 from rr_actors.system.console.console_messages import ChildRow, RegistrarRow
-from rr_actors.tools.process_usage import UsageWatch
+from rr_actors.tools.process_usage import RateWatch, UsageWatch
 
 STEP_S = 5.0
 STEPS = 120
@@ -80,36 +79,25 @@ class FigureCurves:
     def __init__(self) -> None:
         self._usages = UsageWatch()
         self._points: dict[str, dict[str, deque[tuple[int, float]]]] = {}
-        self._counting = threading.Lock()
-        self._loads: Counter[str] = Counter()  # since the last step
+        self._rates = RateWatch()
         self._taken_at = -_LEAST_S
         self.step = 0  # that the newest figures are of
-
-    def loaded(self, registrars: Iterable[str]) -> None:
-        """Count loads that have ended: the registrar of each."""
-        with self._counting:
-            self._loads.update(registrars)
 
     def take(self, children: Sequence[ChildRow], registrars: Sequence[RegistrarRow]) -> None:
         """Take the figures of a moment; do nothing if the last ones are not a second old."""
         if (now := time.monotonic()) < self._taken_at + _LEAST_S:
             return
         self._taken_at, step = now, int(now // STEP_S)
-        loads = None if step == self.step else self._loads_a_second(step - self.step)
         counts = {row.name: row.counts for row in registrars}
+        rates = {name: self._rates.look(name, one["loads"]) for name, one in counts.items() if "loads" in one}
         kept = {row.path: self._points.get(row.path, {}) for row in children[:_CHILDREN]}
         seen: set[int] = set()
         for row in children[:_CHILDREN]:
-            figures = {**self._usage_of(row, seen), **_of_registrar(row.id, counts, loads)}
+            figures = {**self._usage_of(row, seen), **_of_registrar(row.id, counts, rates)}
             for name, value in figures.items():
                 _add(kept[row.path].setdefault(name, deque(maxlen=STEPS)), step, value)
             seen.add(row.pid or 0)
         self._points, self.step = kept, step
-
-    def _loads_a_second(self, steps: int) -> dict[str, float]:
-        with self._counting:
-            loads, self._loads = self._loads, Counter()
-        return {registrar: count / (steps * STEP_S) for registrar, count in loads.items()}
 
     def _usage_of(self, row: ChildRow, seen: Collection[int]) -> dict[str, float]:
         """Return the CPU and memory of a child's process; of several children in one, the first one has them."""
@@ -127,13 +115,14 @@ class FigureCurves:
 
 
 def _of_registrar(
-    name: str, counts: Mapping[str, Mapping[str, int]], loads: Mapping[str, float] | None
+    name: str, counts: Mapping[str, Mapping[str, int]], rates: Mapping[str, float | None]
 ) -> dict[str, float]:
     """Return the figures of the registrar of a child; none if it is no manager, or does not answer."""
     if not (known := counts.get(name)):
         return {}
     figures = {key: float(known[key]) for key in ("mailbox", "resources") if key in known}
-    return figures if loads is None else figures | {"loads": loads.get(name, 0.0)}
+    rate = rates.get(name)
+    return figures if rate is None else figures | {"loads": rate}
 
 
 def _add(points: deque[tuple[int, float]], step: int, value: float) -> None:

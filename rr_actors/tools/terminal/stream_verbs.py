@@ -4,40 +4,23 @@ from __future__ import annotations
 
 import io
 import itertools
-import struct
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, cast
 
 import typer
 
-from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, did_you_mean, few, shown, text_of
+from rr_actors.base.errors import NotFound, UsageError, did_you_mean, few, shown, text_of
 from rr_actors.base.names import short_id, short_ids
-from rr_actors.hosting.streams import Source, StreamFrame, StreamReader, StreamRow, Wake
+from rr_actors.hosting.streams import Stream, StreamFrame, StreamRow
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_questions import Find
-from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.cli_commands import LOOK, JsonOption, StateOption, app, say, say_json, say_table
-from rr_actors.tools.explanations import readers_text
+from rr_actors.tools.explanations import age_text, bytes_text, rate_text, readers_text
+from rr_actors.tools.terminal.stream_frames import frames_of, png
 
 _LOOK_S = 1.0  # between two looks at a stream's rate, and at whether its resource is still there
-_READER = "rr-actors"
-
-
-def _bytes_text(row: StreamRow) -> str:
-    return f"{row.bytes_s / 2**20:.1f} MiB/s" if row.readers else ""
-
-
-def _rate_text(row: StreamRow) -> str:
-    return f"{row.rate:.1f}/s"
-
-
-def _age_text(row: StreamRow) -> str:
-    if row.age_s is None:
-        return "no frame"
-    return f"{row.age_s * 1000:.0f} ms" if row.age_s < 1 else ago(row.age_s)
 
 
 @app.command(rich_help_panel=LOOK, epilog="Example: rr-actors streams cameras/camera")
@@ -56,18 +39,18 @@ def streams(
     if not page.rows:
         say("no stream matches" if match or registrar else "no stream is open", err=True)
     else:
-        ids = short_ids(row.resource_id for row in page.rows)
+        ids = short_ids(row.info.resource_id for row in page.rows)
         heads = ("stream", "resource", "rate", "bytes", "age", "missed", "read by", "id")
         table = [
             (
-                row.name,
-                f"{row.server} {row.request}",
-                _rate_text(row),
-                _bytes_text(row),
-                _age_text(row),
-                str(row.missed),
+                row.info.name,
+                f"{row.info.server} {row.request}",
+                rate_text(row),
+                bytes_text(row),
+                age_text(row),
+                str(row.info.missed),
                 readers_text(row),
-                ids[row.resource_id],
+                ids[row.info.resource_id],
             )
             for row in page.rows
         ]
@@ -77,7 +60,10 @@ def streams(
 
 
 def _facts(row: StreamRow) -> dict[str, Any]:
-    return {name: getattr(row, name) for name in row.__struct_fields__} | {"missed": row.missed}
+    info = row.info
+    facts = {"name": info.name, "resource_id": info.resource_id, "server": info.server, "request": row.request}
+    figures = {"frames": row.frames, "rate": info.rate_hz, "bytes_s": info.bytes_per_s, "age_s": info.age_s}
+    return {**facts, **figures, "readers": row.readers, "missed": info.missed}
 
 
 @app.command(
@@ -111,7 +97,7 @@ def stream(
         if write is not None and save is not None:
             frame = next(_frames(client, row, timeout_s), None)
             if frame is None:
-                raise NotFound(f"stream {row.name!r}: its resource was unloaded", id=row.resource_id)
+                raise NotFound(f"stream {row.info.name!r}: its resource was unloaded", id=row.info.resource_id)
             _save(save, write, frame)
             say(f"saved frame {frame.number} in {save}")
         elif echo:
@@ -136,7 +122,7 @@ def _found(client: ConsoleClient, id: str, name: str) -> StreamRow:
         several = few(f"{row.name} ({short_id(row.id)})" for row in resources)
         raise UsageError(f"{shown(id)}: several resources have this in their ids: {several}; give more of the id")
     (resource,) = resources
-    rows = {row.name: row for row in client.streams(match=resource.id).rows}
+    rows = {row.info.name: row for row in client.streams(match=resource.id).rows}
     names = few(map(repr, rows)) or "none"
     if name and name not in rows:
         raise UsageError(f"{resource.name} has no stream {shown(name)}; it has: {names}{did_you_mean(name, rows)}")
@@ -152,11 +138,11 @@ def _found(client: ConsoleClient, id: str, name: str) -> StreamRow:
 
 def _looks(client: ConsoleClient, row: StreamRow) -> Iterator[StreamRow | None]:
     """Yield the stream's row each second; None while it is not open. It ends when the resource is gone."""
-    while client.ask(Find(row.resource_id)).resources:
-        found = [one for one in client.streams(match=row.resource_id).rows if one.name == row.name]
+    while client.ask(Find(row.info.resource_id)).resources:
+        found = [one for one in client.streams(match=row.info.resource_id).rows if one.info.name == row.info.name]
         yield found[0] if found else None
         time.sleep(_LOOK_S)
-    say(f"stream {row.name!r}: its resource was unloaded", err=True)
+    say(f"stream {row.info.name!r}: its resource was unloaded", err=True)
 
 
 def _say_rate(row: StreamRow | None, as_json: bool) -> None:
@@ -165,9 +151,9 @@ def _say_rate(row: StreamRow | None, as_json: bool) -> None:
     elif row is None:
         say("the stream is not open: its manager is being respawned, or a callback of its resource runs")
     else:
-        size = f", {_bytes_text(row)}" if row.readers else ""
+        size = f", {bytes_text(row)}" if row.readers else ""
         by = f", read by {readers_text(row)}" if row.readers else ", nobody reads it"
-        say(f"{_rate_text(row)}{size}, newest {_age_text(row)}{by}")
+        say(f"{rate_text(row)}{size}, newest {age_text(row)}{by}")
 
 
 # -- its frames ------------------------------------------------------------------------------------------------------
@@ -187,28 +173,10 @@ def _frames(client: ConsoleClient, row: StreamRow, timeout_s: float) -> Iterator
         if (now := time.monotonic()) - looked_at < _LOOK_S:
             return False
         looked_at = now
-        return not client.ask(Find(row.resource_id)).resources
+        return not client.ask(Find(row.info.resource_id)).resources
 
-    source = Source(row.resource_id, _READER, is_over, list, _unwatched, _unwatched)
-    with StreamReader(source, row.name, "latest", 1, timeout_s) as reader:
-        while True:
-            try:
-                frame = next(reader, None)
-            except TimeoutError as error:
-                raise Unavailable(str(error)) from error
-            except RrError:
-                raise
-            except Exception as error:  # of the value's own code
-                what = f"stream {row.name!r}: a frame cannot be read here: {text_of(error)}"
-                raise Unavailable(f"{what}; its classes must be importable: set PYTHONPATH, say") from error
-            if frame is None:
-                say(f"stream {row.name!r}: its resource was unloaded", err=True)
-                return
-            yield frame
-
-
-def _unwatched(wake: Wake) -> None:
-    """Do nothing: no status comes here."""
+    yield from frames_of(Stream(row.info.resource_id, row.info.name), is_over, timeout_s)
+    say(f"stream {row.info.name!r}: its resource was unloaded", err=True)
 
 
 def _say_frame(frame: StreamFrame, as_json: bool) -> None:
@@ -240,7 +208,7 @@ def _save(path: Path, write: Callable[[Any], bytes], frame: StreamFrame) -> None
 
 def _writer(path: Path) -> Callable[[Any], bytes]:
     """Return the function that makes the bytes of such a file of a value; raise UsageError if there is none."""
-    writers = {".png": _png, ".npy": _npy, ".bin": _raw}
+    writers = {".png": png, ".npy": _npy, ".bin": _raw}
     if (write := writers.get(path.suffix)) is None:
         raise UsageError(f"--save: expected a file that ends with .png, .npy or .bin, got {shown(str(path))}")
     if path.exists():
@@ -258,23 +226,3 @@ def _npy(value: Any) -> bytes:
     file = io.BytesIO()
     numpy.save(file, value, allow_pickle=False)
     return file.getvalue()
-
-
-_COLOURS = {1: 0, 3: 2, 4: 6}
-"""The PNG colour types: grey, red-green-blue, and these with a transparency, by the bytes of a pixel."""
-
-
-def _png(value: Any) -> bytes:
-    """Return the PNG of a picture: height by width bytes of grey, or height by width by 3 or 4 of colour."""
-    view = memoryview(value)
-    shape = (*(view.shape or ()), 1) if view.ndim == 2 else view.shape or ()
-    if view.format not in ("B", "<B") or len(shape) != 3 or shape[2] not in _COLOURS or not all(shape):
-        raise ValueError("a picture is an array of unsigned bytes, height by width, or height by width by 3 or 4")
-    height, width, depth = shape
-    data, row = view.tobytes(), width * depth
-    lines = b"".join(b"\0" + data[at : at + row] for at in range(0, height * row, row))
-    head = struct.pack(">IIBBBBB", width, height, 8, _COLOURS[depth], 0, 0, 0)
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines, 6)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
-    )

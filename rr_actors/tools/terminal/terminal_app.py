@@ -50,7 +50,7 @@ from rr_actors.tools.terminal.terminal_rows import (
     Window,
     refused,
 )
-from rr_actors.tools.terminal.terminal_tables import AllResources, Tree
+from rr_actors.tools.terminal.terminal_tables import AllLoads, AllResources, AllStreams, TreeTable
 
 _T = TypeVar("_T")
 _THREADS = 16  # for the panes, the feed, and commands that wait
@@ -95,7 +95,7 @@ class Pane(Widget, can_focus=True):
         Binding("enter", "open", "open"),
     ]
 
-    class Chosen(Message):
+    class Picked(Message):
         """The cursor of a pane is on another row, or the pane shows another list."""
 
         def __init__(self, pane: Pane, row: Row | None) -> None:
@@ -200,7 +200,7 @@ class Pane(Widget, can_focus=True):
             if self._top != before[1] or self.row is None:
                 self._wanted.set()
             self._draw()
-            self.post_message(self.Chosen(self, self.row))
+            self.post_message(self.Picked(self, self.row))
 
     async def _keep_asking(self) -> None:
         while True:
@@ -237,7 +237,7 @@ class Pane(Widget, can_focus=True):
             self.cursor = places[0] if places else self.cursor
         self._go(self.cursor)
         if self.row != before:
-            self.post_message(self.Chosen(self, self.row))
+            self.post_message(self.Picked(self, self.row))
         self._draw()
 
     @property
@@ -282,7 +282,7 @@ class Pane(Widget, can_focus=True):
 
 
 _KEYS = """\
- 1  2  3     the tree; all resources; the events alone
+ 1 to 5      the tree; resources; the events alone; streams; loads
  z           the pane alone, and back
  s           sorts the left list by the next column, the most first
  arrows j k  move; page up, page down, home and end, too
@@ -293,12 +293,16 @@ _KEYS = """\
 
  K           kills the chosen child, after a question: y is yes
  t  r        stops the chosen child; starts it again
- u           unloads the query of the chosen row
+ u  p        unloads the query of the chosen row; gives it a priority
  U           takes the chosen resource away from all its holders
+ R           revokes the chosen resource: y is yes
  q           leaves
 
  CPU is that since the last look. Of several children in one process the first
  one has it. Columns appear where there is room for them: z makes room."""
+
+
+_NUMBER = "a priority from -1000 to 1000, or standby; Enter gives it, Esc leaves it"
 
 
 class Keys(ModalScreen[None]):
@@ -334,7 +338,7 @@ class Terminal(App[None]):
     #events { height: 25%; }
     #events.alone { height: 1fr; }
     #tree.alone { margin-right: 0; }
-    #filter { height: 1; border: none; padding: 0; display: none; }
+    #filter, #priority { height: 1; border: none; padding: 0; display: none; }
     #status { height: auto; max-height: 3; }
     #status.bad { color: $text-error; text-style: bold; }
     """
@@ -345,6 +349,8 @@ class Terminal(App[None]):
         Binding("r", "restart", "restart"),
         Binding("u", "unload", "unload"),
         Binding("U", "take_away", "all"),
+        Binding("R", "revoke", show=False),
+        Binding("p", "give_priority", show=False),
         Binding(
             "slash", "filter", "filter", key_display="/", priority=True
         ),  # the characters typed after it are never commands
@@ -352,6 +358,8 @@ class Terminal(App[None]):
         Binding("1", "list_tree", show=False),
         Binding("2", "list_resources", show=False),
         Binding("3", "show_events", show=False),
+        Binding("4", "list_streams", show=False),
+        Binding("5", "list_loads", show=False),
         Binding("z", "zoom", show=False),
         Binding("s", "sort", show=False),
         Binding("question_mark", "help", "help", key_display="?"),
@@ -372,7 +380,8 @@ class Terminal(App[None]):
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
         self._happened = EventLines()
         # Kept, not looked up on the screen: an answer may arrive when the user leaves and the screen is empty.
-        self._tree, self._resources = Tree(), AllResources()  # as they were sorted last
+        self._tree, self._resources = TreeTable(), AllResources()  # sorted as last
+        self._streams, self._loads = AllStreams(), AllLoads()
         self.left = Pane("tree", self._tree, self._look)
         self.right = Pane("chosen", Nothing(), self._look)
         self.events = Pane("events", Happenings(self._happened), self._look)
@@ -380,17 +389,20 @@ class Terminal(App[None]):
         self._alone: Pane | None = None
         self._headline = Static(id="title", markup=False)
         self._field = Input(id="filter", placeholder="only rows with this text; Enter keeps the filter, Esc ends it")
+        self._number = Input(id="priority", placeholder=_NUMBER)
         self._status_line = Static(id="status", markup=False)
         self._heard = 0
         self._shown = 0
         self._said = ""
         self._is_bad = False
-        self._to_kill = ""
         self._question = ""
+        self._asked: tuple[str, Command[c.Done]] = "", commands.Kill("")  # what the question is about
+        self._declined = ""  # what is said after a no
         self._lost = ""
         self._silence = ""
         self._welcome: c.Welcome | None = None
         self._filtered: Pane | None = None
+        self._needy: tuple[Pane, str] | None = None  # the query whose priority is being typed, and its pane
         self._before: list[tuple[Rows, str, int]] = []  # lists shown before, with filter and cursor
 
     # -- the screen --------------------------------------------------------------------------------------------------
@@ -403,6 +415,7 @@ class Terminal(App[None]):
             yield self.right
         yield self.events
         yield self._field
+        yield self._number
         yield self._status_line
         yield Footer(show_command_palette=False, compact=True)
 
@@ -441,8 +454,8 @@ class Terminal(App[None]):
 
     # -- what is shown -----------------------------------------------------------------------------------------------
 
-    @on(Pane.Chosen)
-    def _choose(self, message: Pane.Chosen) -> None:
+    @on(Pane.Picked)
+    def _choose(self, message: Pane.Picked) -> None:
         row = message.row
         if message.pane is not self.left or row is None or row != self.left.row:
             return
@@ -476,7 +489,15 @@ class Terminal(App[None]):
         """Show all resources on the left."""
         self._list(self._resources)
 
-    def _list(self, rows: Tree | AllResources) -> None:
+    def action_list_streams(self) -> None:
+        """Show all streams on the left."""
+        self._list(self._streams)
+
+    def action_list_loads(self) -> None:
+        """Show on the left the loads that wait, and how long those of each server did."""
+        self._list(self._loads)
+
+    def _list(self, rows: TreeTable | AllResources | AllStreams | AllLoads) -> None:
         if self._alone is not self.left:
             self._give_screen_to(None)
         self.left.show(rows)
@@ -485,10 +506,14 @@ class Terminal(App[None]):
     def action_sort(self) -> None:
         """Sort the list on the left by its next column."""
         rows = self.left.rows
-        if isinstance(rows, Tree):
+        if isinstance(rows, TreeTable):
             self._tree = rows = rows.by_next()
         elif isinstance(rows, AllResources):
             self._resources = rows = rows.by_next()
+        elif isinstance(rows, AllStreams):
+            self._streams = rows = rows.by_next()
+        elif isinstance(rows, AllLoads):
+            self._loads = rows = rows.by_next()
         self.left.show(rows, self.left.match)
 
     def action_show_events(self) -> None:
@@ -514,7 +539,11 @@ class Terminal(App[None]):
     def action_leave(self) -> None:
         """Go back: answer a question with no, or leave the filter, the opened list or the pane alone, or go left."""
         if self._question and self._question == self.status:
-            self._say(f"{self._to_kill} was not killed")
+            self._say(self._declined)
+            return
+        if self._needy is not None:
+            self._close_number()
+            self._say("the priority stays as it was")
             return
         pane = self._focused_pane()
         if self._filtered is not None:
@@ -529,8 +558,8 @@ class Terminal(App[None]):
             self.screen.set_focus(self.left)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Return whether the key of an action acts now: in the filter, `/` is a character."""
-        return action != "filter" or self._filtered is None
+        """Return whether the key of an action acts now: where something is typed, `/` is a character."""
+        return action != "filter" or (self._filtered is None and self._needy is None)
 
     def action_filter(self) -> None:
         """Filter the pane that has the focus."""
@@ -563,14 +592,17 @@ class Terminal(App[None]):
     def action_kill(self) -> None:
         """Ask whether to kill the process of the chosen child."""
         if (path := self._chosen_child("kill")) is not None:
-            self._say(f"kill {path}? y: yes, Esc: no")
-            self._to_kill, self._question = path, self._said
+            self._ask_first(f"kill {path}", commands.Kill(path), f"{path} was not killed")
+
+    def _ask_first(self, what: str, command: Command[c.Done], declined: str) -> None:
+        self._say(f"{what}? y: yes, Esc: no")
+        self._asked, self._declined, self._question = (what, command), declined, self._said
 
     def action_confirm(self) -> None:
-        """Kill the child that the status line asks about; do nothing if the status line shows no question."""
+        """Do what the status line asks about; do nothing if the status line shows no question."""
         if self._question and self._question == self.status:
             self._question = ""
-            self._begin(f"kill {self._to_kill}", commands.Kill(self._to_kill))
+            self._begin(*self._asked)
 
     def action_terminate(self) -> None:
         """Stop the chosen child."""
@@ -593,23 +625,64 @@ class Terminal(App[None]):
 
     def action_unload(self) -> None:
         """Release the query of the chosen row."""
+        if query := self._chosen_query("unload", "; U takes it away from all"):
+            self._begin(f"unload query {short_id(query)}", commands.Unload(query))
+
+    def _chosen_query(self, verb: str, instead: str = "") -> str:
+        """Return the query of the chosen row, or "", and say that it has none."""
         row = self._focused_pane().row
         if row is None or not (row.query or row.resource):
-            self._say("unload: choose a resource or a holder on the right (Tab goes there)", bad=True)
-        elif not row.query:
-            self._say("unload: it has not one holder: Enter shows them; U takes it away from all", bad=True)
+            self._say(f"{verb}: choose a resource or a holder on the right (Tab goes there)", bad=True)
+            return ""
+        if not row.query:
+            self._say(f"{verb}: it has not one holder: Enter shows them{instead}", bad=True)
+        return row.query
+
+    def action_give_priority(self) -> None:
+        """Have a priority typed for the query of the chosen row."""
+        if query := self._chosen_query("priority"):
+            self._needy = self._focused_pane(), query
+            self._number.value = ""
+            self._number.display = True
+            self.screen.set_focus(self._number)
+
+    @on(Input.Submitted, "#priority")
+    def _give_priority(self, message: Input.Submitted) -> None:
+        query = self._close_number()
+        try:
+            priority = commands.priority_from("priority", message.value)
+        except UsageError as error:
+            self._say(str(error), bad=True)
         else:
-            self._begin(f"unload query {short_id(row.query)}", commands.Unload(row.query))
+            self._begin(f"priority of query {short_id(query)}", commands.GivePriority(query, priority))
+
+    def _close_number(self) -> str:
+        """Put away the field for a priority, and return the query whose it is."""
+        (pane, query), self._needy = self._needy or (self.left, ""), None
+        self.screen.set_focus(pane)
+        self._number.display = False
+        return query
 
     def action_take_away(self) -> None:
         """Take the chosen resource away from all its holders."""
+        if (chosen := self._chosen_resource("unload from all")) is not None:
+            id, name = chosen
+            self._begin(f"unload {name} from all", commands.Unload(id, force=True))
+
+    def action_revoke(self) -> None:
+        """Ask whether to revoke the chosen resource."""
+        if (chosen := self._chosen_resource("revoke")) is not None:
+            id, name = chosen
+            self._ask_first(f"revoke {name}", commands.Revoke(id, "revoked in top"), f"{name} was not revoked")
+
+    def _chosen_resource(self, verb: str) -> tuple[str, str] | None:
+        """Return the id and the name of the chosen resource, or say that none is chosen."""
         row, shown = self._focused_pane().row, self._focused_pane().rows
         id = shown.id if isinstance(shown, Neighbours) else row.resource if row and row.key == row.resource else ""
         if row is None or not id:
-            self._say("unload from all: choose a resource on the right (Tab goes there)", bad=True)
-        else:
-            name = shown.name if isinstance(shown, Neighbours) else row.name
-            self._begin(f"unload {name or short_id(id)} from all", commands.Unload(id, force=True))
+            self._say(f"{verb}: choose a resource on the right (Tab goes there)", bad=True)
+            return None
+        return id, (shown.name if isinstance(shown, Neighbours) else row.name) or short_id(id)
 
     def _begin(self, what: str, command: Command[c.Done]) -> None:
         self._say(f"{what} …")

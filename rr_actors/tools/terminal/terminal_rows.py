@@ -12,6 +12,8 @@ from typing import Protocol, TypeAlias, TypeVar
 from rr_actors.base.errors import NotFound, RrError, UnknownQuery
 from rr_actors.base.names import named, short_id
 from rr_actors.hosting.forwarded_logs import LogLine
+from rr_actors.hosting.streams import StreamRow
+from rr_actors.managers.actions.graph_pictures import ShownGraph, shown_graph
 from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
@@ -19,14 +21,14 @@ from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
 from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.event_texts import ago
-from rr_actors.tools.explanations import name_of_resource, since
+from rr_actors.tools.explanations import bytes_text, name_of_resource, rate_text, since
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.terminal.child_logs import line_texts
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_of
 
 WORST = (
-    "FATAL", "ERROR", "unload_failed", "WARNING", "loading", "resuming", "queued", "unloading", "pausing", "paused",
-    "UPDATE", "OK",
+    "FATAL", "ERROR", "unload_failed", "revoked", "WARNING", "loading", "resuming", "queued", "unloading", "pausing",
+    "paused", "UPDATE", "OK",
 )  # fmt: skip
 """The states of resources, the worst first."""
 LOOK_S = 10.0  # for the answer to a question
@@ -159,16 +161,23 @@ class Past:
     @property
     def title(self) -> str:
         """The child's path."""
-        return f"{self.path}: history"
+        return f"{self.path}: now, history and log"
 
     def list(self, link: Asks, window: Window) -> Listed:
         """Ask the system for the child's state, history and log."""
-        records = link.ask(questions.ListHistory(self.path, _HISTORY), LOOK_S).records
+        found = link.ask(questions.ListHistory(self.path, _HISTORY), LOOK_S)
+        log, more = _log(link, self.path)
         rows = [row for place in _places(link, self.path) for row in _wrapped(_as_it_is(place), window.width, "bold")]
-        happened = [(record.at, self._happened(record, window.width)) for record in records]
-        happened += [(line.at, _logged(line, window.width)) for line in _log(link, self.path)]
+        happened = [(record.at, self._happened(record, window.width)) for record in found.records]
+        happened += [(line.at, _logged(line, window.width)) for line in log]
         for _, shown in sorted(happened, key=lambda one: one[0])[::-1]:
             rows += shown
+        if found.left_out or len(found.records) == _HISTORY:
+            rows.append(
+                Row("", f"the newest {len(found.records)} events: rr-actors history {self.path} has older ones")
+            )
+        if more:
+            rows.append(Row("", f"the newest {len(log)} of {len(log) + more} log lines: rr-actors logs {self.path}"))
         return _cut(rows, window)
 
     def _happened(self, record: Record, width: int) -> Lines:
@@ -178,7 +187,7 @@ class Past:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """A resource: its state, its holders, and the parts on which it depends."""
+    """A resource: its state, its holders, its streams, its actions if it is a graph, and the parts it depends on."""
 
     id: str
     name: str = field(default="", compare=False)
@@ -189,7 +198,7 @@ class Neighbours:
         return f"{self.name or short_id(self.id)}: holders and parts"
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask the system for the resource and its parts.
+        """Ask the system for the resource, its streams and its parts.
 
         Raises:
             UnknownQuery: the resource is unloaded.
@@ -204,14 +213,44 @@ class Neighbours:
         rows += [_holder(link, holder) for holder in resource.holders]
         if resource.holder_count > len(resource.holders):
             rows.append(Row("", f"  and by {resource.holder_count - len(resource.holders)} more"))
+        rows += _actions(graph_of(link, resource))
+        streams = link.ask(questions.ListStreams(self.id, registrar=resource.server.partition("/")[0]), LOOK_S).rows
+        rows += [_stream(row) for row in streams]
         if resource.part_count:
             rows.append(Row("", f"depends on {resource.part_count}:"))
         for part in resource.parts:
             queries = [row for row in link.ask(questions.Find(part), LOOK_S).queries if row.id == part]
-            rows += [Row(row.id, f"  {row.name}", row.hold, resource=row.resource_id, name=row.name) for row in queries]
+            rows += map(_part, queries)
         if resource.part_count > len(resource.parts):
             rows.append(Row("", f"  and on {resource.part_count - len(resource.parts)} more"))
         return _cut(rows, window)
+
+
+def _part(row: QueryRow) -> Row:
+    """Return the row of a part; with its state, unless it is well: a bad state comes from below."""
+    note = row.hold if row.state == "OK" else f"{row.hold}, {row.state}"
+    return Row(row.id, f"  {row.name}", note, STATE_STYLES.get(row.state, ""), resource=row.resource_id, name=row.name)
+
+
+def graph_of(link: Asks, row: ResourceRow) -> ShownGraph | None:
+    """Return the run of the graph of actions that a resource is; None if it is none."""
+    registrar, _, server = row.server.partition("/")
+    return shown_graph(link.ask(questions.ReadResponse(row.id, registrar), LOOK_S).text) if server == "graph" else None
+
+
+def _actions(graph: ShownGraph | None) -> Lines:
+    if graph is None:
+        return []
+    facts = {name: ", ".join(filter(None, (state, graph.notes.get(name)))) for name, state in graph.states.items()}
+    styles = {"ERROR": "red", "RUNNING": "bold", "UNINITIALIZED": "dim"}
+    rows = [Row("", f"  {name}", fact, style=styles.get(graph.states[name], "")) for name, fact in facts.items()]
+    return [Row("", f"graph {graph.state}:"), *rows]
+
+
+def _stream(row: StreamRow) -> Row:
+    by = f"{row.info.consumers} read it" if row.readers else "nobody reads it"
+    figures = ", ".join(filter(None, (rate_text(row), bytes_text(row))))
+    return Row("", f"stream {row.info.name}: {by}", figures)
 
 
 @dataclass(frozen=True)
@@ -277,12 +316,13 @@ def _logged(line: LogLine, width: int) -> list[Row]:
     return [*_wrapped(first, width, _LEVEL_STYLES.get(line.level, "")), *_indented(more)]
 
 
-def _log(link: Asks, path: str) -> list[LogLine]:
-    """Return the newest log lines of a child; none if neither it nor its lines are there any more."""
+def _log(link: Asks, path: str) -> tuple[list[LogLine], int]:
+    """Return the newest log lines of a child, and how many older ones there are; none if it has left with its lines."""
     try:
-        return link.ask(questions.ListLog(path, limit=_LOGGED), LOOK_S).lines
+        found = link.ask(questions.ListLog(path, limit=_LOGGED), LOOK_S)
     except NotFound:
-        return []
+        return [], 0
+    return found.lines, found.total - len(found.lines)
 
 
 def _places(link: Asks, path: str) -> list[c.ChildRow]:
@@ -311,7 +351,7 @@ def _age(id: str) -> str:
 
 
 _BAD = frozenset(("load_failed", "unload_failed", "pause_failed", "start_failed", "gave_up", "dead_letter"))
-STATE_STYLES = {"WARNING": "yellow", "ERROR": "red", "FATAL": "red"}
+STATE_STYLES = {"WARNING": "yellow", "ERROR": "red", "FATAL": "red", "revoked": "red"}
 
 
 def _resource(row: ResourceRow) -> Row:

@@ -12,7 +12,7 @@ from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_questions import Find
 
 CHILD_STATES = ("running", "starting", "restarting", "stopped")
-RESOURCE_STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL", "loaded", "loading", "unloading", "paused")
+RESOURCE_STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL", "loaded", "loading", "unloading", "paused", "revoked")
 GONE = "gone"
 
 _AGAIN_S = 0.1  # between two attempts to reach a system that does not run yet, and between two looks at one that does
@@ -99,4 +99,4 @@ def _states_of(asking: ConsoleClient, target: str) -> list[str]:
     if len(resources) > 1:
         several = few(f"{row.name} ({row.id})" for row in resources)
         raise UsageError(f"{shown(target)}: several resources have this in their ids: {several}; give more of the id")
-    return [resources[0].condition, resources[0].phase] if resources else [GONE]
+    return [resources[0].condition, resources[0].state, resources[0].phase] if resources else [GONE]

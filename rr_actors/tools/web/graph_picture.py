@@ -30,6 +30,7 @@ _STATES = {  # the colour, sign and shape of each state
     "ERROR": ("#c62828", "✖ ", "diamond"),
     "FATAL": ("#7f0000", "✖✖ ", "rect"),
     "unload_failed": ("#c62828", "✖ ", "diamond"),
+    "revoked": ("#c62828", "✖ ", "diamond"),
 }
 SERVER = "#"
 """A node of this beginning is a server, "#cameras/camera"."""
@@ -38,6 +39,11 @@ _STACK = 16  # resources above one another in a box
 _TALL = 4  # of them have the height of a server, whose text has a line for each state and stands below it
 _LABELS = 60  # up to so many nodes always have labels; of more nodes, a label appears under the mouse
 _TEXT = 34
+_LABEL_LAYOUT = """() => ({
+  hideOverlap: true,
+  width: Math.max(24, 0.85 * (document.querySelector(".rr-graph").clientWidth - 16) / %s - 22),
+})"""
+"""A label has the room of one column: it ends with dots before the next one, or before the picture's edge."""
 _OPENED = 40  # resources of a server
 _NEIGHBOURS = 100
 _LOOK_S = 20.0
@@ -169,11 +175,13 @@ def _drawn(
 ) -> Chart:
     places, areas = _places(boxes, edges)
     shown = len(labels) <= _LABELS
+    columns = max((area[2] for area in areas.values()), default=1.0)
     return {
+        "animationDuration": 0,  # a picture that moves into sight costs more than all else of its page
         "animationDurationUpdate": 300,
         "grid": {"left": 8, "right": 8, "top": 24, "bottom": 8},
         "tooltip": {"confine": True},
-        "xAxis": {"show": False, "min": 0, "max": max((area[2] for area in areas.values()), default=1)},
+        "xAxis": {"show": False, "min": 0, "max": columns},
         "yAxis": {
             "show": False, "inverse": True, "min": 0,
             "max": max((area[3] for area in areas.values()), default=1),
@@ -185,6 +193,7 @@ def _drawn(
                 "coordinateSystem": "cartesian2d",
                 "edgeSymbol": ["none", "arrow"],
                 "edgeSymbolSize": 7,
+                ":labelLayout": _LABEL_LAYOUT % columns,
                 "cursor": "pointer",
                 "data": [_node(name, places[name], *labels[name], shown, lit, told) for name in labels],
                 "links": [_link(edge, lit, told) for edge in edges],
@@ -207,7 +216,7 @@ def _node(
     where: Chart = {"position": "right"}
     if name.startswith(SERVER):
         where = {"position": [0, 18], "align": "left", "verticalAlign": "top", "lineHeight": 14}
-    node["label"] = {"show": shown or name in lit or reached, "formatter": sign + text} | where
+    node["label"] = {"show": shown or name in lit or reached, "formatter": sign + text, "overflow": "truncate"} | where
     node["label"] |= {"color": "#b0bec5" if is_dark else "#1c2529", "fontWeight": "bold" if reached else "normal"}
     node["tooltip"] = {"formatter": html.escape(f"{text}: {state}".replace("\n", ", "), quote=False)}
     return node

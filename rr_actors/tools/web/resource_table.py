@@ -24,8 +24,13 @@ _BLOCK = 100  # rows that are asked for at once
 _REFRESH_S = 1.0
 _LOOK_S = 20.0
 _COLUMNS = (
-    ("resource", 5), ("state", 1.3), ("message", 2), ("priority", 1), ("holders", 1), ("held_by", 2), ("short_id", 1.3),
+    ("resource", 5), ("state", 1.8), ("message", 2), ("priority", 1), ("holders", 1), ("held_by", 2), ("short_id", 1.3),
 )  # fmt: skip
+_NAME_PX = 320  # a narrower cell would show the same beginning of all names of a server; a narrow table is scrolled
+_SIGNS = """({
+  "rr-row-bad": (row) => row.data && ["ERROR", "FATAL"].includes(row.data.state),
+  "rr-row-warm": (row) => row.data && row.data.state === "WARNING",
+})"""
 _SOURCE = f"""{{
   getRows: (wanted) => {{
     const match = encodeURIComponent(window.rrMatch || "");
@@ -45,15 +50,21 @@ class ResourceTable:
     """
 
     def __init__(self, on_choose: Callable[[str], Awaitable[None]]) -> None:
-        self._refreshed = 0.0
+        self._refreshed = time.monotonic()
+        self._on_choose = on_choose
+        self._grid: ui.aggrid | None = None
         search = ui.input("search in id, server, request and status", on_change=lambda event: self._find(event.value))
         search.props("dense outlined clearable debounce=200").classes("w-full")
+        self._place = ui.element("div").classes("w-full").style("height: max(260px, 36vh)")
+
+    def fill(self) -> None:
+        """Add the table itself, which asks for its first rows. Its library takes a while to load."""
         columns = [
             {
                 "field": name,
                 "headerName": name.replace("_", " "),
                 "flex": width,
-                "minWidth": 55 + 25 * width,
+                "minWidth": _NAME_PX if name == "resource" else 65 + 25 * width,
                 "tooltipField": name,
             }
             for name, width in _COLUMNS
@@ -66,27 +77,28 @@ class ResourceTable:
             "maxBlocksInCache": 4,
             "rowSelection": {"mode": "singleRow", "checkboxes": False, "enableClickSelection": True},
             ":getRowId": "(row) => row.data.id",
+            ":rowClassRules": _SIGNS,
             ":datasource": _SOURCE,
         }
-        self._grid = ui.aggrid(options, auto_size_columns=False).classes("w-full").style("height: max(260px, 36vh)")
+        with self._place:
+            self._grid = grid = ui.aggrid(options, auto_size_columns=False).classes("w-full").style("height: 100%")
 
         async def selected() -> None:  # the event does not say which row is chosen
-            answer = self._grid.run_grid_method("getSelectedRows", timeout=_LOOK_S)
+            answer = grid.run_grid_method("getSelectedRows", timeout=_LOOK_S)
             if rows := cast("list[dict[str, Any]]", await answer):
-                await on_choose(rows[0]["id"])
+                await self._on_choose(rows[0]["id"])
 
-        self._grid.on("selectionChanged", selected, args=[])
+        grid.on("selectionChanged", selected, args=[])
 
     def refresh(self) -> None:
         """Make the browser ask again for the rows that it shows, at most once a second."""
-        if time.monotonic() > self._refreshed + _REFRESH_S:
+        if self._grid is not None and time.monotonic() > self._refreshed + _REFRESH_S:
             self._refreshed = time.monotonic()
             self._grid.run_grid_method("refreshInfiniteCache")
 
     def _find(self, text: str | None) -> None:
-        ui.run_javascript(
-            f"window.rrMatch = {json.dumps(text or '')}; getElement({self._grid.id}).api.purgeInfiniteCache();"
-        )
+        purge = "" if self._grid is None else f" getElement({self._grid.id}).api?.purgeInfiniteCache();"
+        ui.run_javascript(f"window.rrMatch = {json.dumps(text or '')};{purge}")
 
 
 def add_rows(watch: Watch) -> None:

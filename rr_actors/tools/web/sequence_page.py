@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import msgspec
-from nicegui import ui
+from nicegui import Client, ui
 
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.model.recorded import Entry
@@ -27,11 +27,15 @@ from rr_actors.tools.web.web_pages import Page
 _LIMIT = 20_000  # entries of a page's recording
 _LISTED = 30
 _AROUND_S = 1.0
+_UNSEEN_S = 60.0
 _CRASHES = ("exited", "restarted", "start_failed", "gave_up", "stopped", "started")
 
 
 class Recorder:
-    """Records the system of a watch, from start() to stop(), by a connection of its own. Any thread may use it."""
+    """Records the system of a watch, from start() to stop(), by a connection of its own. Any thread may use it.
+
+    All pages of a server share one, so a recording goes on, and stays, when its reader opens another page.
+    """
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
@@ -116,18 +120,17 @@ class Recorder:
 class SequencePage(Page):
     """The page with the list of recorded entries, and the diagram around the chosen one."""
 
-    def __init__(self, watch: Watch) -> None:
-        self._recorder = Recorder(watch)
+    def __init__(self, watch: Watch, recorder: Recorder) -> None:
+        self._recorder = recorder
         self._shown: list[Entry] = []
         super().__init__(watch, "/sequence")
-        ui.context.client.on_delete(lambda: asyncio.to_thread(self._recorder.close))
 
     def build(self) -> None:
         """Put the buttons, the list and the diagram on the page."""
         with ui.element("div").classes("rr-split"):
             with ui.element("div").classes("rr-panel").style("flex: 2"):
                 with ui.row().classes("gap-2"):
-                    ui.button("record", on_click=self._record).props("dense no-caps")
+                    ui.button("record", on_click=self._record).props("dense no-caps outline")
                     ui.button("stop recording", on_click=self._end).props("dense no-caps outline")
                 self._state = ui.label("nothing is recorded").classes("rr-note")
                 self._list = ui.column().classes("rr-rows gap-0")
@@ -190,6 +193,16 @@ class SequencePage(Page):
             link.click();
             URL.revokeObjectURL(link.href);
         """)
+
+
+async def end_unseen(recorder: Recorder) -> None:
+    """End each recording that no page has been open to see for a minute: to record makes loads slower."""
+    unseen = 0
+    while True:
+        await asyncio.sleep(_UNSEEN_S / 2)
+        unseen = 0 if any(client.has_socket_connection for client in Client.instances.values()) else unseen + 1
+        if unseen > 1 and recorder.is_recording:
+            await asyncio.to_thread(recorder.stop)
 
 
 def _take(recording: Recording, parts: Iterator[c.Entries]) -> None:

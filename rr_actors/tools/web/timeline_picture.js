@@ -1,23 +1,31 @@
 // A timeline that is zoomed and moved, as a Vue component and for a file of its own. It needs no other file.
 const STEPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800,
   3600, 7200, 10800, 21600, 43200, 86400];
-const ROW = 32, RIGHT = 12, TICK_PX = 96, BAR_PX = 3, MARK_PX = 15, LEAST_S = 0.005, TOLD = 5, SPARE = 4;
+const ROW = 32, RIGHT = 36, TICK_PX = 96, BAR_PX = 3, MARK_PX = 15, LETTER_PX = 7, LEAST_S = 0.005, TOLD = 200, SPARE = 4;
 const HINT = "Drag or ← → to move, wheel or + − to zoom, Home and End, 0 for all. Click a mark, or n and p: it says why.";
 const escaped = (text) => String(text).replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`);
 const two = (number) => String(number).padStart(2, "0");
 
-function mergedMarks(marks, step, order) {
+function labelOf(counts, order) { // how many of the worst kind, and "+" if there are others; "" for one event
+  const kinds = Object.keys(counts), count = counts[order.find((kind) => counts[kind])];
+  const number = count === 1 ? "" : count < 1000 ? `${count}` : `${Math.floor(count / 1000)}k`;
+  return number + (kinds.length > 1 ? "+" : "");
+}
+
+function mergedMarks(marks, perPx, order) { // a mark and the count beside it lie on no other one
   const groups = [];
   for (const mark of marks) {
-    const last = groups[groups.length - 1];
-    if (last && mark[0] - last[0][0] < step) last.push(mark);
-    else groups.push([mark]);
+    let last = groups[groups.length - 1];
+    if (!last || mark[0] - last.at >= (MARK_PX + LETTER_PX * last.label.length) * perPx) {
+      groups.push((last = { at: mark[0], counts: {}, marks: [] }));
+    }
+    last.marks.push(mark);
+    for (const kind in mark[3]) last.counts[kind] = (last.counts[kind] || 0) + mark[3][kind];
+    last.label = labelOf(last.counts, order);
   }
   return groups.map((group) => {
-    const counts = {};
-    for (const [, , , of] of group) for (const kind in of) counts[kind] = (counts[kind] || 0) + of[kind];
-    const kinds = Object.keys(counts).sort((a, b) => order.indexOf(a) - order.indexOf(b));
-    return { at: group[0][0], kind: kinds[0], counts, marks: group, kinds };
+    const kinds = order.filter((kind) => group.counts[kind]);
+    return { ...group, kind: kinds[0], kinds };
   });
 }
 
@@ -234,7 +242,7 @@ export class TimelineView {
     }
     for (const [ofChildren, at] of [[true, y + 12], [false, y + 25]]) {
       const marks = lane.marks.filter((mark) => this.looks[mark[1]][2] === ofChildren);
-      for (const mark of mergedMarks(marks, MARK_PX * perPx, this.order)) {
+      for (const mark of mergedMarks(marks, perPx, this.order)) {
         if (mark.at >= a && mark.at <= b) out += this.mark({ path: lane.path, ...mark }, at);
       }
     }
@@ -242,13 +250,12 @@ export class TimelineView {
   }
 
   mark(item, y) {
-    const number = this.items.push(item) - 1, x = this.x(item.at), count = item.counts[item.kind];
-    const label = `${count > 1 ? count : ""}${item.kinds.length > 1 ? "+" : ""}`;
+    const number = this.items.push(item) - 1, x = this.x(item.at);
     const ring = this.isChosen(item) ? `<circle class="ring" cx="${x.toFixed(1)}" cy="${y}" r="9"/>` : "";
     return `<g class="rr-tl-mark" data-item="${number}" data-kind="${item.kind}" data-path="${escaped(item.path)}">
       <rect class="touch" x="${(x - 7).toFixed(1)}" y="${y - 7}" width="14" height="14"/>
       <path class="mark k-${item.kind}" transform="translate(${x.toFixed(1)} ${y})" d="${this.looks[item.kind][1]}"/>
-      ${label && `<text class="count" x="${(x + 5).toFixed(1)}" y="${y - 3}">${label}</text>`}${ring}
+      ${item.label && `<text class="count" x="${(x + 8).toFixed(1)}" y="${y + 3}">${item.label}</text>`}${ring}
       <title>${escaped(item.marks.length > 1 ? "" : item.marks[0][2])}</title></g>`;
   }
 }

@@ -22,7 +22,7 @@ CSS = """
   --rr-still: light-dark(#757575, #98a2a8); --rr-still-paper: light-dark(#e6e6e6, #33393d);
   --rr-bad: light-dark(#c62828, #ff8078); --rr-bad-paper: light-dark(#ffdede, #4d2020);
   --rr-unknown-paper: light-dark(#eceff1, #2a3136); --rr-halo: light-dark(#90caf9, #2f6fa3);
-  --rr-dim: light-dark(#607d8b, #9fb0b9); --rr-amber: light-dark(#a15c00, #f2b53c); }
+  --rr-dim: light-dark(#546e7a, #9fb0b9); --rr-amber: light-dark(#a15c00, #f2b53c); }
 .rr-tree, .rr-tree ul { list-style: none; margin: 0; padding: 0; }
 .rr-tree li { display: flex; align-items: flex-start; position: relative; padding: 2px 0; }
 .rr-tree ul { margin-left: 14px; padding-left: 18px; border-left: 2px solid var(--rr-edge); }

@@ -19,6 +19,7 @@ from typing import TypeVar
 import msgspec
 
 from rr_actors.base.errors import RrError
+from rr_actors.hosting.streams import Stream
 from rr_actors.registrar.pages import ResourceRow, ServerRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
@@ -30,6 +31,7 @@ from rr_actors.system.recording.timelines import Timeline
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.event_lines import EventLines, event_of
 from rr_actors.tools.terminal.figure_curves import FigureCurves
+from rr_actors.tools.terminal.stream_frames import Thumbnails
 
 GROUPED_FROM = 300
 """From so many resources on, a picture shows servers in place of resources."""
@@ -47,6 +49,7 @@ _SHARE = 10
 _LONGEST_S = 5.0
 _AGAIN_S = 0.5
 _LOOK_S = 10.0
+_STREAMS = 4  # of one resource that are shown as pictures
 
 _A = TypeVar("_A")
 _Row = TypeVar("_Row", c.ChildRow, c.RegistrarRow, ResourceRow)
@@ -106,6 +109,7 @@ class Watch:
         self._versions = itertools.count(1)
         self._lanes, self._lanes_lock = Lanes(), threading.Lock()
         self.figures = FigureCurves()
+        self._thumbnails = Thumbnails()
         self._latest = 0.0  # the time of the newest record in the lanes
         self._timeline: tuple[int, Timeline] | None = None  # and the version that it shows
         self._threads = [
@@ -126,6 +130,17 @@ class Watch:
                 break
             found = moment
         return found
+
+    def pictures_of(self, resource_id: str) -> dict[str, bytes]:
+        """Return a small PNG for each stream of a resource that has pictures, by its name. It reads the streams."""
+        with contextlib.suppress(RrError):  # the next moment says why there is no answer
+            rows = self.link.ask(questions.ListStreams(resource_id, 0, _STREAMS), _LOOK_S).rows
+            names = [
+                row.info.name for row in rows if row.info.resource_id == resource_id and row.info.age_s is not None
+            ]
+            found = {name: self._thumbnails.newest(Stream(resource_id, name)) for name in names}
+            return {name: picture for name, picture in found.items() if picture}
+        return {}
 
     def timeline(self) -> Timeline:
         """Return the timeline of all that is known: the records of the state directory, and the events since then."""
@@ -182,7 +197,6 @@ class Watch:
             for event in part.events:
                 self.lines.take(event)
             self._note(*part.events)
-            self.figures.loaded(str(one.facts.get("registrar")) for one in part.events if one.event == "loaded")
             self.heard += len(part.events)
             self._news.set()
             if any("path" in event.facts for event in part.events):  # an event of the tree
@@ -233,21 +247,29 @@ class Watch:
                 self._lanes.sees(row.path, row.pid or 0, time.time())
         registrars = self._ask(questions.ListRegistrars()).rows
         self.figures.take(children, registrars)
-        pages = read_pages(self._ask, questions.ListResources(), GROUPED_FROM)
-        found = next(pages)
-        resources, servers = list[ResourceRow](), list[ServerRow]()
-        if found.total > GROUPED_FROM:
-            servers = self._ask(questions.ListServers()).rows
-        else:  # an answer has no room for many long texts: then there are more pages
-            resources = [*found.rows, *(row for page in pages for row in page.rows)]
+        total, resources, servers = self._asked_resources(grouped=bool(before.servers))
         return Moment(
             time.time(),
             _shared([msgspec.structs.replace(row, up_s=None) for row in children[:CHILDREN]], before.children),
             _shared(registrars, before.registrars),
             _shared(resources, before.resources),
-            found.total,
+            total,
             servers=before.servers if servers == list(before.servers) else tuple(servers),
         )
+
+    def _asked_resources(self, *, grouped: bool) -> tuple[int, list[ResourceRow], list[ServerRow]]:
+        """Return how many resources there are; and all of them, or where these are too many the servers.
+
+        Args:
+            grouped: they were too many before: count them first.
+        """
+        total = self._ask(questions.ListResources(limit=1)).total if grouped else 0
+        if total <= GROUPED_FROM:
+            pages = read_pages(self._ask, questions.ListResources(), GROUPED_FROM)
+            found = next(pages)
+            if (total := found.total) <= GROUPED_FROM:  # an answer has no room for many long texts: there may be more
+                return total, [*found.rows, *(row for page in pages for row in page.rows)], []
+        return total, [], self._ask(questions.ListServers()).rows
 
     def _ask(self, request: Verb[_A]) -> _A:
         return self.link.ask(request, _LOOK_S)

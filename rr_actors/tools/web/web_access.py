@@ -54,7 +54,7 @@ class Access:
         self.app = app  # NiceGUI looks for the application that serves it, by this name
         self._keys = keys
         self._cookie = f"rr_actors_{port}"
-        self._is_open = host not in _LOOPBACK and not _is_loopback(host)
+        self._is_open = not is_loopback(host)
         self._names = _LOOPBACK | {host.lower()}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -130,8 +130,9 @@ def _cookies(header: str) -> dict[str, str]:
     return {name.strip(): value.strip() for name, _, value in pairs}
 
 
-def _is_loopback(host: str) -> bool:
-    return _is_address(host) and ipaddress.ip_address(host.strip("[]")).is_loopback
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches a server that listens at a host."""
+    return host in _LOOPBACK or (_is_address(host) and ipaddress.ip_address(host.strip("[]")).is_loopback)
 
 
 def _is_address(name: str) -> bool:

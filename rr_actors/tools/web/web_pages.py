@@ -10,33 +10,37 @@ reader chooses something, a thread asks the system for it.
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from nicegui import background_tasks, ui
 
-from rr_actors.base.errors import RrError
+from rr_actors.base.errors import RrError, UsageError
 from rr_actors.base.notebook import escape
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_questions import ListLoads
 from rr_actors.system.console.console_view import Command
 from rr_actors.system.recording.event_texts import ago
+from rr_actors.tools.explanations import LOADS_HEADS, NO_LOAD_WAITS, WAITING_HEADS, loads_cells, waiting_cells
 from rr_actors.tools.terminal.event_lines import EventFilter
 from rr_actors.tools.terminal.figure_curves import Curve
-from rr_actors.tools.terminal.terminal_rows import Neighbours, Past, Row, Rows, Window, refused
+from rr_actors.tools.terminal.terminal_rows import Neighbours, Past, Row, Rows, Window, graph_of, refused
 from rr_actors.tools.web import graph_picture, tree_picture
 from rr_actors.tools.web.resource_table import ResourceTable
 from rr_actors.tools.web.tree_picture import TreePicture
 from rr_actors.tools.web.watch import CHILDREN, Moment, Watch
 
 _LOOK_S = 0.2
-_LINES = 14  # events
+_PICTURE_S = 0.5
+_LINES = 200  # events: the newest are in sight, and the others are scrolled to
 _ROWS = 300  # of the panel
 _CURVES = 50  # children of which curves are drawn
 _WIDTH = 110
@@ -44,10 +48,17 @@ _STEP_S = 0.5
 """How long a status takes in the picture from one resource to the next. In the system it is too fast to see."""
 _STEPS = 30  # statuses
 _NONE: dict[str, int] = {}
+_WAITING = 100  # loads in progress that a page lists
+_ASK_S = 10.0
+_LOADS_NOTE = (
+    "Since each server was registered. Shared: joined a resource that was loaded, or was being loaded. Waited: not "
+    "answered at once. Mean, p95 (of the newest 500) and longest are the times of load callbacks."
+)
 _PAGES = (
     ("Tree", "/"),
     ("Timeline", "/timeline"),
     ("Resources", "/resources"),
+    ("Loads", "/loads"),
     ("Figures", "/figures"),
     ("Sequence", "/sequence"),
 )
@@ -56,6 +67,9 @@ CSS = (
     tree_picture.CSS
     + """\
 .nicegui-content { padding: 0; gap: 0; }
+body { --q-primary: light-dark(#1565c0, #7db9f5) !important; --q-negative: #b71c1c !important;
+  --q-positive: #1b6e2a !important; --q-warning: #8a5300 !important; }
+.q-loading-bar { display: none; }
 .rr-page { width: 100%; padding: 8px 14px; gap: 10px; }
 .rr-bar { width: 100%; background: #263238; color: #fff; padding: 6px 14px; align-items: center; gap: 18px; }
 .rr-bar a { color: #cfd8dc; } .rr-bar a.rr-here { color: #fff; font-weight: 700; text-decoration: underline; }
@@ -64,13 +78,19 @@ CSS = (
 .rr-split { display: flex; width: 100%; gap: 16px; align-items: stretch; } .rr-split > .rr-panel { max-height: 62vh; }
 .rr-holds-tree { container-type: inline-size; }
 @media (max-width: 900px) { .rr-split { flex-direction: column; } .rr-split > .rr-panel { flex: none !important; } }
-@media (prefers-color-scheme: dark) { .rr-graph canvas, .rr-sequence svg { filter: invert(1) hue-rotate(180deg); } }
+@media (prefers-color-scheme: dark) {
+  .rr-graph canvas, .rr-sequence svg, .rr-actions svg { filter: invert(1) hue-rotate(180deg); } }
+.rr-events-box { display: flex; flex-direction: column-reverse; max-height: 17em; overflow-y: auto; }
+.rr-row-bad .ag-cell { color: var(--rr-bad); } .rr-row-warm .ag-cell { color: var(--rr-amber); }
 .rr-rows, .rr-events { font: 12px/1.45 monospace; white-space: pre-wrap; overflow-wrap: anywhere; width: 100%; }
 .rr-line { display: flex; gap: 10px; align-items: baseline; } .rr-line.rr-red { color: var(--rr-bad); }
 .rr-line.rr-bold { font-weight: 700; } .rr-line.rr-dim { color: var(--rr-dim); }
 .rr-line.rr-yellow { color: var(--rr-amber); }
-.rr-rows .q-btn { flex: none; white-space: nowrap; overflow-wrap: normal; }
-.rr-note { color: var(--rr-dim); }
+.rr-line .q-btn { flex: none; white-space: nowrap; overflow-wrap: normal; }
+.rr-rows > .q-btn { max-width: 100%; text-align: left; } .rr-rows > .q-btn .q-btn__content { text-align: left;
+  justify-content: flex-start; }
+.rr-note { color: var(--rr-dim); } .rr-line .rr-note { overflow-wrap: break-word; }
+.rr-pictures img { max-width: 100%; border-radius: 4px; }
 .rr-figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 380px), 1fr)); gap: 10px 22px; }
 .rr-figures section { min-width: 0; } .rr-figures h2 { font: 600 13px/1.6 sans-serif; margin: 0;
   overflow-wrap: anywhere; }
@@ -79,6 +99,14 @@ CSS = (
 .rr-figures b { text-align: right; color: var(--rr-text); }
 .rr-figures svg { width: 100%; height: 26px; background: var(--rr-unknown-paper); margin: 1px 0; border-radius: 3px; }
 .rr-figures path { fill: none; stroke: var(--rr-focus); stroke-width: 1.5; vector-effect: non-scaling-stroke; }
+.rr-loads { width: 100%; border-collapse: collapse; font-size: 13px; }
+.rr-loads caption { text-align: left; font-weight: 700; padding: 2px 0 6px; }
+.rr-loads th, .rr-loads td { text-align: right; padding: 3px 10px; border-bottom: 1px solid var(--rr-edge); }
+.rr-loads th:first-child, .rr-loads td:first-child, .rr-loads .rr-left { text-align: left; overflow-wrap: anywhere; }
+@media (max-width: 900px) { .rr-loads, .rr-loads :is(tbody, tr, td, caption) { display: block; }
+  .rr-loads thead { display: none; } .rr-loads td, .rr-loads td:first-child { border: none; padding: 1px 4px;
+  text-align: left; } .rr-loads td::before { content: attr(data-head) ": "; color: var(--rr-dim); }
+  .rr-loads tr { border-bottom: 1px solid var(--rr-edge); padding: 4px 0; } }
 .rr-banner { width: 100%; padding: 6px 14px; background: var(--rr-warm-paper); color: var(--rr-text);
   font-weight: 600; }
 .rr-banner.rr-bad { background: var(--rr-bad-paper); }
@@ -120,8 +148,10 @@ class Page(ABC):
             with ui.element("div").classes("rr-panel w-full"):
                 self._wanted = ui.input("events: a text, event:KIND, child:ID, server:NAME", on_change=self._show_lines)
                 self._wanted.props("dense outlined clearable debounce=200").classes("w-full")
-                self._events = ui.label().classes("rr-events").props('role="log" aria-label="events"')
-        ui.timer(_LOOK_S, self._look)
+                with ui.element("div").classes("rr-events-box w-full").props('tabindex="0"'):
+                    self._events = ui.label().classes("rr-events").props('role="log" aria-label="events"')
+        self._look()  # what is known already is in the page itself: nobody waits for the first news
+        ui.timer(_LOOK_S, self._look, immediate=False)
 
     @abstractmethod
     def build(self) -> None:
@@ -135,6 +165,11 @@ class Page(ABC):
         """Return a value that changes when the page must be drawn again for the same moment."""
         return None
 
+    @property
+    def moment(self) -> Moment:
+        """The moment that is shown: of now, or of the time that the slider is at."""
+        return self.watch.now if self.at is None else self.watch.moment_at(self.at)
+
     async def carry_out(self, what: str, command: Command[c.Done]) -> None:
         """Send a command to the system, and show the reader what was done, or the error."""
         with ui.context.client:  # not in the button's place: the page may draw it anew before the answer is here
@@ -146,17 +181,38 @@ class Page(ABC):
                 ui.notify(done.text, type="positive", position="top")
         self.watch.look_soon()
 
-    async def ask_first(self, question: str, carry_out: Callable[[], Awaitable[None]]) -> None:
+    async def ask_first(self, question: str, yes: str, carry_out: Callable[[], Awaitable[None]]) -> None:
         """Carry out a command if the reader agrees."""
         with ui.context.client, ui.dialog() as dialog, ui.card():
             ui.label(question)
             with ui.row():
                 ui.button("cancel", on_click=lambda: dialog.submit(False)).props("no-caps outline")
-                ui.button("kill", on_click=lambda: dialog.submit(True)).props("no-caps color=negative")
+                ui.button(yes, on_click=lambda: dialog.submit(True)).props("no-caps color=negative")
         agreed = await dialog
         dialog.delete()
         if agreed:
             await carry_out()
+
+    async def ask_priority(self, query_id: str, whose: str) -> None:
+        """Give a query the priority that the reader types, if any."""
+        with ui.context.client, ui.dialog() as dialog, ui.card():
+            ui.label(f"The priority of {whose}:")
+            field = ui.input("from -1000 to 1000, or standby").props("dense outlined autofocus").classes("w-full")
+            field.on("keydown.enter", lambda: dialog.submit(field.value))
+            with ui.row():
+                ui.button("cancel", on_click=lambda: dialog.submit(None)).props("no-caps outline")
+                ui.button("give it", on_click=lambda: dialog.submit(field.value)).props("no-caps")
+        typed: str | None = await dialog
+        dialog.delete()
+        if typed is None:
+            return
+        try:
+            command = commands.GivePriority(query_id, commands.priority_from("priority", typed))
+        except UsageError as error:
+            with ui.context.client:
+                ui.notify(str(error), type="negative", multi_line=True, position="top")
+        else:
+            await self.carry_out("priority", command)
 
     def _slid(self, back: float | None) -> None:
         back = back or 0.0
@@ -167,7 +223,7 @@ class Page(ABC):
 
     def _look(self) -> None:
         """Show the news of the watch."""
-        watch, moment = self.watch, self.watch.now if self.at is None else self.watch.moment_at(self.at)
+        watch, moment = self.watch, self.moment
         if self.at is None:
             begins = watch.moments[0].at
             self._slider.props["min"] = min(-1, round(begins - time.time())) if begins else -1
@@ -187,8 +243,10 @@ class Page(ABC):
             self.draw(moment)
 
     def _show_lines(self) -> None:
-        lines = self.watch.lines.lines(EventFilter.parse(self._wanted.value or ""))[-_LINES:]
-        self._events.text = "\n".join(map(str, lines))
+        wanted = self._wanted.value or ""
+        lines = self.watch.lines.lines(EventFilter.parse(wanted))[-_LINES:]
+        none = f"No event matches {wanted!r}." if wanted else "No event yet."
+        self._events.text = "\n".join(map(str, lines)) or none
 
     def _warn(self) -> None:
         """Say above the page that it does not show the running system of now."""
@@ -211,6 +269,14 @@ def _named(watch: Watch) -> str:
     return "" if welcome is None else f"{welcome.system}, pid {welcome.pid}, {welcome.state_dir}{missed}"
 
 
+def _shape(row: Row) -> tuple[str, str]:
+    """Return what a line of a panel is made for. Of lines for the same, the words change in place.
+
+    A button that is clicked while it is replaced by another one does nothing.
+    """
+    return row.style, row.query
+
+
 class _Panel:
     """Rows about the chosen thing, as the live terminal shows them, and buttons.
 
@@ -223,6 +289,7 @@ class _Panel:
         self._page = page
         self._rows: Rows | None = None
         self._shown: list[Row] = []
+        self._labels: list[tuple[ui.label, ui.label]] = []  # of each line its text and its note
         self._is_asking = self._is_wanted = False
         self._title = ui.label(hint).classes("text-bold")
         self._buttons = ui.row().classes("gap-2")
@@ -255,28 +322,56 @@ class _Panel:
             listed = refused(error, window)
         if rows is not self._rows or listed.rows == self._shown:
             return
-        self._shown = listed.rows
+        before, self._shown = self._shown, listed.rows
+        if list(map(_shape, before)) == list(map(_shape, listed.rows)):
+            for (text, note), row in zip(self._labels, listed.rows, strict=True):
+                text.text, note.text = row.text, row.note
+            return
         self._lines.clear()
         with self._lines:
-            for row in listed.rows:
-                self._line(row)
+            self._labels = [self._line(row) for row in listed.rows]
 
-    def _line(self, row: Row) -> None:
+    def _line(self, row: Row) -> tuple[ui.label, ui.label]:
         with ui.element("div").classes("rr-line " + " ".join(f"rr-{word}" for word in row.style.split())):
-            ui.label(row.text)
-            if row.note:
-                ui.label(row.note).classes("rr-note")
+            text, note = ui.label(row.text), ui.label(row.note).classes("rr-note")
+            note.bind_visibility_from(note, "text", backward=bool)
             if row.query:
                 self._button("unload", commands.Unload(row.query))
+                self._asking("priority", partial(self._page.ask_priority, row.query, row.text.strip("-> ")))
+        return text, note
 
     def _button(self, name: str, command: Command[c.Done]) -> None:
         carry_out = partial(self._page.carry_out, name, command)
         if isinstance(command, commands.Kill):
-            carry_out = partial(
-                self._page.ask_first, f"Kill {command.child}? It cannot finish what it does.", carry_out
-            )
-        button = ui.button(name, on_click=carry_out).props("dense no-caps outline")
+            question = f"Kill {command.child}? It cannot finish what it does."
+            carry_out = partial(self._page.ask_first, question, "kill", carry_out)
+        elif isinstance(command, commands.Revoke):
+            question = f"Revoke {self._title.text}? Its holders have {command.grace_s:g} s to release it."
+            carry_out = partial(self._page.ask_first, question, "revoke it", carry_out)
+        self._asking(name, carry_out)
+
+    def _asking(self, name: str, do: Callable[[], Awaitable[None]]) -> None:
+        button = ui.button(name, on_click=do).props("dense no-caps outline")
         button.bind_enabled_from(self._page, "at", backward=lambda at: at is None)
+
+
+class _Pictures:
+    """The newest pictures of some streams. Whatever a frame contains, it is the source of an image and nothing else."""
+
+    def __init__(self) -> None:
+        self._row = ui.row().classes("rr-pictures gap-2")
+        self._images: dict[str, ui.element] = {}
+
+    def show(self, pictures: Mapping[str, bytes]) -> None:
+        """Show these PNGs, by the names of their streams, in place of those before."""
+        for name in [name for name in self._images if name not in pictures]:
+            self._images.pop(name).delete()
+        for name, picture in pictures.items():
+            if name not in self._images:
+                with self._row:
+                    self._images[name] = ui.element("img")
+                self._images[name].props["alt"] = self._images[name].props["title"] = f"stream {name}"
+            self._images[name].props["src"] = f"data:image/png;base64,{base64.b64encode(picture).decode()}"
 
 
 class TreePage(Page):
@@ -304,7 +399,7 @@ class TreePage(Page):
 
     async def _choose(self, path: str) -> None:
         self._chosen = path
-        self._tree.show(self.watch.now, path)
+        self._tree.show(self.moment, path)
         buttons: dict[str, Command[c.Done]] = {}
         if "/" in path:  # the root itself can only be looked at
             buttons["kill -9"] = commands.Kill(path)
@@ -350,12 +445,76 @@ def _section(path: str, curves: Sequence[Curve]) -> str:
     return f'<section data-child="{escape(path)}"><h2>{escape(path)}</h2>{rows}</section>'
 
 
+class LoadsPage(Page):
+    """The page with the loads that wait now, and how often and how long those of each server waited."""
+
+    goes_back = False
+
+    def __init__(self, watch: Watch) -> None:
+        self._is_asking = False
+        super().__init__(watch, "/loads")
+
+    def build(self) -> None:
+        """Put both tables on the page."""
+        with ui.element("div").classes("rr-panel w-full"):
+            self._waiting = ui.html("", sanitize=False).classes("w-full")
+        with ui.element("div").classes("rr-panel w-full"):
+            self._servers = ui.html("", sanitize=False).classes("w-full")
+            ui.label(_LOADS_NOTE).classes("rr-note")
+
+    def draw(self, moment: Moment) -> None:
+        """Ask for the loads again, unless an answer is still to come."""
+        if not self._is_asking and not moment.problem:
+            background_tasks.create(self._ask())
+
+    def step(self) -> int:
+        """Return the second: a load that waits grows older."""
+        return int(time.monotonic())
+
+    async def _ask(self) -> None:
+        self._is_asking = True
+        try:
+            waiting, total, servers = await asyncio.to_thread(self._asked)
+        except RrError:  # the next moment says why there is no answer
+            return
+        finally:
+            self._is_asking = False
+        said = f"{total:,} load{'' if total == 1 else 's'} in progress" if total else NO_LOAD_WAITS
+        first = f": the first {len(waiting)}" if len(waiting) < total else ""
+        self._waiting.content = _table(said + first, WAITING_HEADS, waiting, left=(0, 1, 2, 4))
+        self._servers.content = _table("Loads of each server", LOADS_HEADS, servers, left=(0,))
+
+    def _asked(self) -> tuple[list[tuple[str, ...]], int, list[tuple[str, ...]]]:
+        ask = partial(self.watch.link.ask, timeout_s=_ASK_S)
+        found = ask(ListLoads(limit=_WAITING))
+        waiting = [waiting_cells(ask, row) for row in found.rows]
+        return waiting, found.total, [loads_cells(row) for row in found.servers]
+
+
+def _table(caption: str, heads: Sequence[str], rows: Sequence[Sequence[str]], *, left: Sequence[int]) -> str:
+    """Return a table as HTML, the columns of these numbers aligned at the left; without rows, its caption alone."""
+    places = ['class="rr-left"' if at in left else "" for at in range(len(heads))]
+    head = "".join(f'<th scope="col" {place}>{escape(one)}</th>' for one, place in zip(heads, places, strict=True))
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f'<td data-head="{escape(name)}" {place}>{escape(cell)}</td>'
+            for name, place, cell in zip(heads, places, row, strict=True)
+        )
+        + "</tr>"
+        for row in rows
+    )
+    head = f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>" if rows else ""
+    return f'<table class="rr-loads"><caption>{escape(caption)}</caption>{head}</table>'
+
+
 class ResourcesPage(Page):
     """The page with the resources: the picture of their dependencies beside the tree, and a table of all."""
 
     def __init__(self, watch: Watch) -> None:
         self._chosen = ""
         self._began = time.time()
+        self._graph: ui.echart | None = None
         self._opened: dict[str, list[ResourceRow]] = {}  # servers, with their resources that are drawn
         self._focus: list[ResourceRow] = []  # the chosen resource and its neighbours, where all are too many to draw
         super().__init__(watch, "/resources")
@@ -369,30 +528,64 @@ class ResourcesPage(Page):
                 with ui.row().classes("items-center gap-2"):
                     self._said = ui.label().classes("rr-note")
                     self._back = ui.button("all", on_click=self._show_all).props("dense no-caps outline")
-                self._graph = ui.echart(graph_picture.chart(Moment(0)), on_point_click=self._clicked)
-                self._graph.classes("rr-graph").style("height: 48vh")
+                self._graph_place = ui.element("div").classes("w-full").style("height: 48vh")
             with ui.element("div").classes("rr-panel").style("flex: 2"):
                 self._panel = _Panel(self, "Choose a resource to see its holders and parts.")
+                self._pictures = _Pictures()
+                self._actions = ui.html("", sanitize=False).classes("rr-actions")
         self._table = ResourceTable(self._choose)
+        ui.timer(0, self._add_libraries, once=True)
+        ui.timer(_PICTURE_S, self._look_at_streams)
+
+    def _add_libraries(self) -> None:
+        """Add the graph and the table. Their libraries take a second to load, so tree and counts are shown first."""
+        with self._graph_place:
+            self._graph = ui.echart(self._options(self._seen()), on_point_click=self._clicked)
+            self._graph.classes("rr-graph").style("height: 100%")
+        self._table.fill()
+
+    async def _look_at_streams(self) -> None:
+        """Show the newest picture of each stream of the chosen resource."""
+        chosen = self._chosen if self.at is None else ""
+        seen = await asyncio.to_thread(self.watch.pictures_of, chosen) if chosen else {}
+        if chosen == (self._chosen if self.at is None else ""):  # nothing else was chosen meanwhile
+            self._pictures.show(seen)
 
     def draw(self, moment: Moment) -> None:
         """Show the tree and the graph, and make the table and the panel ask for their rows again."""
         self._tree.show(moment)
         grouped = bool(moment.servers)
-        if grouped and self._focus and self.at is None:
-            moment = replace(moment, resources=tuple(self._focus), servers=())
-        chosen = self._chosen if any(row.id == self._chosen for row in moment.resources) else ""
-        options = graph_picture.chart(moment, chosen, self.step(), self._opened)
-        self._graph.options.clear()
-        self._graph.options.update(options)
+        if self._graph is not None:
+            self._graph.options.clear()
+            self._graph.options.update(self._options(self._seen()))
         how = ": the chosen one, with all above and below it" if self._focus else ": a click opens a server"
-        self._said.text = f"{moment.total:,} resources{how * grouped}"
+        self._said.text = f"{moment.total:,} resource{'' if moment.total == 1 else 's'}{how * grouped}"
         self._back.set_visibility(grouped and bool(self._focus or self._opened))
         if self.at is None:
             self._table.refresh()
             background_tasks.create(self._panel.ask())
+            background_tasks.create(self._draw_actions())
             if grouped:
                 background_tasks.create(self._renew())
+
+    def _seen(self) -> Moment:
+        """Return what the graph shows: the moment, or of many resources the chosen one with its neighbours."""
+        moment = self.moment
+        if moment.servers and self._focus and self.at is None:
+            return replace(moment, resources=tuple(self._focus), servers=())
+        return moment
+
+    def _options(self, seen: Moment) -> graph_picture.Chart:
+        chosen = self._chosen if any(row.id == self._chosen for row in seen.resources) else ""
+        return graph_picture.chart(seen, chosen, self.step(), self._opened)
+
+    async def _draw_actions(self) -> None:
+        """Draw the actions of the chosen resource with their states, if it is a graph of actions."""
+        row = next((row for row in (*self.watch.now.resources, *self._focus) if row.id == self._chosen), None)
+        with contextlib.suppress(RrError):  # the next moment says why there is no answer
+            graph = None if row is None else await asyncio.to_thread(graph_of, self.watch.link, row)
+            if row is None or row.id == self._chosen:  # nothing else was chosen meanwhile
+                self._actions.content = "" if graph is None else graph.picture
 
     def step(self) -> set[str]:
         """Return the nodes that the newest statuses have just reached on their way up, slowed down for the picture.
@@ -446,4 +639,6 @@ class ResourcesPage(Page):
         if self.watch.now.servers:
             await self._renew()
         name = next((row.name for row in (*self.watch.now.resources, *self._focus) if row.id == id), "")
-        await self._panel.show(Neighbours(id, name), {"unload from all": commands.Unload(id, force=True)})
+        buttons: dict[str, Command[c.Done]] = {"unload from all": commands.Unload(id, force=True)}
+        buttons["revoke"] = commands.Revoke(id, "revoked on the web page")
+        await self._panel.show(Neighbours(id, name), buttons)

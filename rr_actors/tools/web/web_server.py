@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import socket
@@ -16,22 +17,24 @@ from functools import partial
 import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse
-from nicegui import app, ui
+from nicegui import app, background_tasks, binding, ui
 
 from rr_actors.base.errors import RrError, UsageError
 from rr_actors.runtime.processes import lifeline
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.recording.figures import prometheus_text
-from rr_actors.tools.web.lab_pages import add_lab
+from rr_actors.tools.web.lab.lab_pages import add_lab
 from rr_actors.tools.web.resource_table import add_rows
-from rr_actors.tools.web.sequence_page import SequencePage
+from rr_actors.tools.web.sequence_page import Recorder, SequencePage, end_unseen
 from rr_actors.tools.web.timeline_page import TimelinePage
 from rr_actors.tools.web.watch import Watch
-from rr_actors.tools.web.web_access import Access, Keys
-from rr_actors.tools.web.web_pages import FiguresPage, ResourcesPage, TreePage
+from rr_actors.tools.web.web_access import Access, Keys, is_loopback
+from rr_actors.tools.web.web_pages import FiguresPage, LoadsPage, ResourcesPage, TreePage
 
 _CLOSE_S = 1
 _LOOK_S = 20.0
+_AWAY_S = 15.0
+"""How long a page may lose its connection, on a busy machine say, and go on as it was. Later it is loaded anew."""
 
 
 def serve(
@@ -62,28 +65,40 @@ def serve(
     port = listening.getsockname()[1]
     keys = Keys()
     if lab:
-        add_lab()
+        add_lab(takes_code=is_loopback(host))
     else:
         watch = Watch(state_dir)
-        ui.page("/", title="rr-actors: tree")(partial(TreePage, watch))
-        ui.page("/timeline", title="rr-actors: timeline")(partial(TimelinePage, watch))
-        ui.page("/resources", title="rr-actors: resources")(partial(ResourcesPage, watch))
-        ui.page("/figures", title="rr-actors: figures")(partial(FiguresPage, watch))
-        ui.page("/sequence", title="rr-actors: sequence")(partial(SequencePage, watch))
+        recorder = Recorder(watch)
+        for path, name, page in (
+            ("/", "tree", partial(TreePage, watch)),
+            ("/timeline", "timeline", partial(TimelinePage, watch)),
+            ("/resources", "resources", partial(ResourcesPage, watch)),
+            ("/loads", "loads", partial(LoadsPage, watch)),
+            ("/figures", "figures", partial(FiguresPage, watch)),
+            ("/sequence", "sequence", partial(SequencePage, watch, recorder)),
+        ):
+            ui.page(path, title=f"rr-actors: {name}", reconnect_timeout=_AWAY_S)(page)
         add_rows(watch)
         _add_metrics(watch)
         app.on_startup(watch.start)
+        app.on_startup(partial(_begin_to_look, recorder))
+        app.on_shutdown(recorder.close)
         app.on_shutdown(watch.stop)
     shown = f"[{host}]" if ":" in host else host
     app.on_startup(lambda: say(f"http://{shown}:{port}/{'lab' if lab else ''}?token={keys.token}"))
     served = FastAPI(openapi_url=None)
-    ui.run_with(served, title="rr-actors", favicon="🎭", dark=None, show_welcome_message=False)
+    binding.MAX_PROPAGATION_TIME = math.inf  # it prints a warning where the machine is busy
+    ui.run_with(served, title="rr-actors", favicon="🎭", dark=None, language="en-US", show_welcome_message=False)
     config = uvicorn.Config(
         Access(served, keys, host, port), log_level="warning", timeout_graceful_shutdown=_CLOSE_S, server_header=False
     )
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn closes all, then raises the signal again
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config).run(sockets=[listening])
+
+
+def _begin_to_look(recorder: Recorder) -> None:
+    background_tasks.create(end_unseen(recorder))
 
 
 def _add_metrics(watch: Watch) -> None:

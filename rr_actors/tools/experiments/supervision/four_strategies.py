@@ -25,15 +25,15 @@ def three(strategy: Any) -> rr.Supervisor:
     return rr.Supervisor([rr.ChildSpec(Worker, id=id) for id in ids], id=strategy, strategy=strategy)
 
 
-def main(state_dir: str) -> None:
+def main(state_dir: str, child: str = "b") -> None:
     strategies = ("one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one")
     with rr.System([three(strategy) for strategy in strategies], state_dir=state_dir) as system:
         for _ in range(3):  # this one begins without children: they are made from its template
             system.supervisor("root/simple_one_for_one").start_child([])
         time.sleep(3)
         for strategy in strategies:
-            second = system.supervisor(f"root/{strategy}").which_children()[1]
-            print(f"SIGKILL to {second.id} under {strategy}", flush=True)
-            os.kill(second.pid or 0, signal.SIGKILL)
+            killed = system.supervisor(f"root/{strategy}").which_children()["abc".index(child)]
+            print(f"SIGKILL to {killed.id} under {strategy}", flush=True)
+            os.kill(killed.pid or 0, signal.SIGKILL)
             time.sleep(3)
         time.sleep(3)

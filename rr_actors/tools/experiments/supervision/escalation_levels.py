@@ -20,13 +20,13 @@ class Part(rr.Actor):
         return os.getpid()
 
 
-def main(state_dir: str) -> None:
+def main(state_dir: str, kills: int = 4) -> None:
     wheel = rr.Supervisor([rr.ChildSpec(Part, id="motor")], id="wheel", max_restarts=1, max_seconds=60)
     parts: list[rr.ChildSpec | rr.Supervisor] = [rr.ChildSpec(Part, id="battery"), wheel]
     base = rr.Supervisor(parts, id="base", strategy="one_for_all", max_restarts=1, max_seconds=60)
     with rr.System(rr.Supervisor([base], max_restarts=1, max_seconds=60), state_dir=state_dir) as system:
         motor = system.ref("root/base/wheel/motor")
-        for number in range(1, 5):
+        for number in range(1, kills + 1):
             time.sleep(4)
             print(f"kill {number}: SIGKILL to the motor", flush=True)
             os.kill(motor.ask("who?", timeout=20), signal.SIGKILL)

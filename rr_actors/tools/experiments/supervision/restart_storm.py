@@ -27,11 +27,11 @@ class Innocent(rr.Actor):
     pass
 
 
-def main(state_dir: str) -> None:
+def main(state_dir: str, max_restarts: int = 3) -> None:
     children = [rr.ChildSpec(Innocent, id="innocent"), rr.ChildSpec(Broken, id="broken")]
-    branch = rr.Supervisor(children, id="branch", max_restarts=3, max_seconds=15)
+    branch = rr.Supervisor(children, id="branch", max_restarts=max_restarts, max_seconds=15)
     with rr.System(rr.Supervisor([branch], max_restarts=1, max_seconds=60), state_dir=state_dir) as system:
-        print("broken fails 1.5 s after each start; 3 restarts within 15 s are allowed", flush=True)
+        print(f"broken fails 1.5 s after each start; {max_restarts} restarts within 15 s are allowed", flush=True)
         system.wait(60)
         print(f"the tree has ended: {system.ended.reason if system.ended else 'not yet'}", flush=True)
         time.sleep(3)

@@ -4,84 +4,61 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import importlib.util
-import inspect
+import json
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
 
 from rr_actors.base.errors import RrError
 from rr_actors.runtime.processes.lifeline import kill_group
+from rr_actors.tools.web.lab.lab_catalog import experiment_called
+from rr_actors.tools.web.lab.lab_declarations import Seen, Value
+from rr_actors.tools.web.lab.lab_texts import PACKAGE
 from rr_actors.tools.web.watch import Watch
 
-_PACKAGE = "rr_actors.tools.experiments"
-_NAMES = (
-    "four_strategies", "restart_storm", "escalation_levels", "poisoned_actor", "sharing_and_parts", "kill_in_a_load",
-)  # fmt: skip
 AT_ONCE = 4
 """How many experiments may run at a time, of all browsers together."""
-_LOOK_FOR = "Look for:"
-_STOP_S = 5.0
+_CHANGED = "changed_experiment.py"
+_STOP_S = 15.0  # what is killed may leave programs that run on
 _LOOK_S = 0.1
 _LINES = 100
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """One of the lab's programs.
-
-    Attributes:
-        title, about, look_for: texts for people, from the module's docstring.
-        code: the module's text after the docstring.
-    """
-
-    name: str
-    title: str
-    about: str
-    look_for: str
-    code: str
-
-
-def experiments() -> list[Experiment]:
-    """Return all experiments, as the lab shows them."""
-    return [_read(name) for name in _NAMES]
-
-
-def _read(name: str) -> Experiment:
-    spec = importlib.util.find_spec(f"{_PACKAGE}.{name}")
-    assert spec is not None
-    assert spec.origin is not None
-    _, docstring, code = Path(spec.origin).read_text().split('"""', 2)
-    title, _, rest = inspect.cleandoc(docstring).partition("\n")
-    about, _, look_for = rest.partition(_LOOK_FOR)
-    return Experiment(name, title.rstrip("."), _flowing(about), _flowing(look_for), code.strip() + "\n")
-
-
-def _flowing(text: str) -> str:
-    return " ".join(text.split())
 
 
 class Run:
     """A run of an experiment, from its start to its end. Any thread may use it.
 
+    Args:
+        name: of the experiment.
+        levers: the arguments of its main().
+        code: a text that is run in the place of its program; "" runs that.
+
     Attributes:
-        lines: the lines that it has printed.
+        began: seconds since the epoch.
+        said: the lines that it has printed, each with its time.
         watch: the watch of the system that it has started; None until that is reached.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, levers: Mapping[str, Value] | None = None, code: str = "") -> None:
         self.name = name
-        self.lines: deque[str] = deque(maxlen=_LINES)
+        self.began = time.time()
+        self.said: deque[tuple[float, str]] = deque(maxlen=_LINES)
         self.watch: Watch | None = None
-        self._state = tempfile.mkdtemp(prefix="rr-lab-")
+        self._place = Path(tempfile.mkdtemp(prefix="rr-lab-"))
+        self._state = str(self._place / "state")
         self._stopping = threading.Event()
-        command = [sys.executable, "-m", _PACKAGE, name, self._state]
+        declared = experiment_called(name)
+        program = declared.program if declared is not None else name
+        if code:
+            program = str(self._place / _CHANGED)
+            Path(program).write_text(code)
+        command = [sys.executable, "-m", PACKAGE, program, self._state, json.dumps(dict(levers or {}))]
         self._program = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, process_group=0
         )
@@ -96,6 +73,22 @@ class Run:
         """True until the run has ended and nothing of it is left."""
         return self._keeper.is_alive()
 
+    @property
+    def has_finished(self) -> bool:
+        """True after its program has come to its own end, without an error."""
+        return not self.is_running and self._program.returncode == 0
+
+    @property
+    def lines(self) -> list[str]:
+        """The lines that it has printed."""
+        return [line for _, line in self.said.copy()]
+
+    @property
+    def seen(self) -> Seen:
+        """What it has shown until now."""
+        watch = self.watch
+        return Seen(list(watch.events.copy()) if watch is not None else [], self.lines)
+
     def stop(self) -> None:
         """End the run, and wait until nothing of it is left. A second call does nothing."""
         self._stopping.set()
@@ -103,7 +96,7 @@ class Run:
 
     def _read(self, output: IO[str]) -> None:
         for line in output:
-            self.lines.append(line.rstrip("\n"))
+            self.said.append((time.time(), line.rstrip("\n")))
 
     def _keep(self) -> None:
         try:
@@ -133,7 +126,7 @@ class Run:
         for pipe in (program.stdin, program.stdout):
             if pipe is not None:
                 pipe.close()
-        shutil.rmtree(self._state, ignore_errors=True)
+        shutil.rmtree(self._place, ignore_errors=True)
 
 
 class Place:
@@ -152,7 +145,7 @@ class Place:
         self._lock = asyncio.Lock()  # stopping takes a while, and another click may come meanwhile
         self._has_left = False
 
-    async def start(self, name: str) -> bool:
+    async def start(self, name: str, levers: Mapping[str, Value] | None = None, code: str = "") -> bool:
         """Stop the page's experiment and start another; return False if too many run on other pages."""
         async with self._lock:
             await self._stop()
@@ -160,7 +153,7 @@ class Place:
                 return True
             if sum(one.is_running for one in self._runs) >= AT_ONCE:
                 return False
-            self.run = Run(name)
+            self.run = Run(name, levers, code)
             self._runs.add(self.run)
             return True
 

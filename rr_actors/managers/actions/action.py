@@ -1,0 +1,249 @@
+"""Action: a user's code that a graph runs, and the parameters that its class has."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, cast
+
+import msgspec
+from msgspec import inspect
+
+from rr_actors.base.checks import is_number
+from rr_actors.base.errors import UsageError, shown
+from rr_actors.managers.actions.graph_checks import Signature
+from rr_actors.managers.actions.graph_model import Parameter
+from rr_actors.managers.actions.parameters import SEPARATOR, flat, nested
+from rr_actors.registrar.engine.server import Current, current
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.model.rows import State
+from rr_actors.registrar.queries import Query
+from rr_actors.registrar.registrar import Registrar
+from rr_actors.runtime.processes.isolated import Events
+
+OnStatus = Callable[[Status], object]
+_WITH_FIELDS = (inspect.StructType, inspect.DataclassType, inspect.NamedTupleType, inspect.TypedDictType)
+_WORDS: dict[type[inspect.Type], str] = {
+    inspect.StrType: "string",
+    inspect.IntType: "number",
+    inspect.FloatType: "number",
+    inspect.BoolType: "bool",
+}
+
+
+class Action(ABC):
+    """One step of a graph: subclass it, and give the class to rr_actors.managers.Actions (thesis 2.5.1)::
+
+        class Navigate(rr.Action):
+            class Input(msgspec.Struct):
+                goal: str
+
+            def run(self, given: Input) -> bool:
+                robot = self.load("robots/robot", LoadRobot("rover"))
+                ...
+                return True
+
+    Each run makes an instance. What it loads is released when the run has ended, in whatever way. In a graph of the
+    older dialect an "asynchronous" action keeps it until the graph ends.
+
+    Attributes:
+        name: the name in graphs; "" means the name of the class.
+        Input: the class of what `run` is given, a msgspec.Struct or a dataclass. Without one, run() is given a dict.
+        Output: the class of what it returns.
+        isolate: True: run() has a process of its own, which is killed if it does not stop. For code that may hang or
+            crash. It loads nothing (docs/actions.md).
+        timeout_s: seconds that an isolated run may take; then it is stopped. None: no limit.
+        attempt: 1 at first; more if a crash has interrupted the run before.
+        pausing: an event that is set while the action is to pause. Code that can pause looks at it.
+    """
+
+    name: ClassVar[str] = ""
+    Input: ClassVar[type[Any] | None] = None
+    Output: ClassVar[type[Any] | None] = None
+
+    isolate: ClassVar[bool] = False
+    timeout_s: ClassVar[float | None] = None
+
+    attempt: int = 1
+    pausing: threading.Event = threading.Event()  # each instance has its own
+
+    def __init__(self) -> None:
+        """Make the action for one run. Only the Actions manager does."""
+        self.pausing = threading.Event()
+        self._stopping: threading.Event | None = None
+        self._current: Current | None = None
+        self._registrar: Registrar | None = None
+
+    @abstractmethod
+    def run(self, given: Any) -> Any:
+        """Do the step. Return an Output, True or None for on_true, and False for on_false. To raise means on_error.
+
+        With `Output` and False, return ``(False, output)``.
+        """
+
+    @property
+    def stopping(self) -> threading.Event:
+        """The event that tells a run to end soon.
+
+        It is set when the graph stops the action or is released, and when the process stops. It is set, too, when
+        something that the action has loaded is lost, unless `on_status` has handled that.
+        """
+        if self._stopping is None:
+            raise self._not_running()
+        return self._stopping
+
+    def load(
+        self,
+        server: str,
+        request: Any,
+        *,
+        on_status: OnStatus | None = None,
+        timeout_s: float | None = 30.0,
+        priority: int | None = None,
+    ) -> Query:
+        """Load a resource for this run, as Registrar.load() does. It is released when the run has ended.
+
+        Args:
+            on_status: called with each of its statuses. If it does not say `status.handled()` to a FATAL, `stopping` is
+                set.
+            priority: None: that of the graph.
+
+        Raises:
+            RrError: as Registrar.load().
+            UsageError: the action is isolated.
+        """
+        me, registrar = self._current, self._registrar
+        if me is None or registrar is None:
+            raise self._not_running()
+
+        def heard(status: Status) -> None:
+            if on_status is not None:
+                on_status(status)
+            if status.state is State.FATAL and not status.is_handled:
+                self.stopping.set()
+
+        if priority is None:
+            return registrar.load(server, request, on_status=heard, timeout_s=timeout_s, parent=me)
+        return registrar.load(server, request, on_status=heard, timeout_s=timeout_s, parent=me, priority=priority)
+
+    def _not_running(self) -> UsageError:
+        if self._stopping is not None:
+            text = (
+                "it is isolated, and its process has no registrar: load in another action, and hand over what it needs"
+            )
+        else:
+            text = "no graph runs this action: only its manager can load for it"
+        return UsageError(f"{type(self).__name__}: {text}")
+
+    def _bind(self, registrar: Registrar, attempt: int) -> None:
+        self._registrar, self._current, self.attempt = registrar, current(), attempt
+        self._stopping = current().stopping
+
+    def _bind_alone(self, events: Events, attempt: int) -> None:
+        self._stopping, self.pausing, self.attempt = events.stopping, events.pausing, attempt
+
+
+def bind(action: Action, registrar: Registrar, attempt: int) -> None:
+    """Bind an action to the load callback that runs it."""
+    action._bind(registrar, attempt)  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def run_alone(
+    kind: type[Action], inputs: Mapping[str, Any], attempt: int, events: Events
+) -> tuple[str, dict[str, Any]]:
+    """Run an isolated action, in its process, and return its result and outputs."""
+    action = kind()
+    action._bind_alone(events, attempt)  # pyright: ignore[reportPrivateUsage]  # same file
+    return result_of(kind, action.run(given_to(kind, inputs)))
+
+
+def check_isolation(kind: type[Action]) -> None:
+    """Check what an action's class says about its process.
+
+    Raises:
+        UsageError: `isolate` is no bool, or `timeout_s` no time, or it is there although nothing can end the run.
+    """
+    who, limit_s = f"{kind.__name__}.timeout_s", kind.timeout_s
+    if not isinstance(kind.isolate, bool):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise UsageError(f"{kind.__name__}.isolate: expected True or False, got {shown(kind.isolate)}")
+    if limit_s is not None and not (is_number(limit_s) and limit_s > 0):
+        raise UsageError(f"{who}: expected seconds greater than 0, or None, got {shown(limit_s)}")
+    if limit_s is not None and not kind.isolate:
+        raise UsageError(f"{who}: expected isolate = True, without which nothing can end a run, got {shown(limit_s)}")
+
+
+def name_of(kind: type[Action]) -> str:
+    """Return the name that graphs call an action by."""
+    return kind.name or kind.__name__
+
+
+def signature_of_class(kind: type[Action]) -> Signature:
+    """Return the parameters of an action's class.
+
+    Raises:
+        UsageError: Input or Output has no fields.
+    """
+    return Signature(_parameters(kind, "Input"), _parameters(kind, "Output"))
+
+
+def _parameters(kind: type[Action], which: str) -> dict[str, Parameter]:
+    fields: type[Any] | None = getattr(kind, which)
+    if fields is None:
+        return {}
+    found = inspect.type_info(fields)
+    if not isinstance(found, _WITH_FIELDS):
+        expected = "a msgspec.Struct, a dataclass, a NamedTuple or a TypedDict"
+        raise UsageError(f"{kind.__name__}.{which}: expected {expected}, got {shown(fields)}")
+    return dict(_flat_fields(found, "", True))
+
+
+def _flat_fields(found: Any, prefix: str, required: bool) -> list[tuple[str, Parameter]]:
+    flat_fields: list[tuple[str, Parameter]] = []
+    for field in found.fields:
+        name, needed = prefix + field.encode_name, required and field.required
+        if isinstance(field.type, _WITH_FIELDS):
+            flat_fields += _flat_fields(field.type, name + SEPARATOR, needed)
+        else:
+            allowed = tuple(field.type.values) if isinstance(field.type, inspect.LiteralType) else ()
+            flat_fields.append((name, Parameter(_word(field.type), required=needed, allowed=allowed)))
+    return flat_fields
+
+
+def _word(kind: inspect.Type) -> str:
+    if isinstance(kind, inspect.ListType):
+        return f"{_WORDS[type(kind.item_type)]}s" if type(kind.item_type) in _WORDS else "list"
+    if isinstance(kind, inspect.LiteralType):
+        return "string" if all(isinstance(value, str) for value in kind.values) else "number"
+    return _WORDS.get(type(kind), "any")
+
+
+def given_to(kind: type[Action], inputs: Mapping[str, Any]) -> Any:
+    """Return what run() is given.
+
+    Raises:
+        msgspec.ValidationError: the inputs do not fit the class.
+    """
+    values = nested(inputs)
+    return values if kind.Input is None else msgspec.convert(values, kind.Input)
+
+
+def result_of(kind: type[Action], returned: Any) -> tuple[str, dict[str, Any]]:
+    """Return the result and the outputs, by flat names, of what run() has returned.
+
+    Raises:
+        UsageError: it is nothing that run() may return.
+    """
+    output: object = returned
+    succeeded = True
+    if isinstance(returned, tuple) and len(cast("tuple[object, ...]", returned)) == 2:
+        succeeded, output = cast("tuple[bool, object]", returned)
+    if isinstance(output, bool) or output is None:
+        return ("on_false" if output is False else "on_true"), {}
+    if kind.Output is not None and isinstance(output, kind.Output):
+        output = msgspec.to_builtins(output)
+    if not isinstance(output, dict):
+        expected = "an Output, a dict of outputs, True, False, None, or (False, outputs)"
+        raise UsageError(f"{kind.__name__}.run(): expected {expected}, got {shown(cast('object', returned))}")
+    leaves = {name for name, one in signature_of_class(kind).outputs.items() if one.type == "any"}
+    return ("on_true" if succeeded else "on_false"), flat(cast("dict[str, Any]", output), leaves)

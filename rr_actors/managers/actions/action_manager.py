@@ -1,0 +1,385 @@
+"""Actions: the manager that runs actions, and the graphs made of them (thesis 2.5).
+
+`actions/action` runs one action: its load callback is the action's run(). `actions/graph` runs a graph: its response is
+the graph's JSON object with the states, and changes with each transition.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rr_actors.base import pickling
+from rr_actors.base.checks import is_number
+from rr_actors.base.errors import LoadFailed, NotFound, RrError, UsageError, shown
+from rr_actors.base.names import new_id
+from rr_actors.base.reporting.log import Log
+from rr_actors.managers.actions.action import Action, bind, given_to, name_of, result_of, run_alone
+from rr_actors.managers.actions.graph_documents import read_graph
+from rr_actors.managers.actions.graph_engine import GraphEngine
+from rr_actors.managers.actions.graph_library import GraphLibrary
+from rr_actors.managers.actions.graph_model import ActionGraph
+from rr_actors.managers.actions.graph_runs import (
+    OVER,
+    Begin,
+    Change,
+    Ended,
+    Event,
+    GraphRun,
+    Halt,
+    NodeRun,
+    Pause,
+    Resume,
+    checked_inputs,
+    document_in,
+    feedback,
+    first_run,
+    run_in,
+)
+from rr_actors.managers.actions.parameters import flat
+from rr_actors.managers.actions.run_controls import RunControl
+from rr_actors.registrar.declarations import server
+from rr_actors.registrar.engine.server import current
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.manager import Manager
+from rr_actors.registrar.model.rows import LOADED, State
+from rr_actors.registrar.queries import Query
+from rr_actors.runtime.processes.isolated import Events, run_isolated
+
+logger = Log("rr_actors.managers.actions")
+
+
+@dataclass(frozen=True)
+class RunAction:
+    """The request to run one action.
+
+    Attributes:
+        action: the action's name.
+        inputs: by flat names, "nav_goal::x".
+        run: identifies the run: each has its own.
+        attempt: of this run, if a crash has interrupted earlier ones.
+        engine: the manager whose graph runs it; "": none.
+    """
+
+    action: str
+    inputs: dict[str, Any] = field(default_factory=dict[str, Any])
+    run: str = field(default_factory=new_id)
+    attempt: int = 1
+    engine: str = ""
+
+
+@dataclass(frozen=True)
+class ActionEnd:
+    """The response: `result` is on_true or on_false; `outputs` by flat names."""
+
+    result: str
+    outputs: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RunGraph:
+    """The request to run a graph.
+
+    Attributes:
+        graph: the name of a graph of the manager's folder, or a graph as a JSON object.
+        inputs: of the entries, nested or by flat names.
+        instance: identifies the run: each has its own.
+        file: where the JSON object was read, for errors.
+    """
+
+    graph: str | dict[str, Any]
+    inputs: dict[str, Any] = field(default_factory=dict[str, Any])
+    instance: str = field(default_factory=new_id)
+    file: str = ""
+
+
+class Actions(Manager):
+    """Serves `action` and `graph`: runs actions, and graphs of them in the Unified Meaning Representation Format.
+
+    The holders of a graph hear UPDATE at each transition, and ERROR if it ends with on_error. To release it stops it. A
+    graph goes on after a crash of this manager: no action runs again whose end is on disk.
+    """
+
+    def __init__(
+        self, actions: Sequence[type[Action]] = (), graphs: str | os.PathLike[str] | None = None, stop_s: float = 5.0
+    ) -> None:
+        """Take the classes of actions, and a folder with graphs in ``*.json`` files.
+
+        Args:
+            stop_s: seconds that actions have to end when their graph is released.
+
+        Raises:
+            GraphError: a graph is wrong. `.file`, `.path`, `.expected`, `.got`
+            UsageError: an action is none, or `stop_s` is no number of at least 0.
+        """
+        if not is_number(stop_s) or stop_s < 0:
+            raise UsageError(f"Actions: stop_s: expected a number of at least 0, got {shown(stop_s)}")
+        self._library = GraphLibrary(actions, graphs)
+        self._stop_s = stop_s
+        self._lock = threading.Lock()
+        self._engines: dict[str, GraphEngine] = {}
+        self._instances: dict[str, str] = {}  # ids of graphs, by what their requests identify them by
+        self._controls: dict[str, RunControl] = {}
+        self._acting: dict[str, Action] = {}
+        self._closing = False
+
+    def on_start(self) -> None:
+        """Go on with the graphs that a crash, or the end of the system, has interrupted.
+
+        A graph whose load was interrupted is loaded again, and may run already.
+        """
+        found = [info for info in self.registrar.resources() if info.server == "graph" and info.phase == LOADED]
+        graphs = [info for info in found if info.id not in self._engines]
+        go_on = [self._restored(info.id, info.request, info.response) for info in graphs]
+        for each in go_on:  # when all engines are there: a graph tells its sub-graphs again what it has told them
+            each()
+
+    def on_stop(self) -> None:
+        """Tell all actions to end. Those whose graph is not released run again when the manager starts again."""
+        with self._lock:
+            self._closing = True
+            acting = list(self._acting.values())
+        for action in acting:
+            action.stopping.set()
+
+    # -- messages --------------------------------------------------------------------------------------------------
+
+    def on_receive(self, message: Any) -> None:
+        """Do what `rr-actors graph change` asks."""
+        match message:
+            case {"change_graph": str(graph), "new": dict(), "start": str(start), "file": str(file)}:
+                self.change_graph(graph, message["new"], start, file)
+            case _:
+                raise UsageError(f"{self.registrar.name}: expected a message to Actions, got {shown(message)}")
+
+    def stop_graph(self, graph: str) -> None:
+        """End a graph: stop its actions. Its state is STOPPED when they have ended.
+
+        Args:
+            graph: the id of the graph's resource.
+
+        Raises:
+            NotFound: no graph of this id runs here. `.id`, `.known`
+        """
+        self._engine(graph).tell(Halt())
+
+    def pause_graph(self, graph: str) -> None:
+        """Pause a graph: no action begins until it is resumed, and `pausing` is set in those that run.
+
+        Raises:
+            NotFound: no graph of this id runs here. `.id`, `.known`
+        """
+        self._engine(graph).tell(Pause())
+
+    def resume_graph(self, graph: str, start: str = "") -> None:
+        """Resume a graph that is paused or halted.
+
+        Args:
+            start: an action of it that runs now, "TaNavigate_0".
+
+        Raises:
+            NotFound: no graph of this id runs here. `.id`, `.known`
+            GraphError: it has no such action.
+        """
+        self._engine(graph).tell(Resume(start))
+
+    def change_graph(self, graph: str, new: str | dict[str, Any], start: str = "", file: str = "") -> None:
+        """Go on with another graph: one commit puts it in the place of the one that runs.
+
+        Actions that run go on if the new graph has the same. The others are stopped, and what they have loaded is
+        released, before anything begins. If the new graph is wrong, nothing changes.
+
+        Args:
+            graph: the id of the graph's resource.
+            new: the name of a graph of the folder, or a graph as a JSON object.
+            start: an action of the new graph that runs then, "TaNavigate_0". Without it, actions that ran otherwise
+                than the new graph says begin again. If nothing runs then, the entries do that are new.
+            file: where the JSON object was read, for errors.
+
+        Raises:
+            NotFound: no graph of this id runs here. `.id`, `.known`
+            GraphError: the new graph is wrong, or has no action `start`, or that lacks an input; or the graph that is
+                to be changed has ended. `.file`, `.path`, `.expected`, `.got`
+        """
+        engine = self._engine(graph)
+        engine.tell(Change(self._library.find(new, file), start))
+
+    def _engine(self, graph: str) -> GraphEngine:
+        with self._lock:
+            engine, known = self._engines.get(graph), tuple(self._engines)
+        if engine is None:
+            raise NotFound(
+                f"no graph {shown(graph)}: expected one of {', '.join(known) or 'none'}", id=graph, known=known
+            )
+        return engine
+
+    # -- servers ---------------------------------------------------------------------------------------------------
+
+    @server("action", recovery="keep")
+    def run_action(self, request: RunAction) -> ActionEnd:
+        """Run an action until its end."""
+        kind = self._library.action(request.action)
+        if request.engine == self.registrar.name and current().attempt > 1:
+            text = f"{request.action}: a crash has interrupted it, and its graph runs it again as the next attempt"
+            raise LoadFailed(text, server=f"{self.registrar.name}/action")
+        action = kind()
+        with self._lock:
+            control = self._controls.get(request.run)
+            self._acting[request.run] = action
+            closing = self._closing
+        bind(action, self.registrar, request.attempt + current().attempt - 1)
+        try:
+            if control is not None:
+                control.attach_action(action)
+            if closing:
+                action.stopping.set()
+            end = ActionEnd(*self._run(kind, action, request.inputs))
+        finally:
+            del self._acting[request.run]
+        if self._closing and action.stopping.is_set():
+            raise LoadFailed(f"{request.action}: its manager stops", server=f"{self.registrar.name}/action")
+        return end
+
+    def _run(self, kind: type[Action], action: Action, inputs: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+        """Run an action here or in a process of its own, and return its result and outputs."""
+        if not kind.isolate:
+            return result_of(kind, action.run(given_to(kind, inputs)))
+        name = f"{self.registrar.name}/{name_of(kind)}"
+        call = pickling.dumps(functools.partial(run_alone, kind, inputs, action.attempt), f"the isolated action {name}")
+        events, spawner = Events(action.stopping, action.pausing), self._node.spawner
+        ended = run_isolated(spawner, call, events, name=name, timeout_s=kind.timeout_s, grace_s=self._stop_s)
+        if ended.why:
+            error = LoadFailed(f"{name_of(kind)}: {ended.why}", server=f"{self.registrar.name}/action")
+            if ended.trace:
+                error.add_note(f"In the process of {name}:\n{ended.trace}")
+            raise error
+        return ended.value
+
+    @run_action.status
+    def action_status(self, request: RunAction, status: Status) -> None:
+        """Keep the statuses of what an action has loaded from its graph: the action itself decides, and has heard."""
+        if status.query_id:
+            status.handled()
+
+    @server("graph", recovery="keep")
+    def load_graph(self, request: RunGraph) -> dict[str, Any]:
+        """Check a graph, and begin it."""
+        graph = self._library.find(request.graph, request.file)
+        inputs = checked_inputs(graph, _flat_inputs(graph, request.inputs))
+        run = first_run(graph)
+        engine = self._add(current().resource_id, request.instance, graph, run)
+        begins = Begin(inputs), current().loaded
+        threading.Thread(target=engine.begin, args=begins, name=f"graph {graph.name}", daemon=True).start()
+        return feedback(graph, run)
+
+    @load_graph.status
+    def graph_status(self, request: RunGraph, status: Status) -> None:
+        """Keep the statuses of actions from the holders: they hear how the graph ends."""
+        if status.query_id:
+            status.handled()
+
+    @load_graph.unload
+    def unload_graph(self, request: RunGraph, response: dict[str, Any] | None) -> None:
+        """Stop what runs."""
+        with self._lock:
+            engine = self._engines.pop(current().resource_id, None)
+            self._instances.pop(request.instance, None)
+        if engine is not None:
+            engine.close(self._stop_s)
+
+    def _add(self, id: str, instance: str, graph: ActionGraph, run: GraphRun) -> GraphEngine:
+        engine = GraphEngine(self, id, graph, run)
+        with self._lock:
+            self._engines[id] = engine
+            self._instances[instance] = id
+        return engine
+
+    def _restored(self, id: str, request: RunGraph, response: dict[str, Any]) -> Callable[[], None]:
+        """Make the engine of a graph again, and return what goes on with it."""
+        try:
+            run = run_in(response)
+            graph = self._library.complete(read_graph(document_in(response)))
+            inputs = {} if run.steps else checked_inputs(graph, _flat_inputs(graph, request.inputs))
+        except RrError as error:
+            text = f"the graph does not fit the actions of this version: {error}"
+            return functools.partial(self.registrar.send_status, id, Status(State.FATAL, text))
+        engine = self._add(id, request.instance, graph, run)
+        if run.steps:
+            return lambda: engine.restore(self.registrar.children(id), _key_of, self._ends())
+        return threading.Thread(
+            target=engine.begin, args=[Begin(inputs)], name=f"graph {graph.name}", daemon=True
+        ).start
+
+    def _ends(self) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Return the ends of actions that are on disk here."""
+        infos = [info for info in self.registrar.resources() if info.server == "action" and info.phase == LOADED]
+        return {info.request.run: (info.response.result, info.response.outputs) for info in infos}
+
+    # -- for the engines -------------------------------------------------------------------------------------------
+
+    def is_closing(self) -> bool:
+        """Return whether this manager stops, so that ends of actions mean nothing."""
+        return self._closing
+
+    def begin_run(self, graph_id: str, graph: ActionGraph, node: str, run: NodeRun, control: RunControl) -> Query:
+        """Run an action or a sub-graph; return its query when that has ended, or when the sub-graph has begun."""
+        action = graph.nodes[node]
+        with self._lock:
+            self._controls[control.key] = control
+        try:
+            if not action.actor and action.action not in self._library.actions:
+                request: RunGraph | RunAction = RunGraph(action.action, run.inputs, control.key)
+                return self.registrar.load(f"{self.registrar.name}/graph", request, parent=graph_id, timeout_s=None)
+            request = RunAction(action.action, run.inputs, control.key, run.attempt, self.registrar.name)
+            actor = action.actor or self.registrar.name
+            return self.registrar.load(f"{actor}/action", request, parent=graph_id, timeout_s=None)
+        finally:
+            del self._controls[control.key]
+
+    def end_of(self, query: Query, node: str, run: NodeRun, control: RunControl) -> Ended:
+        """Return how a run has ended whose query is held; of a sub-graph, wait for that."""
+        response = query.response
+        if isinstance(response, ActionEnd):
+            return Ended(node, run.number, response.result, response.outputs)
+        control.attach(lambda what: self._tell_graph(query.resource_id, what))
+        ended = wait_ended(query, None)
+        result = "on_error" if ended.result == "on_halted" else ended.result
+        return Ended(node, run.number, result, ended.outputs, ended.why)
+
+    def _tell_graph(self, id: str, what: str) -> None:
+        events: dict[str, Event] = {"stop": Halt(), "pause": Pause(), "resume": Resume()}
+        with self._lock:
+            engine = self._engines.get(id)
+        if engine is not None:  # else it is being released
+            engine.tell(events[what])
+
+
+def wait_ended(query: Query, timeout_s: float | None) -> GraphRun:
+    """Return the run of a graph when it has ended or is halted.
+
+    Raises:
+        LoadFailed: the graph is lost.
+        LoadTimeout: it has not ended in time.
+    """
+    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    while (run := run_in(query.response)).state not in OVER:
+        left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
+        status = query.wait_status(timeout_s=left_s)
+        if status.state is State.FATAL:
+            raise LoadFailed(f"{query.server_id}: the graph is lost: {status.message}", server=query.server_id)
+    return run
+
+
+def _flat_inputs(graph: ActionGraph, inputs: dict[str, Any]) -> dict[str, Any]:
+    leaves = [name for entry in graph.entry for name in graph.nodes[entry].inputs]
+    return flat(inputs, leaves)
+
+
+def _key_of(part: Query) -> str:
+    request = part.request
+    return request.instance if isinstance(request, RunGraph) else request.run

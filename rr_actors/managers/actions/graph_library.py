@@ -1,0 +1,116 @@
+"""Graph library: the actions and graphs that an Actions manager has, by name."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from rr_actors.base.errors import UsageError, shown
+from rr_actors.managers.actions.action import Action, check_isolation, name_of, signature_of_class
+from rr_actors.managers.actions.graph_checks import completed, signature_of
+from rr_actors.managers.actions.graph_documents import read_graph, read_graph_file
+from rr_actors.managers.actions.graph_model import ActionGraph, wrong_graph
+
+
+class GraphLibrary:
+    """All of it is read and checked when it is made, so that a manager with a wrong graph does not start.
+
+    Attributes:
+        actions: the classes, by the names that graphs call them by.
+        graphs: the graphs of the folder, with the parameters of their actions, by name.
+    """
+
+    def __init__(self, actions: Sequence[type[Action]], folder: str | os.PathLike[str] | None = None) -> None:
+        """Read the graphs in the files ``*.json`` of a folder.
+
+        Raises:
+            GraphError: a graph is wrong, or the folder cannot be read.
+            UsageError: one of `actions` is no subclass of Action, or has no run(), or two have the same name,
+                or `isolate` or `timeout_s` is wrong.
+        """
+        self.actions = _by_name(actions)
+        self._known = {name: signature_of_class(kind) for name, kind in self.actions.items()}
+        self.graphs: dict[str, ActionGraph] = {}
+        unread = {} if folder is None else _read_folder(Path(folder))
+        for name in unread:
+            self._complete(name, unread, ())
+
+    def _complete(self, name: str, unread: dict[str, ActionGraph], inside: tuple[str, ...]) -> None:
+        """Complete a graph after its sub-graphs."""
+        if name in self.graphs:
+            return
+        graph = unread[name]
+        for node in graph.nodes.values():
+            if node.action in inside or node.action == name:
+                expected = f"a graph that is not inside itself, as {node.action} is"
+                raise wrong_graph(graph.file, f"{node.place}.name", expected, node.action)
+            if node.action in unread and node.action not in self.actions:
+                self._complete(node.action, unread, (*inside, name))
+        self.graphs[name] = self.complete(graph)
+        self._known.setdefault(name, signature_of(self.graphs[name]))
+
+    def complete(self, graph: ActionGraph) -> ActionGraph:
+        """Return a graph with the parameters of its actions, and check it.
+
+        Raises:
+            GraphError: it cannot run here.
+        """
+        return completed(graph, self._known)
+
+    def find(self, graph: str | dict[str, Any], file: str = "") -> ActionGraph:
+        """Return the graph of this name, or the one that this JSON object is, which was read in `file`.
+
+        Raises:
+            GraphError: there is none of this name, or the object is none that can run here.
+        """
+        if isinstance(graph, dict):
+            return self.complete(read_graph(graph, file))
+        if graph not in self.graphs:
+            known = ", ".join(sorted(self.graphs)) or "none"
+            raise wrong_graph("", "graph", f"a graph: one of {known}", graph)
+        return self.graphs[graph]
+
+    def action(self, name: str) -> type[Action]:
+        """Return the class of an action.
+
+        Raises:
+            GraphError: there is none of this name.
+        """
+        if name not in self.actions:
+            known = ", ".join(sorted(self.actions)) or "none"
+            raise wrong_graph("", "action", f"an action: one of {known}", name)
+        return self.actions[name]
+
+
+def is_action(given: object) -> bool:
+    """Return whether this is a subclass of Action."""
+    return isinstance(given, type) and issubclass(given, Action)
+
+
+def _by_name(actions: Sequence[type[Action]]) -> dict[str, type[Action]]:
+    found: dict[str, type[Action]] = {}
+    for kind in actions:
+        if not is_action(kind):
+            raise UsageError(f"Actions: actions: expected subclasses of rr.Action, got {shown(cast('object', kind))}")
+        if inspect.isabstract(kind):
+            raise UsageError(f"Actions: actions: expected a class with a method run(), got {kind.__name__} without one")
+        check_isolation(kind)
+        if name_of(kind) in found:
+            raise UsageError(f"Actions: actions: expected different names, got {name_of(kind)!r} again")
+        found[name_of(kind)] = kind
+    return found
+
+
+def _read_folder(folder: Path) -> dict[str, ActionGraph]:
+    if not folder.is_dir():
+        raise wrong_graph(str(folder), "", "a folder with graphs", None, "none")
+    found: dict[str, ActionGraph] = {}
+    for path in sorted(folder.glob("*.json")):
+        graph = read_graph_file(path)
+        if graph.name in found:
+            raise wrong_graph(graph.file, "graph_name", f"another name than in {found[graph.name].file}", graph.name)
+        found[graph.name] = graph
+    return found

@@ -1,0 +1,129 @@
+"""A graph of actions, as both published dialects of UMRF describe one: the actions, their parameters and relations.
+
+Names of actions in a graph are "TaNavigate_0": the name of the action, and a number that distinguishes its instances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import GraphError, shortened, shown
+
+RESULTS = ("on_true", "on_false", "on_stopped", "on_error")
+RESPONSES = ("run", "pause", "restart", "stop", "bypass", "ignore")
+DEFAULT_CONDITIONS: dict[str, str] = dict(zip(RESULTS, ("run", "run", "ignore", "bypass"), strict=True))
+ENTRY, EXIT = "graph_entry", "graph_exit"
+
+
+class Parameter(msgspec.Struct, frozen=True):
+    """One value that an action takes or gives.
+
+    Attributes:
+        type: "string", "number", "bool", their plurals, or another word, of which nothing is known.
+        value: the value that the graph gives, if `has_value`.
+        required: whether the action cannot run without it.
+        updatable: whether a parent's output may replace `value`.
+        allowed: the only values that are accepted from a parent; none: all of its type.
+    """
+
+    type: str
+    value: Any = None
+    has_value: bool = False
+    required: bool = True
+    updatable: bool = True
+    allowed: tuple[Any, ...] = ()
+
+
+class ParentRelation(msgspec.Struct, frozen=True):
+    """What a parent's end means to an action: a response to each result."""
+
+    required: bool = True
+    conditions: dict[str, str] = msgspec.field(default_factory=DEFAULT_CONDITIONS.copy)
+
+
+class ActionNode(msgspec.Struct, frozen=True):
+    """One action of a graph.
+
+    Attributes:
+        name: the name in the graph.
+        action: the name of the action's class, or of a graph.
+        place: where the file has it, "actions[2]".
+        spontaneous: whether it runs again and again.
+        kept: whether what it has loaded is kept until the graph ends.
+        actor: the manager that runs it; "": the manager of the graph.
+        parents: by the name in the graph.
+        children: by the name in the graph: the names that outputs have there, by their names here.
+    """
+
+    name: str
+    action: str
+    place: str
+    spontaneous: bool = False
+    kept: bool = False
+    actor: str = ""
+    inputs: dict[str, Parameter] = {}
+    outputs: dict[str, Parameter] = {}
+    parents: dict[str, ParentRelation] = {}
+    children: dict[str, dict[str, str]] = {}
+
+
+class ActionGraph(msgspec.Struct, frozen=True):
+    """A graph that has been read.
+
+    Attributes:
+        file: where it was read, for errors; "" if it was no file.
+        dialect: 1: of 2019 to 2022, without an exit. 2: since 2023.
+        entry: the actions that run first.
+        exit: the actions whose end ends the graph.
+        document: the JSON object.
+    """
+
+    name: str
+    file: str
+    dialect: int
+    nodes: dict[str, ActionNode]
+    entry: tuple[str, ...]
+    exit: dict[str, ParentRelation]
+    document: dict[str, Any]
+
+    def exits_of(self, name: str) -> Iterator[tuple[str, ParentRelation]]:
+        """Return the children of an action, and the end of the graph, with what the action's end means to them."""
+        for child in self.nodes[name].children:
+            yield child, self.nodes[child].parents[name]
+        if name in self.exit:
+            yield EXIT, self.exit[name]
+
+    def parents_of(self, name: str) -> dict[str, ParentRelation]:
+        """Return the relations to the parents of an action, or of the end of the graph."""
+        return self.exit if name == EXIT else self.nodes[name].parents
+
+    def unchanged(self, before: ActionGraph) -> set[str]:
+        """Return the actions that are the same in an earlier graph, whatever their relations are."""
+        return {name for name, node in self.nodes.items() if _alone(node) == _alone(before.nodes.get(name))}
+
+    def below(self, name: str) -> set[str]:
+        """Return all actions that come after this one. In a cycle it is one of them."""
+        found: set[str] = set()
+        left = [name]
+        while left:
+            new = set(self.nodes[left.pop()].children) - found
+            found |= new
+            left += new
+        return found
+
+
+def _alone(node: ActionNode | None) -> ActionNode | None:
+    """Return an action without what the graph around it says."""
+    return node and msgspec.structs.replace(node, place="", parents={}, children={})
+
+
+def wrong_graph(file: str, path: str, expected: str, got: object, said: str | None = None) -> GraphError:
+    """Return the error for one place of a graph; the text shows `said`, or else the value and its type."""
+    if said is None:
+        said = "none" if got is None else f"{shown(got)} ({type(got).__name__})"
+    place = ": ".join(filter(None, (file or "graph", shortened(path))))
+    text = f"{place}: expected {expected}, got {said}"
+    return GraphError(text, server="", file=file or None, path=path, expected=expected, got=got)

@@ -1,0 +1,211 @@
+"""The desired state: what a file says is to be kept, the checks of that, and the replicas that it asks for.
+
+A file has a table for each kind of thing that is kept::
+
+    [[keep]]
+    name = "camera"
+    server = "cameras/camera"
+    request = "/dev/video{instance}"     # {instance}: 0 to replicas - 1
+    replicas = 3
+    priority = 5
+    after = ["power"]                    # loaded when all replicas of these are ready
+
+    [[group]]                            # "keeper/group" loads all of its members, in this order
+    name = "navigation"
+
+    [[group.member]]
+    server = "maps/map"
+    request = "hall"
+"""
+
+from __future__ import annotations
+
+import graphlib
+from collections.abc import Mapping
+from typing import Any, cast
+
+import msgspec
+
+from rr_actors.base.errors import InvalidName, did_you_mean, few, shown
+from rr_actors.base.names import parse_server_id
+from rr_actors.base.toml import parse_typed, wrong
+from rr_actors.base.values.canonical import encode
+from rr_actors.managers.keeper.comparing import Wanted
+from rr_actors.registrar.model.rows import HIGHEST, LOWEST
+
+INSTANCE = "{instance}"
+MOST_REPLICAS = 10_000
+Request = Any
+"""A request of any server: plain data, as TOML has it. None: the server's request with all of its defaults."""
+
+
+class Keep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One kind of thing that is kept.
+
+    Attributes:
+        name: what `keeper/kept` and `after` call it.
+        server: "registrar/server".
+        request: its texts may contain {instance}, the number of the replica.
+        replicas: how many are wanted, from 0.
+        priority: of each replica, from -1000 to 1000.
+        standby: whether the replicas are held on standby, without a priority.
+        after: names of what must be ready before a replica is loaded. What is loaded already stays.
+    """
+
+    name: str
+    server: str
+    request: Request = None
+    replicas: int = 1
+    priority: int = 0
+    standby: bool = False
+    after: tuple[str, ...] = ()
+
+
+class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A resource of a group."""
+
+    server: str
+    request: Request = None
+
+
+class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Resources that are loaded together, by their name at `keeper/group`."""
+
+    name: str
+    member: tuple[Member, ...] = ()
+
+
+class KeepFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    keep: tuple[Keep, ...] = ()
+    group: tuple[Group, ...] = ()
+
+
+class Replica(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The request for one replica. `members`: of the group that it loads, so a changed group is loaded anew."""
+
+    keep: str
+    instance: int
+    server: str
+    request: Request = None
+    members: tuple[Member, ...] = ()
+
+
+class Desired(msgspec.Struct, frozen=True):
+    """What is to be kept, and the groups, by their names."""
+
+    keeps: dict[str, Keep] = {}
+    groups: dict[str, Group] = {}
+
+    def replicas(self, group_server: str) -> list[tuple[Wanted, Replica]]:
+        """Return all replicas that are wanted; `group_server` is the id of the server of groups."""
+        found: list[tuple[Wanted, Replica]] = []
+        for keep in self.keeps.values():
+            members: tuple[Member, ...] = ()
+            if keep.server == group_server and isinstance(keep.request, str) and keep.request in self.groups:
+                members = self.groups[keep.request].member
+            priority = None if keep.standby else keep.priority
+            for i in range(keep.replicas):
+                replica = Replica(keep.name, i, keep.server, numbered(keep.request, i), members)
+                found.append((Wanted(keep.name, i, encode(replica), priority, keep.after), replica))
+        return found
+
+
+def numbered(request: Request, instance: int) -> Request:
+    """Return the request with the number in place of each {instance} in its texts."""
+    if isinstance(request, str):
+        return request.replace(INSTANCE, str(instance))
+    if isinstance(request, list):
+        return [numbered(part, instance) for part in cast("list[object]", request)]
+    if isinstance(request, dict):
+        return {key: numbered(part, instance) for key, part in cast("dict[str, object]", request).items()}
+    return request
+
+
+def parse_desired(data: bytes, file: str) -> Desired:
+    """Return what the bytes of a TOML file called `file` want.
+
+    Raises:
+        ConfigError: they are no TOML, or a key is wrong. `.file`, `.key`, `.expected`, `.got`
+    """
+    parsed = parse_typed(data, file, KeepFile)
+    checks = _Checks(file)
+    keeps = {keep.name: keep for keep in parsed.keep}
+    checks.names("keep", [keep.name for keep in parsed.keep])
+    checks.names("group", [group.name for group in parsed.group])
+    for i, keep in enumerate(parsed.keep):
+        checks.keep(f"keep[{i}]", keep, keeps)
+    for i, group in enumerate(parsed.group):
+        for j, member in enumerate(group.member):
+            checks.server(f"group[{i}].member[{j}].server", member.server)
+    checks.order(parsed.keep)
+    return Desired(keeps, {group.name: group for group in parsed.group})
+
+
+class _Checks:
+    """The checks of one file. Each raises ConfigError."""
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+
+    def names(self, table: str, names: list[str]) -> None:
+        seen = set[str]()
+        for i, name in enumerate(names):
+            if not name or name in seen:
+                said = f"{shown(name)} again" if name else None
+                raise wrong(self._file, f"{table}[{i}].name", f"a name that no other {table} has", name, said=said)
+            seen.add(name)
+
+    def keep(self, key: str, keep: Keep, keeps: Mapping[str, Keep]) -> None:
+        self.server(f"{key}.server", keep.server)
+        self._within(f"{key}.replicas", keep.replicas, 0, MOST_REPLICAS)
+        self._within(f"{key}.priority", keep.priority, LOWEST, HIGHEST)
+        if keep.replicas > 1 and numbered(keep.request, 0) == keep.request:
+            expected = f"a request with {INSTANCE}, so that the {keep.replicas} replicas differ"
+            raise wrong(self._file, f"{key}.request", expected, keep.request)
+        for i, name in enumerate(keep.after):
+            if name not in keeps:
+                said = f"{shown(name)}{did_you_mean(name, keeps)}"
+                raise wrong(self._file, f"{key}.after[{i}]", f"one of {few(keeps)}", name, said=said)
+
+    def server(self, key: str, server: str) -> None:
+        try:
+            parse_server_id(server)
+        except InvalidName as error:
+            raise wrong(self._file, key, "the id of a server, 'registrar/server'", server) from error
+
+    def order(self, keeps: tuple[Keep, ...]) -> None:
+        """Check that nothing is, in the end, after itself."""
+        try:
+            graphlib.TopologicalSorter({keep.name: keep.after for keep in keeps}).prepare()
+        except graphlib.CycleError as error:
+            ring = " after ".join(map(shown, reversed(error.args[1])))
+            index = next(i for i, keep in enumerate(keeps) if keep.name == error.args[1][-1])
+            key = f"keep[{index}].after"
+            raise wrong(self._file, key, "names without a ring", error.args[1], said=f"the ring {ring}") from error
+
+    def _within(self, key: str, number: int, least: int, most: int) -> None:
+        if not least <= number <= most:
+            raise wrong(self._file, key, f"a whole number from {least} to {most}", number)
+
+
+def changes(before: Desired, after: Desired) -> list[str]:
+    """Return a line for each difference: "+ camera", "- lidar", "~ arm: replicas 3 -> 1"."""
+    lines: list[str] = []
+    for prefix, old, new in (("", before.keeps, after.keeps), ("group ", before.groups, after.groups)):
+        lines += [f"+ {prefix}{name}" for name in new if name not in old]
+        lines += [f"- {prefix}{name}" for name in old if name not in new]
+        for name, now in new.items():
+            if name in old and (said := _changed(old[name], now)):
+                lines.append(f"~ {prefix}{name}: {said}")
+    return lines
+
+
+def _changed(old: msgspec.Struct, new: msgspec.Struct) -> str:
+    pairs = ((field, getattr(old, field), getattr(new, field)) for field in new.__struct_fields__)
+    return ", ".join(f"{field} {_plain(was)} -> {_plain(now)}" for field, was, now in pairs if was != now)
+
+
+def _plain(value: object) -> str:
+    return shown(msgspec.to_builtins(value))

@@ -1,0 +1,239 @@
+"""The managers of the mission: sensors that are chosen and kept, and a graph of actions that loads them."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import msgspec
+
+from rr_actors.managers import Action, Actions, Alternative, Choices, Choose, Keeper
+from rr_actors.registrar.declarations import server
+from rr_actors.testing.callback_log import Journal
+from rr_actors.testing.victim_managers import LOG_TO, Recorded, cut_links
+
+SENSORS = ("sensors-1", "sensors-2")
+PLANNERS = ("choices", "keeper", "actions")
+SETTLE_S = 0.2
+"""So long an alternative has to be well until a choice returns to it."""
+ACT_S = 0.02
+"""How long an action takes."""
+UNLUCKY_ARMS = 120
+"""Of 256 loads of arms, so many fail."""
+ACT, ACTED, SEEN, RELEASED = "act", "acted", "seen-the-end", "released"
+"""Words of the journal. Its subject is "mission/round/action" for the first two, and a mission for the others."""
+
+ALTERNATIVES = (
+    Alternative("range", "sensors-1/camera", "front", provides={"rate_hz": 30}, timeout_s=5.0),
+    Alternative("range", "sensors-2/lidar", "front", provides={"rate_hz": 20}, timeout_s=5.0),
+    Alternative("range", "sensors-2/camera", "spare", provides={"rate_hz": 10}, timeout_s=5.0),
+    Alternative("arm", "sensors-1/lidar", "arm", break_first=True, timeout_s=5.0),
+    Alternative("arm", "sensors-2/camera", "arm", break_first=True, timeout_s=5.0),
+)
+CHOICES = (Choose("range"), Choose("range", prefer=["-rate_hz"]), Choose("range", {"rate_hz": "<25"}), Choose("arm"))
+
+
+def _table(kind: str, **fields: object) -> str:
+    """Return a table of a TOML file."""
+    return "\n".join([f"[[{kind}]]", *(f"{key} = {json.dumps(value)}" for key, value in fields.items()), ""])
+
+
+def _keeps(replicas: int, request: str) -> str:
+    """Return a file with this number of radios, and request in the place of theirs and the beacons'."""
+    beacons = {"server": "sensors-2/lidar", "request": request, "replicas": 2, "after": ["radio"]}
+    tables = [
+        _table("keep", name="radio", server="sensors-1/camera", request=request, replicas=replicas),
+        _table("keep", name="beacon", **beacons),
+        _table("group", name="dock"),
+        _table("group.member", server="sensors-2/camera", request="dock"),
+        _table("group.member", server="sensors-1/lidar", request="dock"),
+        _table("keep", name="dock", server="keeper/group", request="dock"),
+    ]
+    return "\n".join(tables)
+
+
+DESIRED: Mapping[str, str] = {
+    "all": _keeps(3, "kept-{instance}"),
+    "less": _keeps(1, "kept-{instance}"),
+    "others": _keeps(3, "other-{instance}"),
+    "nothing": "",
+}
+"""What the keeper is to keep, by name."""
+
+
+class Sensors(Recorded):
+    """Serves "camera", which outlives a crash, and "lidar", which is lost in it.
+
+    One load in ten fails, and of those of an arm nearly each second one, so that a choice loses all of them at times.
+    """
+
+    @server("camera", recovery="keep")
+    def open_camera(self, name: str) -> str:
+        return self._open(name)
+
+    @open_camera.unload
+    def close_camera(self, name: str, response: str) -> None:
+        self.unmake()
+
+    @server("lidar", recovery="lost")
+    def open_lidar(self, name: str) -> str:
+        return self._open(name)
+
+    @open_lidar.unload
+    def close_lidar(self, name: str, response: str) -> None:
+        self.unmake()
+
+    def on_receive(self, message: Any) -> Any:
+        if message == "cut":
+            cut_links()
+        return message
+
+    def _open(self, name: str) -> str:
+        with self.recorded("load") as now:
+            luck = hashlib.sha256(f"{now.resource_id} {now.attempt}".encode()).digest()
+            time.sleep(luck[0] / 255 * 0.01)
+            if luck[1] < (UNLUCKY_ARMS if name == "arm" else 25):
+                raise ValueError("out of luck")
+        return f"{self.registrar.name} {name}"
+
+
+class Chooser(Choices):
+    """Choices whose links can be cut."""
+
+    def on_receive(self, message: Any) -> Any:
+        return _cut(message) or super().on_receive(message)
+
+
+class Caretaker(Keeper):
+    """A Keeper whose links can be cut."""
+
+    def on_receive(self, message: Any) -> Any:
+        return _cut(message) or super().on_receive(message)
+
+
+class Patrol(Actions):
+    """Actions whose links can be cut."""
+
+    def on_receive(self, message: Any) -> Any:
+        return _cut(message) or super().on_receive(message)
+
+
+def _cut(message: Any) -> bool:
+    if message == "cut":
+        cut_links()
+    return message == "cut"
+
+
+def write_desired(directory: Path) -> None:
+    """Write the files that the keeper is given."""
+    for name in DESIRED:
+        desired_file(directory, name).write_text(DESIRED[name])
+
+
+def desired_file(directory: Path, name: str) -> Path:
+    """Return the path of a file that the keeper is given."""
+    return directory / f"keep-{name}.toml"
+
+
+class Place(msgspec.Struct):
+    """What each action is given, and gives: the mission, and which round it is in."""
+
+    mission: str
+    round: int
+    rounds: int
+
+
+class Step(Action):
+    """An action that notes its beginning and its end."""
+
+    Input: ClassVar = Place
+    Output: ClassVar = Place
+
+    def run(self, given: Place) -> Any:
+        subject = f"{given.mission}/{given.round}/{type(self).__name__}"
+        journal().note("actions", ACT, subject, self.attempt)
+        try:
+            return self.do(given)
+        finally:
+            journal().note("actions", ACTED, subject, self.attempt)
+
+    def do(self, given: Place) -> Any:
+        """Do what is special about the step."""
+        self.stopping.wait(ACT_S)
+        return given
+
+
+class Start(Step):
+    """Begins the first round."""
+
+
+class Look(Step):
+    """Needs ranges, by a choice."""
+
+    def do(self, given: Place) -> Any:
+        self.load("choices/choice", CHOICES[given.round % 2], timeout_s=5.0)
+        return super().do(given)
+
+
+class Fetch(Step):
+    """Needs a sensor of its own, and fails now and then."""
+
+    def do(self, given: Place) -> Any:
+        self.load("sensors-1/lidar", f"fetch-{given.round}", timeout_s=5.0)
+        if hashlib.sha256(given.mission.encode()).digest()[given.round] < 12:
+            raise ValueError("nothing to fetch")
+        return super().do(given)
+
+
+class Turn(Step):
+    """Waits for the other two, and begins the next round; or says that it was the last."""
+
+    def do(self, given: Place) -> Any:
+        super().do(given)
+        return given.round < given.rounds, Place(given.mission, given.round + 1, given.rounds)
+
+
+class Finish(Step):
+    """Comes after the last round."""
+
+
+STEPS = (Start, Look, Fetch, Turn, Finish)
+_NEXT = {"Start": ("Look", "Fetch"), "Look": ("Turn",), "Fetch": ("Turn",), "Turn": ("Look", "Fetch", "Finish")}
+_WORDS = {
+    ("Turn", "Look"): ["on_false -> ignore"],
+    ("Turn", "Fetch"): ["on_false -> ignore"],
+    ("Turn", "Finish"): ["on_true -> ignore", "on_false -> run"],
+}
+
+
+def _parent(parent: str, child: str) -> dict[str, Any]:
+    relation = {"name": parent, "required": child == "Turn"}
+    return {**relation, "conditions": _WORDS.get((parent, child), [])}
+
+
+GRAPH: dict[str, Any] = {
+    "graph_name": "patrol",
+    "graph_entry": [{"name": "Start"}],
+    "graph_exit": [{"name": "Finish"}],
+    "actions": [
+        {
+            "name": step.__name__,
+            "children": [{"name": child} for child in _NEXT.get(step.__name__, ())],
+            "parents": [_parent(parent, step.__name__) for parent, below in _NEXT.items() if step.__name__ in below],
+        }
+        for step in STEPS
+    ],
+}
+"""Start, then rounds of Look beside Fetch, which Turn joins, then Finish."""
+
+
+@functools.cache
+def journal() -> Journal:
+    """Return this process's journal."""
+    return Journal(os.environ[LOG_TO])

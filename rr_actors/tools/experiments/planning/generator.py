@@ -1,0 +1,61 @@
+"""Generator: a reserve is started before anybody is switched off.
+
+The battery gives 100 W, and all of it is used. A generator can give 40 W more. The pool names it as its reserve, so it
+is loaded when that is needed, and released when it is not.
+
+Look for: the generator, which loads for two seconds while the pump waits; what becomes of the others when the alarm
+needs 40 W more, and there is no second generator.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+
+import rr_actors as rr
+from rr_actors.managers import Budgets, Pool, Reserve, Share, Supply
+
+WATTS = {"radio": 20, "lamp": 20, "camera": 20, "arm": 40, "pump": 40, "alarm": 40}
+
+
+class Devices(rr.Manager):
+    def __init__(self, has_fuel: bool) -> None:
+        self.has_fuel = has_fuel
+
+    @rr.server("device")
+    def switch_on(self, name: str) -> str:
+        self.registrar.load("budgets/share", Share("watts", WATTS[name], wait_s=20), timeout_s=60)
+        return name
+
+    @rr.server("generator")
+    def start_generator(self) -> None:
+        time.sleep(2)
+        if not self.has_fuel:
+            raise OSError("no fuel")
+        self.registrar.load("budgets/supply", Supply("watts", 40))
+        print("the generator runs", flush=True)
+
+
+def main(state_dir: str, fuel: str = "yes") -> None:
+    pool = Pool("watts", 100, reserve=(Reserve("devices/generator", 40),))
+    children = [
+        rr.ChildSpec(Budgets, id="budgets", args=([pool],)),
+        rr.ChildSpec(Devices, id="devices", args=(fuel == "yes",)),
+    ]
+    step = "in the beginning"
+
+    def hear(name: str, status: rr.Status) -> None:
+        if status.reason == "revoked":
+            print(f"{name} is switched off {step}", flush=True)
+
+    with rr.System(children, state_dir=state_dir) as system:
+        app = system.open_registrar("app")
+        time.sleep(2)
+        for number, name in enumerate(WATTS):
+            if name in ("pump", "alarm"):
+                step = f"for the {name}"
+                print(step, flush=True)
+            heard = functools.partial(hear, name)
+            app.load("devices/device", name, priority=number + 1, on_status=heard, timeout_s=60)
+            if name in ("arm", "pump", "alarm"):
+                time.sleep(4)

@@ -1,0 +1,71 @@
+"""Rebinding: another sensor takes the place of one that was killed.
+
+A choice is a resource with one part: the sensor in use. A camera gives 60 readings in a second, a lidar 30. The
+consumer asks for the kind "range", and prefers many readings. One loop reads them all.
+
+Look for: the choice, whose part changes while its holder keeps it; the camera's new process, which is on trial for the
+settling time before the choice returns to it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import rr_actors as rr
+from rr_actors.managers import Alternative, Choices, Choose
+
+RATES = {"camera": 60, "lidar": 30}  # readings in a second
+RUNS_S = 16.0
+
+
+class Sensors(rr.Manager):
+    def __init__(self, rate_hz: float) -> None:
+        self.rate_hz, self.off = rate_hz, threading.Event()
+
+    @rr.server("sensor", recovery="lost")  # a sensor does not outlive its process
+    def open_sensor(self) -> rr.Stream:
+        ranges, off = rr.current().open_stream("ranges"), threading.Event()
+
+        def run() -> None:
+            while not off.wait(1 / self.rate_hz):
+                ranges.publish((self.registrar.name, os.getpid()))
+
+        threading.Thread(target=run, daemon=True).start()
+        self.off = off
+        return ranges.stream
+
+    @open_sensor.unload
+    def close_sensor(self, response: rr.Stream | None) -> None:
+        self.off.set()
+
+
+def read(choice: rr.Query[object]) -> None:
+    used, last, began = [""], time.monotonic(), time.monotonic()
+    for reading in choice.stream("ranges", timeout_s=30):
+        (name, pid), now = reading.value, time.monotonic()
+        if name != used[-1]:
+            used.append(name)
+            print(f"reads the {name}, {(now - last) * 1000:.0f} ms after the reading before", flush=True)
+            if len(used) == 2:  # the first
+                threading.Timer(4, os.kill, (pid, signal.SIGKILL)).start()
+        last = now
+        if now > began + RUNS_S:
+            break
+    print(f"it has read: {', '.join(used[1:])}.", flush=True)
+
+
+def main(state_dir: str, settle_s: float = 3.0, at_least_hz: int = 10) -> None:
+    sensors = [Alternative("range", f"{name}/sensor", provides={"rate_hz": rate}) for name, rate in RATES.items()]
+    children = [rr.ChildSpec(Sensors, id=name, args=(rate,)) for name, rate in RATES.items()]
+    children.append(rr.ChildSpec(Choices, id="choices", args=(sensors, settle_s)))
+    with rr.System(children, state_dir=state_dir) as system:
+        wanted = Choose("range", {"rate_hz": f">={at_least_hz}"}, ["rate_hz"])
+        choice = system.open_registrar("app").load("choices/choice", wanted)
+        try:
+            read(choice)
+        except rr.ResourceLost as error:
+            print(f"the loop ends: {error}", flush=True)
+            time.sleep(4)

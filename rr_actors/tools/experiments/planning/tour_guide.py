@@ -1,0 +1,42 @@
+"""A tour guide: programs that run only while they are needed.
+
+A use case, such as "drive", is a resource, and the programs that it needs are its parts. Nobody pauses or ends a
+program by hand: one that nobody holds is idle, and its manager does what was chosen for that.
+
+Look for: the programs that are there when the guide does not drive, and how soon they answer when it drives again.
+"""
+
+from __future__ import annotations
+
+import time
+
+import rr_actors as rr
+from rr_actors.managers import Programs, RunProgram
+
+NEEDS = {"drive": ("laser", "wheels"), "explain": ("camera", "voice")}
+
+
+def program(name: str) -> tuple[str, RunProgram]:
+    return "programs/program", RunProgram("sh", ("-c", "while :; do sleep 0.05; done"), instance=name)
+
+
+class Guide(rr.Manager):
+    @rr.server("use_case")
+    def begin(self, name: str) -> str:
+        self.registrar.load_all([program(needed) for needed in NEEDS[name]])
+        return name
+
+
+def main(state_dir: str, idle: str = "pause", linger_s: float = 0.5) -> None:
+    programs = rr.ChildSpec(Programs, id="programs", kwargs={"idle": idle, "linger_s": linger_s})
+    with rr.System([programs, rr.ChildSpec(Guide, id="guide")], state_dir=state_dir) as system:
+        app, provider = system.open_registrar("app"), system.registrar("programs")
+        time.sleep(2)
+        for step in ("drive", "explain", "drive"):
+            began = time.monotonic()
+            with app.load("guide/use_case", step):
+                print(f"{step}: begins after {(time.monotonic() - began) * 1000:.0f} ms", flush=True)
+                time.sleep(5)
+                phases = {info.request.instance: info.phase for info in provider.resources()}
+                for name in ("laser", "wheels", "camera", "voice"):
+                    print(f"{step}: {name} is {phases.get(name, 'not there')}", flush=True)

@@ -1,0 +1,39 @@
+"""A ring that is refused: a map needs a camera, and that camera needs the same map.
+
+Each would wait for the other, for ever. The registrars see the ring when its last load is asked for, also across
+processes, and this load fails at once.
+
+Look for: the two resources that are still loading, and then fail; the error, which names all loads of the ring.
+"""
+
+from __future__ import annotations
+
+import time
+
+import rr_actors as rr
+
+
+class Maps(rr.Manager):
+    @rr.server("map")
+    def load_map(self, request: str) -> str:
+        time.sleep(3)
+        return f"the map of {request}, by {self.registrar.load('cameras/camera', request).response}"
+
+
+class Cameras(rr.Manager):
+    @rr.server("camera")
+    def load_camera(self, request: str) -> str:
+        time.sleep(3)
+        return f"a camera that knows {self.registrar.load('maps/map', request).response}"
+
+
+def main(state_dir: str) -> None:
+    with rr.System([rr.ChildSpec(Maps, id="maps"), rr.ChildSpec(Cameras, id="cameras")], state_dir=state_dir) as system:
+        app = system.open_registrar("app")
+        time.sleep(2)
+        print("the consumer loads the map of the kitchen", flush=True)
+        try:
+            print("loaded:", app.load("maps/map", "kitchen", timeout_s=40).response, flush=True)
+        except rr.RrError as error:
+            print(f"refused: {error}", flush=True)
+        time.sleep(5)

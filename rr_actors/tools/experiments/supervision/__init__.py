@@ -1,0 +1,1 @@
+"""Experiments about supervision: crashes, restarts, and when a supervisor gives up."""

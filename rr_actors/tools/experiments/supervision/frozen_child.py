@@ -1,0 +1,39 @@
+"""A frozen child: its process lives, and stands still. No signal says so; its heartbeat does.
+
+A supervisor with a heartbeat asks the child's process twice in that time. A process that has not answered for so long
+is killed, and started again. A process that stands still for less time goes on as if nothing had happened.
+
+Look for: the new process number if the heartbeat is shorter than the pause; the reason "hung" in the events; the late
+answer if it is not.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import rr_actors as rr
+
+
+class Lidar(rr.Actor):
+    def on_receive(self, message: object) -> int:
+        return os.getpid()
+
+
+def main(state_dir: str, heartbeat_s: float = 1.0) -> None:
+    lidar = rr.ChildSpec(Lidar, id="lidar", heartbeat_s=heartbeat_s or None)
+    with rr.System([lidar], state_dir=state_dir) as system:
+        first = system.ref("lidar").ask("who?", timeout=20)
+        time.sleep(3)
+        print(f"SIGSTOP: process {first} stands still", flush=True)
+        os.kill(first, signal.SIGSTOP)
+        time.sleep(6)
+        try:
+            os.kill(first, signal.SIGCONT)
+            print(f"SIGCONT: process {first} goes on", flush=True)
+        except ProcessLookupError:
+            print(f"process {first} is no longer there", flush=True)
+        second = system.ref("lidar").ask("who?", timeout=20)
+        print("the same process answers" if second == first else f"process {second} answers", flush=True)
+        time.sleep(4)

@@ -1,0 +1,36 @@
+"""A tree of your own: you choose the strategy, the intensity, the child that is killed, and how often.
+
+The supervisor `team` has three children. At one kill more than its intensity allows it gives up. Then `root` starts the
+whole team again.
+
+Look for: the children that start again with the killed one; the squares in the box of `team`, which fill up; the mark
+at `team` itself if it gives up.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import Any
+
+import rr_actors as rr
+
+
+class Worker(rr.Actor):
+    def on_receive(self, message: object) -> int:
+        return os.getpid()
+
+
+def main(
+    state_dir: str, strategy: Any = "one_for_one", max_restarts: int = 2, kills: int = 1, child: str = "b"
+) -> None:
+    children = [rr.ChildSpec(Worker, id=id) for id in "abc"]
+    team = rr.Supervisor(children, id="team", strategy=strategy, max_restarts=max_restarts, max_seconds=60)
+    with rr.System([team], state_dir=state_dir) as system:
+        worker = system.ref(f"root/team/{child}")
+        for number in range(1, kills + 1):
+            time.sleep(3)
+            print(f"kill {number}: SIGKILL to {child}", flush=True)
+            os.kill(worker.ask("who?", timeout=20), signal.SIGKILL)
+        time.sleep(4)

@@ -1,0 +1,131 @@
+"""The commands of `rr-actors` for managers that plan: what a Keeper keeps, and the pools of Budgets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from rr_actors.base.errors import UsageError
+from rr_actors.base.toml import read_bytes
+from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_commands import AskActor
+from rr_actors.tools.cli_commands import (
+    CHANGE_RESOURCES,
+    LOOK,
+    JsonOption,
+    StateOption,
+    app,
+    say,
+    say_json,
+    say_lines,
+    say_table,
+)
+
+_ANSWER_S = 60.0
+_LOOSE = Codec(None, "answer")
+
+KeeperOption = Annotated[str, typer.Option("--keeper", metavar="ID", help="The id or path of the child that keeps.")]
+
+
+def _asked(state: Path | None, planner: str, message: dict[str, str | None]) -> Any:
+    command = AskActor(planner, encode(message, f"message to {planner}"), _ANSWER_S)
+    with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
+        return _LOOSE.show(client.ask(command).answer)
+
+
+def _question(name: str, file: Path) -> dict[str, str | None]:
+    """Return the question about a file that is here, and perhaps not where the system runs."""
+    path = str(file.absolute())
+    try:
+        return {name: read_bytes(path).decode(), "file": path}
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path}: expected a TOML file, got what is not UTF-8 text") from error
+
+
+def _say_changes(lines: list[str], none: str, as_json: bool) -> None:
+    if as_json:
+        say_json(lines)
+    elif lines:
+        say_lines("\n".join(lines))
+    else:
+        say(none)
+
+
+@app.command(rich_help_panel=CHANGE_RESOURCES, epilog="Example: rr-actors apply keep.toml --dry-run")
+def apply(
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="What is to be kept from now on.")],
+    keeper: KeeperOption = "keeper",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Change nothing; show what would be changed.")] = False,
+) -> None:
+    """Have a Keeper keep what another file wants, and show what changes: + is added, - is removed, ~ differs."""
+    made: list[str] = _asked(state, keeper, _question("diff" if dry_run else "apply", file))
+    _say_changes(made, f"{keeper} keeps all of this already", as_json)
+
+
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors keep diff")
+def keep(
+    what: Annotated[Literal["get", "diff"], typer.Argument(help="get: all that is kept; diff: what is not ready.")],
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE.toml]", help="With diff: what apply would change.")
+    ] = None,
+    keeper: KeeperOption = "keeper",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what a Keeper keeps, how many replicas are ready, and why others are not.
+
+    With diff the exit code is 1 if something is not as it is wanted, or FILE would change something.
+    """
+    if what == "get":
+        if file is not None:
+            raise UsageError("keep get: expected no file, got one; rr-actors apply FILE gives a Keeper another")
+        _say_kept(_asked(state, keeper, {"get": None}), as_json)
+        return
+    lines: list[str] = _asked(state, keeper, {"diff": None} if file is None else _question("diff", file))
+    _say_changes(lines, "all is as it is wanted" if file is None else "no change", as_json)
+    if lines:
+        raise typer.Exit(1)
+
+
+def _say_kept(rows: list[dict[str, Any]], as_json: bool) -> None:
+    if as_json:
+        say_json(rows)
+    elif rows:
+        cells = [(row["name"], f"{row['ready']} of {row['wanted']}", row["why"], row["detail"]) for row in rows]
+        say_table(("kept", "ready", "why", ""), cells, gives_way=("",), right=("ready",))
+    else:
+        say("nothing is kept", err=True)
+
+
+@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors budgets")
+def budgets(
+    child: Annotated[
+        str, typer.Option("--budgets", metavar="ID", help="The id or path of the child that has the pools.")
+    ] = "budgets",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the pools of a Budgets: how much each has, what is used and free, and how many loads wait for room."""
+    rows: list[dict[str, Any]] = _asked(state, child, {"pools": None})
+    if as_json:
+        say_json(rows)
+        return
+    cells = [
+        (
+            row["name"],
+            f"{row['capacity']:g}",
+            f"{row['used']:g}",
+            f"{row['free']:g}",
+            str(row["waiting"]),
+            "yes" if row["enforced"] else "no",
+            row["problem"],
+        )
+        for row in rows
+    ]
+    heads = ("pool", "capacity", "used", "free", "waiting", "enforced", "problem")
+    say_table(heads, cells, gives_way=("problem",), right=("capacity", "used", "free", "waiting"))

@@ -1,0 +1,337 @@
+"""Keeper: what is wanted comes and stays, whatever happens to it, and each thing that is not there has a reason."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.managers import Budgets, Keeper, Kept, Pool, Share
+from support import eventually, kill, wait_respawned
+from support_cli import run_cli
+
+Start = Callable[..., rr.System]
+QUICK = rr.Backoff(0.05, 2.0, 0.5, 0.0)
+
+
+def keep(name: str, request: str = '"r{instance}"', server: str = "things/thing", **more: object) -> str:
+    fields = {"name": name, "server": server, **more}
+    return (
+        "\n".join(["[[keep]]", f"request = {request}", *(f"{key} = {json.dumps(fields[key])}" for key in fields)])
+        + "\n"
+    )
+
+
+class Place:
+    """A system with a Keeper, and things in this process that are loaded when they may be."""
+
+    def __init__(self, start: Start, folder: Path, text: str, *children: rr.ChildSpec) -> None:
+        self.folder = folder
+        keeper = rr.ChildSpec(Keeper, id="keeper", args=(self.write("keep.toml", text), QUICK))
+        self.system = start(rr.Supervisor([*children, keeper], max_restarts=100))
+        self.keeper = self.system.ref("keeper").proxy()
+        self.app = self.system.open_registrar("app")
+        self.broken = dict[str, Exception]()
+        self.stuck, self.goes_on = set[str](), threading.Event()
+        self.alive, self.most = dict[str, int](), 0
+        self.well = True
+
+    def serve(self) -> rr.Registrar:
+        self.things = self.system.open_registrar("things")
+        health = rr.Health(every_s=0.05, timeout_s=10.0, fail_after=2)
+        self.things.register_server("thing", self._load, self._unload, health=health, probe=self._probe)
+        return self.things
+
+    def _load(self, request: Any) -> str:
+        if request in self.stuck:
+            self.goes_on.wait(60)
+        if request in self.broken:
+            raise self.broken[request]
+        self.alive[request] = self.alive.get(request, 0) + 1
+        self.most = max(self.most, self.alive[request])
+        return f"{request} is on"
+
+    def _unload(self, request: Any, response: str | None) -> None:
+        self.alive[request] -= 1
+
+    def _probe(self, request: Any, response: str) -> None:
+        if not self.well:
+            raise OSError("no answer")
+
+    def write(self, name: str, text: str) -> str:
+        (self.folder / name).write_text(text)
+        return str(self.folder / name)
+
+    def there(self) -> list[Any]:
+        """Return what is loaded, as the provider says it."""
+        return sorted(info.request for info in self.things.resources() if info.phase == "loaded" and info.holders)
+
+    def kept(self, name: str) -> Kept:
+        return next(one for one in self.keeper.get().get() if one.name == name)
+
+    def wait_kept(self, *kept: Kept) -> bool:
+        return eventually(lambda: self.keeper.get().get() == list(kept), what=f"{kept}")
+
+    def lose(self, request: str) -> None:
+        (info,) = [info for info in self.things.resources() if info.request == request and info.status != "FATAL"]
+        self.things.send_status(info, rr.Status("FATAL", "it burns"))
+
+    def respawn(self) -> None:
+        wait_respawned(self.system, "keeper", kill(self.system, "keeper"))
+
+
+Make = Callable[..., Place]
+
+
+@pytest.fixture
+def make(start: Start, tmp_path: Path) -> Iterator[Make]:
+    places: list[Place] = []
+
+    def made(text: str, *children: rr.ChildSpec) -> Place:
+        places.append(Place(start, tmp_path, text, *children))
+        return places[-1]
+
+    yield made
+    for place in places:
+        place.goes_on.set()
+
+
+def test_what_is_wanted_comes_when_its_server_does(make: Make) -> None:
+    place = make(keep("a", replicas=3) + keep("b", '"b"'))
+    assert place.wait_kept(Kept("a", 3, 0, "none registered"), Kept("b", 1, 0, "none registered"))
+    place.serve()
+    assert place.wait_kept(Kept("a", 3, 3), Kept("b", 1, 1))
+    assert place.there() == ["b", "r0", "r1", "r2"]
+    assert place.keeper.diff().get() == []
+
+
+def test_what_is_lost_comes_back_and_there_is_never_a_second_one(make: Make) -> None:
+    place = make(keep("a", replicas=3))
+    place.serve()
+    assert place.wait_kept(Kept("a", 3, 3))
+    for request in ("r1", "r1", "r2"):
+        first = {info.id for info in place.things.resources()}
+        place.lose(request)
+        eventually(lambda first=first: {info.id for info in place.things.resources()} - first)
+        assert place.wait_kept(Kept("a", 3, 3))
+    assert place.there() == ["r0", "r1", "r2"]
+    assert place.most == 1
+
+
+def test_holders_of_kept_hear_how_it_is(make: Make) -> None:
+    place = make(keep("a", replicas=2))
+    place.serve()
+    assert place.wait_kept(Kept("a", 2, 2))
+    query = place.app.load("keeper/kept", "a", response_type=Kept)
+    assert query.response == Kept("a", 2, 2)
+    place.broken["r1"] = OSError("no fuel")
+    place.lose("r1")
+    assert query.wait_status("WARNING", timeout_s=60).message.startswith("1 of 2 ready: failing")
+    assert eventually(lambda: query.response == Kept("a", 2, 1, "failing"))
+    place.broken["r0"] = OSError("no fuel")
+    place.lose("r0")
+    assert query.wait_status("ERROR", timeout_s=60).message.startswith("0 of 2 ready: all failing")
+    place.broken.clear()
+    assert query.wait_status("OK", timeout_s=60).message == "2 of 2 ready"
+    assert query.response == Kept("a", 2, 2)
+    place.keeper.apply(place.write("none.toml", "")).get()
+    assert eventually(lambda: (query.response, query.fetch_state()) == (Kept("a", 0, 0, "not kept"), "WARNING"))
+    with pytest.raises(rr.LoadFailed, match=r"no keep 'b': expected one of none"):
+        place.app.load("keeper/kept", "b")
+
+
+def test_one_that_is_unhealthy_is_not_ready(make: Make) -> None:
+    place = make(keep("a"))
+    place.serve()
+    assert place.wait_kept(Kept("a", 1, 1))
+    place.well = False
+    assert place.wait_kept(Kept("a", 1, 0, "all failing"))
+    assert place.keeper.diff().get() == ["a: 0 of 1 ready: all failing: health: OSError: no answer"]
+    place.well = True
+    assert place.wait_kept(Kept("a", 1, 1))
+
+
+def test_apply_changes_no_more_than_it_says(make: Make) -> None:
+    place = make(keep("a", replicas=3) + keep("b", '"b"'))
+    place.serve()
+    assert place.wait_kept(Kept("a", 3, 3), Kept("b", 1, 1))
+    r0 = next(info.id for info in place.things.resources() if info.request == "r0")
+    file = place.write("next.toml", keep("a", replicas=1, priority=5) + keep("c", '"c"', standby=True))
+    said = ["+ c", "- b", "~ a: replicas 3 -> 1, priority 0 -> 5"]
+    assert place.keeper.diff(file).get() == said
+    assert place.keeper.apply(file).get() == said
+    assert eventually(lambda: place.there() == ["c", "r0"])
+    assert eventually(
+        lambda: {info.request: info.priority for info in place.things.resources()} == {"r0": 5, "c": None}
+    )
+    assert r0 in {info.id for info in place.things.resources()}
+    assert place.keeper.diff(file).get() == []
+    place.keeper.apply(place.write("next.toml", keep("a", '"other"'))).get()
+    assert eventually(lambda: place.there() == ["other"])
+    assert place.alive == {"r0": 0, "r1": 0, "r2": 0, "b": 0, "c": 0, "other": 1}
+
+
+def test_a_file_that_is_wrong_changes_nothing(make: Make) -> None:
+    place = make(keep("a"))
+    place.serve()
+    file = place.write("wrong.toml", keep("a", replicas=-1))
+    for ask in (place.keeper.apply, place.keeper.diff):
+        with pytest.raises(rr.ConfigError, match=r"wrong.toml: keep\[0\].replicas: expected a whole number from 0"):
+            ask(file).get()
+    assert place.wait_kept(Kept("a", 1, 1))
+
+
+def test_a_load_that_nobody_wants_any_more_is_withdrawn(make: Make) -> None:
+    place = make(keep("a", replicas=2))
+    place.stuck.add("r1")
+    place.serve()
+    assert place.wait_kept(Kept("a", 2, 1, "loading"))
+    place.keeper.apply(place.write("next.toml", keep("a"))).get()
+    assert place.wait_kept(Kept("a", 1, 1))
+    held = {"r0": ("keeper",), "r1": ()}
+    assert eventually(lambda: {info.request: info.holders for info in place.things.resources()} == held)
+    place.goes_on.set()
+    assert eventually(lambda: place.alive.get("r1") == 0)
+    assert eventually(lambda: place.there() == ["r0"])
+
+
+def test_what_is_after_another_waits_for_it(make: Make) -> None:
+    place = make(keep("b", '"b"', after=["a"]) + keep("a", '"a"'))
+    place.stuck.add("a")
+    place.serve()
+    assert place.wait_kept(Kept("b", 1, 0, "waits for a"), Kept("a", 1, 0, "loading"))
+    place.goes_on.set()
+    assert place.wait_kept(Kept("b", 1, 1), Kept("a", 1, 1))
+
+
+def test_what_has_no_room_comes_when_there_is_some(make: Make) -> None:
+    budgets = rr.ChildSpec(Budgets, id="budgets", args=([Pool("watts", 100)],))
+    place = make(keep("a", '"lamp{instance}"', replicas=3), budgets)
+    place.things = place.system.open_registrar("things")
+    place.things.register_server(
+        "thing", lambda request: place.things.load("budgets/share", Share("watts", 40)).response
+    )
+    assert place.wait_kept(Kept("a", 3, 2, "over capacity"))
+    place.system.ref("budgets").proxy().set_capacity("watts", 120).get()
+    assert place.wait_kept(Kept("a", 3, 3))
+
+
+def test_a_group_is_loaded_as_a_whole_and_anew_when_it_changes(make: Make) -> None:
+    def text(*requests: str) -> str:
+        members = "".join(f'[[group.member]]\nserver = "things/thing"\nrequest = "{request}"\n' for request in requests)
+        return keep("n", '"navigation"', "keeper/group") + '[[group]]\nname = "navigation"\n' + members
+
+    place = make(text("map", "laser"))
+    place.serve()
+    assert eventually(lambda: place.there() == ["laser", "map"])
+    place.keeper.apply(place.write("next.toml", text("map", "camera"))).get()
+    assert eventually(lambda: place.there() == ["camera", "map"])
+    query = place.app.load("keeper/group", "navigation")
+    query.unload()
+    with pytest.raises(rr.LoadFailed, match=r"no group 'navigatio': expected one of navigation; did you mean"):
+        place.app.load("keeper/group", "navigatio")
+
+
+def test_a_keeper_that_is_killed_goes_on_with_what_was_applied(make: Make) -> None:
+    place = make(keep("a", replicas=2))
+    place.serve()
+    assert place.wait_kept(Kept("a", 2, 2))
+    place.keeper.apply(place.write("next.toml", keep("a", replicas=3))).get()
+    assert place.wait_kept(Kept("a", 3, 3))
+    before = {info.id for info in place.things.resources()}
+    place.respawn()
+    assert place.wait_kept(Kept("a", 3, 3))
+    assert {info.id for info in place.things.resources()} == before
+    place.write("keep.toml", keep("a"))  # the first file, changed, replaces what was applied
+    place.respawn()
+    assert place.wait_kept(Kept("a", 1, 1))
+    assert eventually(lambda: place.there() == ["r0"])
+
+
+def test_kills_and_losses_at_any_time_leave_what_is_wanted_and_no_second_one(make: Make) -> None:
+    place = make(keep("a", replicas=3))
+    place.serve()
+    for round in range(4):
+        wanted = 3 - round % 2
+        place.keeper.apply(place.write("next.toml", keep("a", replicas=wanted))).get()
+        pid = kill(place.system, "keeper")
+        for info in place.things.resources()[:2]:
+            if info.phase == "loaded":
+                place.things.send_status(info, rr.Status("FATAL", "it burns"))
+        wait_respawned(place.system, "keeper", pid)
+        assert place.wait_kept(Kept("a", wanted, wanted))
+        assert eventually(lambda wanted=wanted: place.there() == [f"r{i}" for i in range(wanted)])
+    assert place.most == 1
+    assert eventually(lambda: len(place.things.resources()) == 2)
+
+
+def test_the_command_line(make: Make, runtime_dir: object) -> None:
+    place = make(keep("a", replicas=2) + keep("b", '"b"', "nobody/there"))
+    place.serve()
+    assert place.wait_kept(Kept("a", 2, 2), Kept("b", 1, 0, "none registered"))
+    rows = json.loads(run_cli("keep", "get", "--json").stdout)
+    assert [(row["name"], row["ready"], row["wanted"], row["why"]) for row in rows] == [
+        ("a", 2, 2, ""),
+        ("b", 0, 1, "none registered"),
+    ]
+    assert "none registered" in run_cli("keep", "get").stdout
+    ran = run_cli("keep", "diff")
+    assert (ran.returncode, ran.stdout.startswith("b: 0 of 1 ready: none registered: ")) == (1, True)
+    file = place.write("next.toml", keep("a", replicas=1))
+    for command in (("apply", "--dry-run", file), ("keep", "diff", file), ("apply", file)):
+        assert run_cli(*command).stdout == "- b\n~ a: replicas 2 -> 1\n"
+    assert place.wait_kept(Kept("a", 1, 1))
+    assert run_cli("keep", "diff").stdout == "all is as it is wanted\n"
+    assert run_cli("apply", file).stdout == "keeper keeps all of this already\n"
+    ran = run_cli("apply", place.write("wrong.toml", keep("a", replicas=-1)))
+    assert ran.returncode != 0
+    assert "wrong.toml: keep[0].replicas: expected a whole number from 0 to 10000, got -1" in ran.stderr
+    assert "expected no file" in run_cli("keep", "get", file).stderr
+    assert "no_such" in run_cli("keep", "get", "--keeper", "no_such").stderr
+    (place.folder / "binary.toml").write_bytes(b"\xff")
+    assert "not UTF-8" in run_cli("apply", place.folder / "binary.toml").stderr
+    assert "No such file" in run_cli("apply", place.folder / "none.toml").stderr
+    place.keeper.apply(place.write("none.toml", "")).get()
+    assert run_cli("keep", "get").stderr == "nothing is kept\n"
+    with pytest.raises(rr.UsageError, match="expected a question to a Keeper"):
+        place.system.ref("keeper").ask({"what": 1})
+
+
+def test_a_file_that_is_wrong_fails_the_start_by_name(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "keep.toml").write_text(keep("a", replica=2))
+    with pytest.raises(
+        rr.StartFailed, match=r"keep.toml: keep\[0\].replica: expected one of name.*did you mean 'replicas'"
+    ):
+        start(rr.ChildSpec(Keeper, id="keeper", args=(str(tmp_path / "keep.toml"),)))
+
+
+class SlowToAnswer(Keeper):
+    """Its holders' responses are on their way until the test lets them go on."""
+
+    answers, goes_on = threading.Event(), threading.Event()
+
+    @rr.server("kept", recovery="keep")
+    def load_kept(self, request: str) -> Kept:
+        kept = super().load_kept(request)
+        self.answers.set()
+        self.goes_on.wait(60)
+        return kept
+
+
+def test_a_holder_hears_what_has_changed_while_its_response_was_on_its_way(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "keep.toml").write_text(keep("one", '"only"'))
+    args = (str(tmp_path / "keep.toml"), QUICK)
+    system = start(rr.ChildSpec(SlowToAnswer, id="keeper", args=args, placement="thread"))
+    loading = system.open_registrar("app").load("keeper/kept", "one", block=False, timeout_s=None)
+    assert SlowToAnswer.answers.wait(30)
+    system.open_registrar("things").register_server("thing", lambda request: request, lambda request, response: None)
+    keeper = system.ref("keeper").proxy()
+    assert eventually(lambda: keeper.get().get()[0].ready == 1)
+    SlowToAnswer.goes_on.set()
+    query = loading.get(timeout=30)
+    assert eventually(lambda: query.response.ready == 1)
