@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Budgets, Keeper, Kept, Pool, Share
-from support import eventually, kill, wait_respawned
+from support import eventually, kill, pid_of, wait_respawned
 from support_cli import run_cli
 
 Start = Callable[..., rr.System]
@@ -251,6 +252,25 @@ def test_a_keeper_that_is_killed_goes_on_with_what_was_applied(make: Make) -> No
     place.respawn()
     assert place.wait_kept(Kept("a", 1, 1))
     assert eventually(lambda: place.there() == ["r0"])
+
+
+def test_a_full_disk_ends_no_keeper_and_what_is_wanted_comes_when_there_is_room(make: Make) -> None:
+    place = make(keep("a", replicas=2))
+    place.serve()
+    assert place.wait_kept(Kept("a", 2, 2))
+    query = place.app.load("keeper/kept", "a", response_type=Kept)
+    pid = pid_of(place.system, "keeper")
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (2048, before[1]))  # its catalog is longer
+    assert place.keeper.apply(place.write("more.toml", keep("a", replicas=3, priority=4))).get()
+    assert eventually(lambda: place.kept("a").wanted == 3)
+    place.keeper.apply(place.write("least.toml", keep("a", replicas=1))).get()
+    assert eventually(lambda: place.kept("a").wanted == 1)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+    assert place.wait_kept(Kept("a", 1, 1))
+    assert eventually(lambda: query.response == Kept("a", 1, 1))
+    assert eventually(lambda: place.there() == ["r0"])
+    assert pid_of(place.system, "keeper") == pid
 
 
 def test_kills_and_losses_at_any_time_leave_what_is_wanted_and_no_second_one(make: Make) -> None:

@@ -13,7 +13,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +21,7 @@ import msgspec
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import (
+    CatalogError,
     ConfigError,
     MailboxFull,
     NotFound,
@@ -127,6 +128,7 @@ class Keeper(Manager):
         self._held_since: dict[str, float] = {}
         self._messages: dict[str, str] = {}
         self._lost: set[str] = set()
+        self._is_full = False  # something of the last look could not be written
         self._what: dict[str, bytes] = {}  # by query, as its replica does not change
         self._wanted: tuple[Desired, list[tuple[Wanted, Replica]]] | None = None
         self._reports: dict[str, Report] | None = None
@@ -272,6 +274,7 @@ class Keeper(Manager):
         self._failures = {slot: failed for slot, failed in self._failures.items() if slot in requests}
         self._note_losses(seen, now)
         steps = comparing.compare(wanted, seen, self._failures, now)
+        self._is_full = False
         self._carry_out(steps, requests)
         reports = comparing.report(desired.keeps, wanted, seen, self._failures)
         self._reports = reports
@@ -282,7 +285,8 @@ class Keeper(Manager):
             return _SOON_S
         if steps.next_at is not None:
             return min(_LOOK_S, max(0.0, steps.next_at - now))
-        return _LOOK_S if any(one.why for one in reports.values()) or steps.release or self._releasing else None
+        is_behind = any(one.why for one in reports.values()) or bool(steps.release or self._releasing)
+        return _LOOK_S if is_behind or self._is_full else None
 
     # -- what is there ---------------------------------------------------------------------------------------------
 
@@ -346,7 +350,7 @@ class Keeper(Manager):
         for one in steps.release:
             self._release(one)
         for one, priority in steps.prioritise:
-            with contextlib.suppress(UsageError):  # it has just gone, or the registrar has a `max_priority`
+            with self._unless_full(), contextlib.suppress(UsageError):  # gone, or the registrar has a `max_priority`
                 self.registrar.set_priority(one.id, priority)
         for one in steps.load:
             self._load(one, requests[one.slot])
@@ -385,6 +389,14 @@ class Keeper(Manager):
             logger.warning("%s %d cannot be released: %s", one.keep, one.instance, text_of(error))
             self._not_before[one.id] = time.monotonic() + self._backoff.maximum_s
 
+    @contextlib.contextmanager
+    def _unless_full(self) -> Generator[None]:
+        """Do what is written to the catalog; if the disk is full, the next look does it again."""
+        try:
+            yield
+        except CatalogError:  # the registrar has logged it
+            self._is_full = True
+
     # -- what others hear ------------------------------------------------------------------------------------------
 
     def _hear(self, status: Status) -> None:
@@ -397,7 +409,7 @@ class Keeper(Manager):
             if info.server != "kept" or info.phase is not Phase.LOADED or info.status is State.FATAL:
                 continue
             report = reports.get(info.request, Report(info.request, 0, 0, "not kept"))
-            with contextlib.suppress(UsageError):  # it has just been unloaded
+            with self._unless_full(), contextlib.suppress(UsageError):  # it has just been unloaded
                 self._tell_one(info, report)
 
     def _tell_one(self, info: ResourceInfo, report: Report) -> None:
