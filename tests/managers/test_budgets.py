@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import resource
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Budgets, OverCapacity, Pool, PoolInfo, Reserve, Share, Supply
-from support import Calls, eventually, kill, wait_respawned
+from support import Calls, eventually, kill, pid_of, wait_respawned
 from support_cli import run_cli
 
 Start = Callable[..., rr.System]
@@ -395,6 +396,44 @@ def test_the_sum_is_within_the_capacity_while_the_manager_is_killed_again_and_ag
                 load.get(timeout=60)
             assert house.pool().used <= 100
         assert eventually(lambda: len(house.devices.resources()) == house.pool().used / 30)
+
+
+@contextlib.contextmanager
+def no_file_grows(pid: int) -> Iterator[None]:
+    """No file of the process can be longer than 600 bytes: its record fits, its journal is longer."""
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (600, before[1]))
+    yield
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+
+
+def test_what_is_to_give_way_does_so_when_a_full_disk_has_room(house: House, caplog: pytest.LogCaptureFixture) -> None:
+    house.run("a", 60)
+    house.run("b", 30, priority=1)
+    pid = pid_of(house.system, "budgets")
+    log = house.system.state_dir / "budgets" / "catalog.journal.1"
+    assert log.stat().st_size > 600
+    with no_file_grows(pid):
+        house.set_capacity(50)
+        eventually(lambda: "not committed" in caplog.text)
+        assert house.pool().used == 90
+    assert house.ended.wait(1) == ["a"]
+    eventually(lambda: house.pool().used == 30)
+    assert pid_of(house.system, "budgets") == pid
+
+
+def test_a_reserve_that_is_not_needed_stops_when_a_full_disk_has_room(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, 50.0),)))
+    house.run("a", 90)
+    house.run("b", 40, wait_s=30)
+    assert house.started.wait(1) == [50.0]
+    with no_file_grows(pid_of(house.system, "budgets")):
+        house.set_capacity(200)
+        eventually(lambda: "not committed" in caplog.text)
+    assert house.ended.wait(1) == ["generator 50"]
+    eventually(lambda: house.pool().capacity == 200)
 
 
 def test_a_file_that_is_wrong_fails_the_start_by_name(start: Start, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.checks import is_number
-from rr_actors.base.errors import LoadFailed, NotFound, OverCapacity, RrError, UsageError, shown
+from rr_actors.base.errors import CatalogError, LoadFailed, NotFound, OverCapacity, RrError, UsageError, shown
 from rr_actors.base.names import short_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.budget_record import BudgetRecord
@@ -186,7 +186,7 @@ class Budgets(Manager):
             known = {f"{name}/{i}" for name, pool in self._pools.items() for i in range(len(pool.reserve))}
             for key, query_id in self._record.reserves().items():
                 if query_id not in held or key not in known:
-                    self._record.drop_reserve(key)
+                    self._keep(self._record.drop_reserve, key)
             for query_id in set(held) - set(self._record.reserves().values()):
                 self._in_thread(self._release, query_id)
             for server_id in sorted({reserve.server for pool in self._pools.values() for reserve in pool.reserve}):
@@ -391,7 +391,7 @@ class Budgets(Manager):
             try:
                 self.registrar.revoke(id, why, grace_s=self._grace_s)
                 return
-            except UsageError:  # it is not loaded yet, or is revoked already
+            except (UsageError, CatalogError):  # it is not loaded yet, or is revoked already; or the disk is full
                 with self._changed:
                     if id not in book.shares:
                         return
@@ -415,7 +415,7 @@ class Budgets(Manager):
             if query is None:
                 book.failed[key] = time.monotonic() + _RETRY_S
             else:
-                self._record.keep_reserve(key, query.id)
+                self._keep(self._record.keep_reserve, key, query.id)
                 if query.fetch_state() == State.FATAL:  # the status came before the record
                     self._give_up(book, key)
             self._settle(book.pool.name)
@@ -425,15 +425,28 @@ class Budgets(Manager):
             query_id = self._record.reserves()[key]
         self._release(query_id)
         with self._changed:
-            self._record.drop_reserve(key)
+            self._keep(self._record.drop_reserve, key)
             book.stopping.pop(key, None)
             self._settle(book.pool.name)
 
     def _release(self, query_id: str) -> None:
+        """Release a reserve. While the disk is full, try again: nobody else would."""
+        while True:
+            try:
+                self.registrar.unload(query_id)
+                return
+            except CatalogError:  # the registrar has logged it
+                time.sleep(_POLL_S)
+            except RrError as error:
+                logger.warning("a reserve cannot be released: %s", error)
+                return
+
+    def _keep(self, keep: Callable[..., None], *facts: object) -> None:
+        """Keep something beside the catalog. While the disk is full it is not: the next change keeps it, too."""
         try:
-            self.registrar.unload(query_id)
-        except RrError as error:
-            logger.warning("a reserve cannot be released: %s", error)
+            keep(*facts)
+        except OSError as error:
+            logger.warning("%s: %s%r is not on disk: %s", self.registrar.name, keep.__name__, facts, error)
 
     def _reserve_status(self, status: Status) -> None:
         """Give up a reserve that has failed: its supply goes with it."""
@@ -496,10 +509,7 @@ class Budgets(Manager):
                 return
             book.measured = capacity
             self._settle(pool)
-            try:
-                self._record.keep_measured(pool, capacity)
-            except OSError as error:  # the disk is full, say; the next change is kept again
-                logger.warning("pool %s: its measured capacity is not kept: %s", pool, error)
+            self._keep(self._record.keep_measured, pool, capacity)
 
     def _troubled(self, pool: str, problem: str) -> None:
         """Keep the last measured capacity, and say once what is wrong."""
