@@ -48,7 +48,7 @@ settings.load_profile("busy machine")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item], config: pytest.Config) -> None:
-    """With RR_ACTORS_SLOW_PART=2/3, keep the second third of the slow tests.
+    """With RR_ACTORS_SLOW_PART=2/4, keep the second quarter of the slow tests.
 
     The same test is always in the same part, whatever others there are.
     """

@@ -145,6 +145,7 @@ COMPLETED = {
 }
 
 
+@pytest.mark.slow
 def test_completion_offers_what_there_is() -> None:
     before = "import rr_actors as rr\nsystem = rr.System()\napp = system.open_registrar('app')\n"
     programs = json.dumps([before + line for line in COMPLETED])

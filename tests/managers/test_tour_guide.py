@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from support import REPOSITORY, run_example
 from support_programs import running_programs
 
 
+@pytest.mark.slow
 def test_on_demand_a_program_runs_only_in_the_steps_that_need_it(tmp_path: Path) -> None:
     said = run_example(tmp_path, REPOSITORY / "examples" / "tour_guide.py", limit_s=150)
     all_on, on_demand, answer, *picture = said.splitlines()

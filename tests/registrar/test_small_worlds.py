@@ -20,6 +20,8 @@ from support_mutations import DIRECTED, MUTATIONS
 SMALLEST = ("at once", "errors", "lost link", "crash", "budget")
 """Each has more than a thousand states."""
 
+QUICK = ("at once", "budget")
+
 ENOUGH = 1000
 """States of each larger world: two minutes of one core for all of them. `make explore` goes on from there."""
 
@@ -31,7 +33,9 @@ FOUND = {
 """Our protocol broken in one place, a small world in which that shows, and the least number of steps it takes."""
 
 
-@pytest.mark.parametrize("name", SMALLEST)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SMALLEST]
+)
 def test_every_history_of_a_small_world_keeps_every_promise(name: str) -> None:
     done = walk(WORLDS[name])
 

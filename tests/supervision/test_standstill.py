@@ -131,6 +131,7 @@ def program(tmp_path: Path, workshop: Workshop) -> Iterator[subprocess.Popen[byt
 
 
 @pytest.mark.timeout(90)
+@pytest.mark.slow
 def test_a_whole_system_that_stands_still_goes_on_as_if_nothing_had_been(
     program: subprocess.Popen[bytes], workshop: Workshop
 ) -> None:

@@ -244,6 +244,7 @@ def test_a_picture_is_svg_that_says_what_happened_whatever_is_in_it() -> None:
     assert timeline_of([])._repr_svg_().count("nothing has happened") == 2
 
 
+@pytest.mark.slow
 def test_a_picture_of_many_children_and_lives_is_bounded_and_counts_what_it_leaves_out() -> None:
     entries = [
         child(at, event, f"root/c{number}", pid=at + 1, reason="killed" if event == "exited" else "")

@@ -224,6 +224,7 @@ def test_no_name_in_the_graph_is_cut_off_or_covered_and_no_word_is_broken(
 
 
 @pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.slow
 def test_nothing_is_cut_off_or_covered_or_empty_in_the_lab(chromium: Chromium, width: int) -> None:
     with web("--lab") as url, chromium.tab(width, 900) as tab:
         tab.goes_to(url)
