@@ -9,6 +9,7 @@ import pytest
 from rr_actors.base.values.canonical import encode
 from rr_actors.managers import Choose, Kept, RunAction
 from rr_actors.managers.actions.graph_documents import read_graph
+from rr_actors.managers.actions.graph_library import GraphLibrary
 from rr_actors.managers.actions.graph_runs import Begin, decide, feedback, first_run
 from rr_actors.managers.choices.choice_manager import Chosen
 from rr_actors.managers.keeper.desired import Replica, parse_desired
@@ -24,7 +25,7 @@ from rr_actors.testing.mission.mission_checks import (
     check_replicas,
     wrong_fatal,
 )
-from rr_actors.testing.mission.mission_managers import CHOICES, DESIRED, GRAPH
+from rr_actors.testing.mission.mission_managers import CHOICES, DESIRED, GRAPH, STEPS, graphs_folder, write_files
 from rr_actors.tools.inspection import Contents
 
 
@@ -43,7 +44,16 @@ def history(*steps: str) -> list[Line]:
     "steps",
     [
         ["act 1/Start", "acted 1/Start", "act 1/Fetch", "act 1/Look", "acted 1/Fetch", "act 1/Turn", "act 2/Look"],
-        ["act 1/Look 1@1", "acted 1/Look 1@1", "act 1/Look 2@2", "act 1/Turn", "act 2/Finish", "seen-the-end"],
+        [
+            "act 1/Look 1@1",
+            "acted 1/Look 1@1",
+            "act 1/Look 2@2",
+            "act 1/Aim",
+            "act 1/Shoot 1@3",
+            "act 1/Turn",
+            "act 2/Finish",
+            "seen-the-end",
+        ],
         ["act 1/Look 1@1", "act 1/Look 2@2", "act 1/Look 3@3", "released"],
         ["act 1/Fetch", "act 1/Look", "act 1/Fetch 2@2", "act 1/Look 2@2"],
     ],
@@ -56,6 +66,7 @@ def test_actions_may_run_side_by_side_and_again_before_their_end_is_on_disk(step
     ("steps", "says"),
     [
         (["act 1/Start", "act 1/Look", "act 1/Start 2@2"], "1/Start runs after its end was on disk: 1/Look has begun"),
+        (["act 1/Shoot", "act 1/Aim 2@2"], "1/Aim runs after its end was on disk: 1/Shoot has begun"),
         (["act 2/Look", "act 1/Turn"], "1/Turn runs after its end was on disk: 2/Look has begun"),
         (["act 3/Finish", "act 2/Turn"], "2/Turn runs after its end was on disk: 3/Finish has begun"),
         (["act 3/Finish", "seen-the-end", "act 3/Finish 2@2"], "runs after its end was on disk: seen-the-end"),
@@ -167,7 +178,7 @@ def test_a_second_replica_is_seen_at_any_moment() -> None:
     assert check_replicas([info(0, "a"), info(0, "b")]) == ["keeper: there are 2 replicas of ('radio', 0)"]
 
 
-def test_the_graph_and_the_files_of_the_mission_are_right() -> None:
+def test_the_graphs_and_the_files_of_the_mission_are_right(tmp_path: Path) -> None:
     wanted = {name: parse_desired(text.encode(), name).replicas("keeper/group") for name, text in DESIRED.items()}
     assert {name: len(replicas) for name, replicas in wanted.items()} == {
         "all": 6,
@@ -175,4 +186,8 @@ def test_the_graph_and_the_files_of_the_mission_are_right() -> None:
         "others": 6,
         "nothing": 0,
     }
-    assert [*read_graph(GRAPH).nodes] == [f"{name}_0" for name in ("Start", "Look", "Fetch", "Turn", "Finish")]
+    assert [*read_graph(GRAPH).nodes] == [
+        f"{name}_0" for name in ("Start", "Look", "Fetch", "Survey", "Turn", "Finish")
+    ]
+    write_files(tmp_path)
+    assert [*GraphLibrary(STEPS, graphs_folder(tmp_path)).find("Survey").nodes] == ["Aim_0", "Shoot_0"]

@@ -76,13 +76,18 @@ def check_graphs(actions: Contents) -> list[str]:
         if row.server == "graph" and row.phase is Phase.LOADED and row.response is not None:
             run = run_in(shown_plain(row.response))
             live = {f"{row.id}/{name}/{node.number}" for name, node in run.nodes.items() if node.state in LIVE}
-            parts = [shown_plain(part.request)["run"] for part in actions.parts(row.id)]
+            parts = [_run_of(shown_plain(part.request)) for part in actions.parts(row.id)]
             found += [
                 f"actions: {part} of a graph that is {run.state} is held by nobody"
                 for part in parts
                 if part not in live
             ]
     return found
+
+
+def _run_of(request: Mapping[str, str]) -> str:
+    """Return which run an action, or a graph that is a part of another, was loaded for."""
+    return request["run" if "run" in request else "instance"]
 
 
 # -- what is kept ------------------------------------------------------------------------------------------------------

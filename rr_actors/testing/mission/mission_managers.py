@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -130,10 +130,17 @@ def _cut(message: Any) -> bool:
     return message == "cut"
 
 
-def write_desired(directory: Path) -> None:
-    """Write the files that the keeper is given."""
+def write_files(directory: Path) -> None:
+    """Write the files that the keeper is given, and the graph that is a part of others."""
     for name in DESIRED:
         desired_file(directory, name).write_text(DESIRED[name])
+    graphs_folder(directory).mkdir()
+    (graphs_folder(directory) / "survey.json").write_text(json.dumps(_SURVEY))
+
+
+def graphs_folder(directory: Path) -> Path:
+    """Return the folder of the graphs that actions are given."""
+    return directory / "graphs"
 
 
 def desired_file(directory: Path, name: str) -> Path:
@@ -191,8 +198,24 @@ class Fetch(Step):
         return super().do(given)
 
 
+class Aim(Step):
+    """The first of a survey, which is a graph of its own."""
+
+
+class Shoot(Step):
+    """The last of a survey: it has a process of its own, and takes that with it now and then."""
+
+    isolate: ClassVar = True
+    timeout_s: ClassVar = 5.0
+
+    def do(self, given: Place) -> Any:
+        if hashlib.sha256(given.mission.encode()).digest()[-given.round] < 12:
+            os._exit(1)
+        return super().do(given)
+
+
 class Turn(Step):
-    """Waits for the other two, and begins the next round; or says that it was the last."""
+    """Comes after a survey, and begins the next round; or says that it was the last."""
 
     def do(self, given: Place) -> Any:
         super().do(given)
@@ -203,34 +226,51 @@ class Finish(Step):
     """Comes after the last round."""
 
 
-STEPS = (Start, Look, Fetch, Turn, Finish)
-_NEXT = {"Start": ("Look", "Fetch"), "Look": ("Turn",), "Fetch": ("Turn",), "Turn": ("Look", "Fetch", "Finish")}
-_WORDS = {
-    ("Turn", "Look"): ["on_false -> ignore"],
-    ("Turn", "Fetch"): ["on_false -> ignore"],
-    ("Turn", "Finish"): ["on_true -> ignore", "on_false -> run"],
-}
+STEPS = (Start, Look, Fetch, Aim, Shoot, Turn, Finish)
+"""In the order in which they run."""
 
 
-def _parent(parent: str, child: str) -> dict[str, Any]:
-    relation = {"name": parent, "required": child == "Turn"}
-    return {**relation, "conditions": _WORDS.get((parent, child), [])}
+def _graph(name: str, below: Mapping[str, Sequence[str]], words: Mapping[tuple[str, str], list[str]]) -> dict[str, Any]:
+    """Return a graph; of its actions the first is its entry, and the last its exit."""
+    first, last = next(iter(below)), [*below][-1]
+
+    def parent(parent: str, child: str) -> dict[str, Any]:
+        relation = {"name": parent, "required": child == "Survey"}
+        return {**relation, "conditions": words.get((parent, child), [])}
+
+    return {
+        "graph_name": name,
+        "graph_entry": [{"name": first}],
+        "graph_exit": [{"name": last}],
+        "actions": [
+            {
+                "name": one,
+                "children": [{"name": child} for child in children],
+                "parents": [parent(above, one) for above, children_of in below.items() if one in children_of],
+            }
+            for one, children in below.items()
+        ],
+    }
 
 
-GRAPH: dict[str, Any] = {
-    "graph_name": "patrol",
-    "graph_entry": [{"name": "Start"}],
-    "graph_exit": [{"name": "Finish"}],
-    "actions": [
-        {
-            "name": step.__name__,
-            "children": [{"name": child} for child in _NEXT.get(step.__name__, ())],
-            "parents": [_parent(parent, step.__name__) for parent, below in _NEXT.items() if step.__name__ in below],
-        }
-        for step in STEPS
-    ],
-}
-"""Start, then rounds of Look beside Fetch, which Turn joins, then Finish."""
+_SURVEY = _graph("Survey", {"Aim": ["Shoot"], "Shoot": []}, {})
+GRAPH = _graph(
+    "patrol",
+    {
+        "Start": ["Look", "Fetch"],
+        "Look": ["Survey"],
+        "Fetch": ["Survey"],
+        "Survey": ["Turn"],
+        "Turn": ["Look", "Fetch", "Finish"],
+        "Finish": [],
+    },
+    {
+        ("Turn", "Look"): ["on_false -> ignore"],
+        ("Turn", "Fetch"): ["on_false -> ignore"],
+        ("Turn", "Finish"): ["on_true -> ignore", "on_false -> run"],
+    },
+)
+"""Start, then rounds of Look beside Fetch, which the graph Survey joins, and Turn; then Finish."""
 
 
 @functools.cache

@@ -24,7 +24,8 @@ from rr_actors.testing.mission.mission_managers import (
     Patrol,
     Sensors,
     desired_file,
-    write_desired,
+    graphs_folder,
+    write_files,
 )
 from rr_actors.testing.mission.mission_threads import LIMIT_S, Operator
 from rr_actors.testing.report import Tally
@@ -48,7 +49,7 @@ class Mission:
         self._directory, self._tally = directory, tally
         self._at_rest = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="chaos: the mission", daemon=True)
-        write_desired(directory)
+        write_files(directory)
 
     def children(self) -> list[ChildSpec]:
         """Return its managers."""
@@ -58,7 +59,7 @@ class Mission:
             *sensors,
             ChildSpec(Chooser, id="choices", args=(ALTERNATIVES, SETTLE_S)),
             ChildSpec(Caretaker, id="keeper", args=(str(file), _BACKOFF)),
-            ChildSpec(Patrol, id="actions", args=(STEPS, None, 2.0)),
+            ChildSpec(Patrol, id="actions", args=(STEPS, str(graphs_folder(self._directory)), 2.0)),
         ]
 
     def open(self, system: System, seed: int) -> None:
