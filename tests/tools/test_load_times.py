@@ -191,6 +191,7 @@ def test_what_a_load_callback_has_reported_stands_beside_the_load_that_waits(
 
     shop.open_registrar("provider").register_server("oven", load)
     loading = app.load("provider/oven", "big", block=False)
+    joining = app.load("provider/oven", "big", block=False)
     said = "0% <b>behind</b> the pump"
     assert eventually(lambda: said in run_cli("loads", "--registrar", "app", "--state", state_dir).stdout)
 
@@ -202,6 +203,12 @@ def test_what_a_load_callback_has_reported_stands_beside_the_load_that_waits(
             while f'app waits for provider/oven "big", for itself: {said}' not in terminal.left.render_line(1).text:
                 assert time.monotonic() < deadline, terminal.left.render_line(1).text
                 await pilot.pause(0.02)
+            await pilot.press("z")
+            for key in ("down", "up"):  # who joins a load does not know the resource's id
+                await pilot.press(key)
+                while f"loading: {said}" not in terminal.right.render_line(1).text:
+                    assert time.monotonic() < deadline, terminal.right.render_line(1).text
+                    await pilot.pause(0.02)
 
     asyncio.run(play())
     with shop.serve_web() as page:
@@ -209,6 +216,7 @@ def test_what_a_load_callback_has_reported_stands_beside_the_load_that_waits(
         tab.clicks("Loads", role="link")
         tab.sees("table", "provider/oven", said)
     ends.set()
+    joining.get(timeout=LIMIT_S)
     loading.get(timeout=LIMIT_S)
 
 

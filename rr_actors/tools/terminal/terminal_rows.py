@@ -187,7 +187,11 @@ class Past:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """A resource: its state, its holders, its streams, its actions if it is a graph, and the parts it depends on."""
+    """A resource: its state, its holders, its streams, its actions if it is a graph, and the parts it depends on.
+
+    Args:
+        id: the resource's, or that of a query on it: who waits for a load does not know the resource yet.
+    """
 
     id: str
     name: str = field(default="", compare=False)
@@ -203,7 +207,7 @@ class Neighbours:
         Raises:
             UnknownQuery: the resource is unloaded.
         """
-        found = [row for row in link.ask(questions.Find(self.id), LOOK_S).resources if row.id == self.id]
+        found = link.ask(questions.Find(self.id), LOOK_S).resources
         if not found:
             raise UnknownQuery(f"{self.name or f'resource {short_id(self.id)}'}: it is unloaded", query_id=self.id)
         resource = found[0]
@@ -214,7 +218,7 @@ class Neighbours:
         if resource.holder_count > len(resource.holders):
             rows.append(Row("", f"  and by {resource.holder_count - len(resource.holders)} more"))
         rows += _actions(graph_of(link, resource))
-        streams = link.ask(questions.ListStreams(self.id, registrar=resource.server.partition("/")[0]), LOOK_S).rows
+        streams = link.ask(questions.ListStreams(resource.id, registrar=resource.server.partition("/")[0]), LOOK_S).rows
         rows += [_stream(row) for row in streams]
         if resource.part_count:
             rows.append(Row("", f"depends on {resource.part_count}:"))

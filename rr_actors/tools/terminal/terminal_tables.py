@@ -324,7 +324,7 @@ class AllLoads:
 def _waiting(ask: Callable[[questions.Find], c.Found], row: QueryRow) -> Row:
     who, what, whose, how_long, because = waiting_cells(ask, row)
     text = f"{who} waits for {what}, for {whose}{because and f': {because}'}"
-    return Row(row.id, text, how_long, "yellow", resource=row.resource_id, query=row.id, name=row.name)
+    return Row(row.id, text, how_long, "yellow", resource=row.resource_id or row.id, query=row.id, name=row.name)
 
 
 def _loads(row: LoadRow, columns: Sequence[_Column[LoadRow]]) -> Row:
