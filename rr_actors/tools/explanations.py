@@ -17,6 +17,7 @@ from rr_actors.system.console.console_questions import Find
 from rr_actors.system.recording.event_texts import ago
 
 _MOST = 5  # things that one beginning of an id may name
+_WELL = ("OK", "UPDATE")
 _DEEP = 8  # resources above one another
 _ID = re.compile(r"[0-9a-f]{12}7[0-9a-f]{19}")
 _NAMES_KEPT = 10_000
@@ -219,20 +220,27 @@ def _priority(priority: int | None) -> str:
 
 
 def _of_part(client: ConsoleClient, part: str, indent: str, above: set[str]) -> Iterator[str]:
-    """Say on which part a resource depends; if it waits for the part, say what that waits for."""
+    """Say on which part a resource depends; if it waits for the part, or the part is not well, say why."""
     found = client.ask(Find(part))
     queries = [query for query in found.queries if query.id == part]
     if not queries:
         return
     query = queries[0]
-    if query.hold != "pending":
+    if query.hold == "pending":
+        yield f"{indent}It waits for {query.name}{_since(query.id)} (query {short_id(query.id)})."
+    elif query.state in _WELL:
         yield f"{indent}It depends on {query.name} (query {short_id(query.id)})."
         return
-    yield f"{indent}It waits for {query.name}{_since(query.id)} (query {short_id(query.id)})."
+    else:
+        yield f"{indent}It depends on {query.name} (query {short_id(query.id)}), which is {query.state}."
     for resource in found.resources:
         if resource.id in above or len(above) >= _DEEP:
-            yield f"{indent}  {_named(resource)} waits for it in turn."
+            if query.hold == "pending":
+                yield f"{indent}  {_named(resource)} waits for it in turn."
             continue
-        yield f"{indent}  {_named(resource)} {_phase(resource)}"
+        if query.hold == "pending":
+            yield f"{indent}  {_named(resource)} {_phase(resource)}"
+        elif resource.message:
+            yield f"{indent}  Its last status was {resource.state}: {resource.message}"
         for other in resource.parts:
             yield from _of_part(client, other, indent + "  ", above | {resource.id})

@@ -565,6 +565,21 @@ def test_why_says_who_holds_it_for_whom_and_since_when(app: rr.Registrar, shop: 
     assert said("why", query.id[:-1]).split(" since ")[0] == whole.split(" since ")[0]
 
 
+def test_why_says_below_a_resource_that_is_not_well_where_that_began(app: rr.Registrar, shop: rr.System) -> None:
+    query = app.load("shop/thing", Order("whole", ("shop/thing:middle",)))
+    (middle,) = shop.registrar("shop").children(query)
+    low = app.load("shop/thing", Order("low"))
+    shop.registrar("shop").send_status(middle, rr.Status("ERROR", "no frame for 2 s"))
+    query.wait_status("ERROR")
+
+    lines = said("why", query.id).splitlines()
+
+    at = next(i for i, line in enumerate(lines) if line.startswith("It depends on"))
+    assert lines[at].endswith(", which is ERROR.")
+    assert lines[at + 1] == "  Its last status was ERROR: no frame for 2 s"
+    assert "which is" not in said("why", low.id)
+
+
 def test_priorities_are_given_and_explained(app: rr.Registrar, shop: rr.System) -> None:
     query = app.load("shop/thing", Order("whole", ("shop/thing:part",)), priority=5)
     (part,) = shop.registrar("shop").children(query)
