@@ -690,10 +690,16 @@ def test_why_prints_what_its_page_shows(system: rr.System) -> None:
     serve(cameras, "camera")
     serve(maps, "map", load=lambda request: maps.load("cameras/camera", f"/dev/{request}").id)
     camera = app.load("maps/map", "kitchen").response
+    hall = app.load("maps/map", "hall")
+    cameras.send_status(hall.response, rr.Status("ERROR", "no frame for 2 s"))
+    hall.wait_status("ERROR")
     page = (REPOSITORY / "docs" / "console.md").read_text()
-    _, shown, _ = re.split(r"^\$ rr-actors why \w+\n|```\n(?=\n## After the end)", page, flags=re.MULTILINE)
+    _, well, ill, *_ = re.split(
+        r"^\$ rr-actors why .+\n|^```\n", page[page.index("$ rr-actors why ") :], flags=re.MULTILINE
+    )
 
-    assert _without_ids_and_times(said("why", camera)) == _without_ids_and_times(shown)
+    assert _without_ids_and_times(said("why", camera)) == _without_ids_and_times(well).rstrip("\n") + "\n"
+    assert _without_ids_and_times(said("why", 'maps/map "hall"')) == _without_ids_and_times(ill)
 
 
 def _without_ids_and_times(text: str) -> str:
