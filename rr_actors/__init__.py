@@ -7,6 +7,7 @@ crashed, with its catalog. README.md begins with an example, docs/tutorial.md co
 
 from __future__ import annotations
 
+import importlib as _importlib
 import sys as _sys
 
 if _sys.platform != "linux":
@@ -20,88 +21,94 @@ if getattr(_sys, "frozen", False) and _sys.argv[1:2] == ["--rr-actors-fork-serve
 from rr_actors.base import __version__ as __version__
 from rr_actors.runtime.garbage import left_alone as _left_alone
 
-with _left_alone():  # saves a tenth of the time: these objects stay until the process ends
-    import importlib as _importlib
-    import typing as _typing
+TYPE_CHECKING = False  # type checkers take it for true; to import that of typing takes as long as all else here
 
-    from rr_actors.actors.actor import IGNORE, Actor, ExitReport
-    from rr_actors.actors.messaging.dead_letters import DeadLetter, DeadLetters
-    from rr_actors.actors.messaging.exit_reports import Down
-    from rr_actors.actors.monitors import Monitor, monitor
-    from rr_actors.actors.refs import ActorDeadError, ActorRef
-    from rr_actors.actors.timers import Timer, send_after
-    from rr_actors.base.config import RegistrarConfig, SystemConfig
-    from rr_actors.base.errors import (
-        ActorUnavailable,
-        AlreadyPresent,
-        AlreadyStarted,
-        CatalogDamaged,
-        CatalogError,
-        CatalogLocked,
-        CatalogVersion,
-        ChildRestarting,
-        ChildRunning,
-        CircularDependency,
-        ConfigError,
-        Frame,
-        GraphError,
-        InvalidName,
-        InvalidRequest,
-        InvalidResponse,
-        InvalidSpec,
-        LoadError,
-        LoadFailed,
-        LoadTimeout,
-        MailboxFull,
-        NameTaken,
-        NotForDynamic,
-        NotFound,
-        NotHolder,
-        NotRunning,
-        NotSerializable,
-        RegistrarDown,
-        ResourceLost,
-        RestartIntensityExceeded,
-        RrError,
-        StartFailed,
-        SupervisionError,
-        TooManyChildren,
-        Unavailable,
-        UnknownQuery,
-        UnknownRegistrar,
-        UnknownServer,
-        UnloadFailed,
-        UsageError,
-    )
-    from rr_actors.base.values.codecs import codec
-    from rr_actors.hosting.streams import Publisher, Stream, StreamFrame, StreamInfo, StreamReader
-    from rr_actors.registrar.declarations import Declared, server
-    from rr_actors.registrar.engine.progress import Progress
-    from rr_actors.registrar.engine.server import Current, current
-    from rr_actors.registrar.engine.status import Status
-    from rr_actors.registrar.load_groups import Queries
-    from rr_actors.registrar.manager import Manager, ref
-    from rr_actors.registrar.model.health import Health
-    from rr_actors.registrar.model.rows import State
-    from rr_actors.registrar.queries import Query, ResourceInfo
-    from rr_actors.registrar.registrar import Registrar
-    from rr_actors.supervision.core.rendering import Tree, render
-    from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
-    from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
-    from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
-    from rr_actors.system.event_subscribers import (
-        ChildEvent,
-        DeadLetterEvent,
-        EndedEvent,
-        Event,
-        MissedEvent,
-        ProgressEvent,
-        ResourceEvent,
-        StreamEvent,
-    )
-    from rr_actors.system.recording.recordings import Recording, read_recording
-    from rr_actors.system.recording.traces import Trace
-    from rr_actors.system.system import System
+# Type checkers and freezers see these imports, and a frozen program runs them. Others import a module for a name that
+# they use: see __getattr__ below, whose table has the same names.
+if TYPE_CHECKING or getattr(_sys, "frozen", False):
+    with _left_alone():
+        from rr_actors.actors.actor import IGNORE, Actor, ExitReport
+        from rr_actors.actors.messaging.dead_letters import DeadLetter, DeadLetters
+        from rr_actors.actors.messaging.exit_reports import Down
+        from rr_actors.actors.monitors import Monitor, monitor
+        from rr_actors.actors.refs import ActorDeadError, ActorRef
+        from rr_actors.actors.timers import Timer, send_after
+        from rr_actors.base.config import RegistrarConfig, SystemConfig
+        from rr_actors.base.errors import (
+            ActorUnavailable,
+            AlreadyPresent,
+            AlreadyStarted,
+            CatalogDamaged,
+            CatalogError,
+            CatalogLocked,
+            CatalogVersion,
+            ChildRestarting,
+            ChildRunning,
+            CircularDependency,
+            ConfigError,
+            Frame,
+            GraphError,
+            InvalidName,
+            InvalidRequest,
+            InvalidResponse,
+            InvalidSpec,
+            LoadError,
+            LoadFailed,
+            LoadTimeout,
+            MailboxFull,
+            NameTaken,
+            NotForDynamic,
+            NotFound,
+            NotHolder,
+            NotRunning,
+            NotSerializable,
+            RegistrarDown,
+            ResourceLost,
+            RestartIntensityExceeded,
+            RrError,
+            StartFailed,
+            SupervisionError,
+            TooManyChildren,
+            Unavailable,
+            UnknownQuery,
+            UnknownRegistrar,
+            UnknownServer,
+            UnloadFailed,
+            UsageError,
+        )
+        from rr_actors.base.values.codecs import codec
+        from rr_actors.hosting.streams import Publisher, Stream, StreamFrame, StreamInfo, StreamReader
+        from rr_actors.registrar.declarations import Declared, server
+        from rr_actors.registrar.engine.progress import Progress
+        from rr_actors.registrar.engine.server import Current, current
+        from rr_actors.registrar.engine.status import Status
+        from rr_actors.registrar.load_groups import Queries
+        from rr_actors.registrar.manager import Manager, ref
+        from rr_actors.registrar.model.health import Health
+        from rr_actors.registrar.model.rows import State
+        from rr_actors.registrar.queries import Query, ResourceInfo
+        from rr_actors.registrar.registrar import Registrar
+        from rr_actors.supervision.core.rendering import Tree, render
+        from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
+        from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
+        from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
+        from rr_actors.system.event_subscribers import (
+            ChildEvent,
+            DeadLetterEvent,
+            EndedEvent,
+            Event,
+            MissedEvent,
+            ProgressEvent,
+            ResourceEvent,
+            StreamEvent,
+        )
+        from rr_actors.system.recording.recordings import Recording, read_recording
+        from rr_actors.system.recording.traces import Trace
+        from rr_actors.system.system import System
+
+if TYPE_CHECKING:
+    from rr_actors import managers as managers
+    from rr_actors.managers import Action, GraphResult, run_graph
 
 __all__ = [
     "IGNORE",
@@ -213,16 +220,62 @@ def __dir__() -> list[str]:
     return __all__
 
 
-if _typing.TYPE_CHECKING:
-    from rr_actors import managers as managers
-    from rr_actors.managers import Action, GraphResult, run_graph
-else:
-    _OF_MANAGERS = {"Action", "GraphResult", "run_graph"}
+if not TYPE_CHECKING:
+    _NAMES = {
+        "rr_actors.actors.actor": "Actor ExitReport IGNORE",
+        "rr_actors.actors.messaging.dead_letters": "DeadLetter DeadLetters",
+        "rr_actors.actors.messaging.exit_reports": "Down",
+        "rr_actors.actors.monitors": "Monitor monitor",
+        "rr_actors.actors.refs": "ActorDeadError ActorRef",
+        "rr_actors.actors.timers": "Timer send_after",
+        "rr_actors.base.config": "RegistrarConfig SystemConfig",
+        "rr_actors.base.values.codecs": "codec",
+        "rr_actors.hosting.streams": "Publisher Stream StreamFrame StreamInfo StreamReader",
+        "rr_actors.managers": "Action GraphResult run_graph",
+        "rr_actors.registrar.declarations": "Declared server",
+        "rr_actors.registrar.engine.progress": "Progress",
+        "rr_actors.registrar.engine.server": "Current current",
+        "rr_actors.registrar.engine.status": "Status",
+        "rr_actors.registrar.load_groups": "Queries",
+        "rr_actors.registrar.manager": "Manager ref",
+        "rr_actors.registrar.model.health": "Health",
+        "rr_actors.registrar.model.rows": "State",
+        "rr_actors.registrar.queries": "Query ResourceInfo",
+        "rr_actors.registrar.registrar": "Registrar",
+        "rr_actors.supervision.core.rendering": "Tree render",
+        "rr_actors.supervision.core.specs": "Backoff ChildSpec Supervisor",
+        "rr_actors.supervision.supervisor": "Child Counts SupervisorRef",
+        "rr_actors.system.console.connected_client": "Client ClientQuery ClientRegistrar connect",
+        "rr_actors.system.event_subscribers": (
+            "ChildEvent DeadLetterEvent EndedEvent Event MissedEvent ProgressEvent ResourceEvent StreamEvent"
+        ),
+        "rr_actors.system.recording.recordings": "Recording read_recording",
+        "rr_actors.system.recording.traces": "Trace",
+        "rr_actors.system.system": "System",
+    }
+    _MODULES = dict.fromkeys(__all__, "rr_actors.base.errors")  # but for these
+    _MODULES |= {name: module for module, names in _NAMES.items() for name in names.split()}
 
     def __getattr__(name: str) -> object:
-        """Import the ready-made managers when `rr.managers` or one of these names is asked for: most need none."""
+        """Import the module of a public name when that name is asked for: no program needs all of them.
+
+        Raises:
+            AttributeError: there is no such name.
+            ImportError: its module cannot be imported.
+        """
         if name == "managers":
             return _importlib.import_module("rr_actors.managers")
-        if name in _OF_MANAGERS:
-            return getattr(_importlib.import_module("rr_actors.managers"), name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name, obj=_sys.modules[__name__])
+        if name not in _MODULES:
+            raise AttributeError(
+                f"module {__name__!r} has no attribute {name!r}", name=name, obj=_sys.modules[__name__]
+            )
+        where = _MODULES[name]
+        try:
+            if where not in _sys.modules:
+                with _left_alone():  # saves a tenth of the time: these objects stay until the process ends
+                    _importlib.import_module(where)
+            module = _importlib.import_module(where)  # another thread may be importing it: this waits
+        except AttributeError as error:  # which would say that there is no such name, and hasattr() would believe it
+            raise ImportError(f"rr_actors.{name} cannot be imported: {error}", name=where) from error
+        found = globals()[name] = getattr(module, name)
+        return found

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import inspect
 import json
 import subprocess
 import sys
@@ -37,6 +40,12 @@ MOST_MODULES = 332
 """Each takes a quarter of a millisecond. Ten are the console's, which each system has by default; one is the web
 page's, four draw pictures for notebooks. 128 of them come with asyncio, sqlite3, msgspec, pykka and cloudpickle."""
 
+BARE_MODULES = 12
+"""Of the import alone: what decides which module a name is in, and leaves the garbage collector alone meanwhile."""
+
+USED = "import rr_actors as rr; rr.System; rr.Manager; rr.Supervisor; rr.Actor; rr.connect"
+"""What a program does with it at least."""
+
 
 def imported_by(statement: str, setup: str = "") -> dict[str, Any]:
     script = f"""
@@ -59,21 +68,73 @@ print(json.dumps({{
 
 
 def test_importing_the_package_imports_no_optional_dependency() -> None:
-    modules = imported_by("import rr_actors as rr; rr.System; rr.Manager")["modules"]
+    modules = imported_by(USED)["modules"]
 
     assert OPTIONAL.intersection(modules) == set()
 
 
 def test_importing_the_package_starts_no_thread() -> None:
-    assert imported_by("import rr_actors")["threads"] == []
+    assert imported_by(USED)["threads"] == []
 
 
 def test_importing_the_package_imports_nothing_that_is_seldom_needed() -> None:
-    assert SELDOM.intersection(imported_by("import rr_actors")["all"]) == set()
+    assert SELDOM.intersection(imported_by(USED)["all"]) == set()
 
 
-def test_importing_the_package_imports_no_more_modules_than_it_must() -> None:
-    assert len(imported_by("import rr_actors")["all"]) <= MOST_MODULES
+def test_what_a_program_uses_of_the_package_imports_no_more_modules_than_it_must() -> None:
+    assert len(imported_by(USED)["all"]) <= MOST_MODULES
+
+
+def test_the_import_alone_imports_next_to_nothing() -> None:
+    assert len(imported_by("import rr_actors")["all"]) <= BARE_MODULES
+    assert "rr_actors.system.system" not in imported_by("import rr_actors as rr; rr.Manager; rr.Registrar")["all"]
+
+
+def test_each_public_name_is_what_type_checkers_and_freezers_take_it_for() -> None:
+    tree = ast.parse(inspect.getsource(rr))
+    static = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
+    shown = {alias.name: node.module or "" for node in static for alias in node.names if alias.name in rr.__all__}
+    assert sorted(shown) == sorted(rr.__all__)
+    for name, where in shown.items():
+        assert getattr(rr, name) is getattr(importlib.import_module(where), name)
+
+
+def test_a_child_finds_the_modules_of_all_names_in_its_fork_server() -> None:
+    """But those of the ready-made managers, which most need none of."""
+    setup = "import importlib; from rr_actors.runtime.processes.child_bootstrap import PRELOAD; "
+    setup += "list(map(importlib.import_module, PRELOAD)); import rr_actors as rr"
+    own = "[getattr(rr, name) for name in rr.__all__ if name not in ('Action', 'GraphResult', 'run_graph')]"
+    assert imported_by(own, setup)["all"] == []
+
+
+def test_all_names_can_be_imported_at_once() -> None:
+    names = "from rr_actors import *; import rr_actors; assert set(rr_actors.__all__) <= set(globals())"
+    assert "rr_actors.managers" in imported_by(names)["all"]
+
+
+def test_threads_that_use_names_at_once_all_have_them() -> None:
+    """Each first use imports, and the others wait for a module that is not whole yet."""
+    program = """
+from concurrent.futures import ThreadPoolExecutor
+import rr_actors as rr
+gate = threading.Barrier(12)
+def use(name):
+    gate.wait()
+    return getattr(rr, name)
+with ThreadPoolExecutor(12) as pool:
+    names = ["System", "connect", "Manager", "Registrar", "read_recording", "Supervisor"] * 2
+    assert [one.__name__ for one in pool.map(use, names)] == names
+"""
+    assert "rr_actors.system.system" in imported_by(program)["all"]
+
+
+def test_a_library_that_lacks_something_does_not_look_like_a_name_that_does_not_exist() -> None:
+    program = "import sys, types; sys.modules['msgspec'] = types.ModuleType('msgspec'); import rr_actors; "
+    for use in ("hasattr(rr_actors, 'RrError')", "exec('from rr_actors import RrError')"):
+        done = subprocess.run([sys.executable, "-c", program + use], capture_output=True, text=True, check=False)
+        assert done.returncode == 1
+        assert done.stderr.splitlines()[-1].startswith("ImportError: "), done.stderr
+        assert "module 'msgspec' has no attribute" in done.stderr
 
 
 def test_the_ready_made_managers_are_imported_when_they_are_asked_for() -> None:
@@ -92,7 +153,7 @@ def test_importing_the_package_is_no_work_for_the_garbage_collector_and_leaves_i
     setup: str, collects: bool
 ) -> None:
     """What modules are made of stays. To look at it again and again took a tenth of the time."""
-    imported = imported_by("import rr_actors", setup)
+    imported = imported_by(USED, setup)
 
     assert len(imported["collections"]) <= 2  # before it is left alone, and when it begins again
     assert imported["collects"] is collects

@@ -185,9 +185,9 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
 
 
 def test_no_module_needs_another_for_its_types_alone() -> None:
-    """An import below TYPE_CHECKING hides a circle: an interface is missing there."""
+    """An import below TYPE_CHECKING hides a circle: an interface is missing there. None imports the package's."""
     for root in (PACKAGE, ROOT / "tests" / "simulation"):
-        for path in root.rglob("*.py"):
+        for path in set(root.rglob("*.py")) - {PACKAGE / "__init__.py"}:
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
                     names = [part.module for part in node.body if isinstance(part, ast.ImportFrom)]

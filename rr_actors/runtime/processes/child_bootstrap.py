@@ -43,6 +43,14 @@ _end_multiprocessing: Callable[[], None] = vars(util)["_exit_function"]
 _FINALIZERS: Any = weakref.finalize
 _serve_one: Callable[..., int] = vars(multiprocessing.forkserver)["_serve_one"]
 
+PRELOAD = (
+    "rr_actors.supervision.child_main",
+    "rr_actors.system.system",
+    "rr_actors.system.console.connected_client",
+    "rr_actors.actors.timers",
+)
+"""What a fork server imports before it forks: the modules of all public names, so that no child imports any."""
+
 _LEAVE_GRACE_S = 2.0
 _AT_EXIT_S = 5.0
 """The longest time for the handlers that were registered with atexit."""
@@ -155,7 +163,7 @@ def _forget_false_tracker() -> None:
 
 
 def serve(listener: int, alive: int, address: int, errors: int, preload: Sequence[str], family: int) -> None:
-    """Run a fork server until its launcher closes it or has ended: its main program.
+    """Run a fork server until its launcher closes it or has ended: its main program. Called without a collector.
 
     Args:
         errors: the standard error for later. What is written before is the launcher's, if this server never serves.
@@ -165,13 +173,12 @@ def serve(listener: int, alive: int, address: int, errors: int, preload: Sequenc
     lifeline.mark(family)
     signal.signal(signal.SIGINT, _ignore)  # for its children, too, until they reset their signals
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTTOU])  # what it writes to a terminal may not stop it
+    for module in PRELOAD:
+        _preload(module)
     gc.freeze()  # the modules, which stay: to collect among them takes a tenth of this start
+    gc.enable()
     for module in preload:
-        try:
-            importlib.import_module(module)
-        except (Exception, SystemExit):
-            sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
-            traceback.print_exc()
+        _preload(module)
     interpreter.check_not_patched()
     _show_errors(errors)
     server = os.getpid()
@@ -191,6 +198,14 @@ def serve(listener: int, alive: int, address: int, errors: int, preload: Sequenc
     _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
     _Forking(listener, alive).run()
     leave(0)  # an orderly end of the interpreter would take 4 ms more, for which System.stop() waits
+
+
+def _preload(module: str) -> None:
+    try:
+        importlib.import_module(module)
+    except (Exception, SystemExit):
+        sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
+        traceback.print_exc()
 
 
 def _show_errors(errors: int) -> None:

@@ -106,7 +106,7 @@ class ForkServer:
             theirs.callback(os.close, errors)
             fds = (listener.fileno(), alive_r, address, errors)
             call = (
-                f"import sys; sys.path[:] = {_sys_path()!r}; "
+                f"import gc, sys; gc.disable(); sys.path[:] = {_sys_path()!r}; "
                 "from rr_actors.runtime.processes.child_bootstrap import serve; "
                 f"serve({fds[0]}, {fds[1]}, {fds[2]}, {fds[3]}, {tuple(preload)!r}, {family})"
             )

@@ -25,9 +25,6 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer
 
-PRELOAD = ("rr_actors.supervision.child_main",)
-"""The modules that a fork server imports before it forks."""
-
 _CHILD_FDS = 4  # of a Process: its pidfd, its status, its lifeline and its control channel
 _SPARE_FDS = 16  # for the fork server, the start of a child, a registrar
 _CODE_GRACE_S = 0.25  # the longest wait for the exit code after a death
@@ -200,7 +197,7 @@ class Spawner:
     """
 
     def __init__(self, preload: Sequence[str] = (), directory: str = "") -> None:
-        self._preload = (*PRELOAD, *preload)
+        self._preload = tuple(preload)
         self._directory = directory
         self._last_words = ""  # of the fork server that could not serve
         self._family = lifeline.new_family()
