@@ -11,8 +11,7 @@ import sys
 from typing import NoReturn
 
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import CatalogError, RrError, UsageError
-from rr_actors.system.console.console_client import NotRunning
+from rr_actors.base.errors import CatalogError, NotRunning, RrError, UsageError
 from rr_actors.tools.log_lines import printable
 
 _INTERRUPTED = 130  # as a shell has it
@@ -24,7 +23,7 @@ def main() -> None:
         _leave("rr-actors: expected a standard output, got a closed one")
     try:
         with needing("the command line", "cli"):  # import rr_actors.tools.cli works without it
-            from rr_actors.tools.recording_verbs import app
+            from rr_actors.tools.verbs.verb_group import app
         app(standalone_mode=True)
     except RrError as error:
         _leave(f"rr-actors: {error}", _code(error))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Collection
 from typing import Any, Literal
 
-from rr_actors.base.errors import RrError, UsageError
 from rr_actors.base.svg_pictures import Box, draw
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.supervision.core.rendering import Tree, dot_text, mermaid_text, svg_boxes, tree_edges
@@ -44,24 +42,6 @@ def svg(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> s
         boxes |= {one.id: Box(_resource_lines(one), _COLOURS.get(one.state, "#ffffff")) for one in resources}
         edges += held
     return draw(boxes, edges)
-
-
-def png(picture: str) -> bytes:
-    """Convert an SVG document to PNG with the program rsvg-convert, and return it.
-
-    Raises:
-        UsageError: the program is not installed.
-        RrError: the program failed.
-    """
-    try:
-        made = subprocess.run(["rsvg-convert", "--format", "png"], input=picture.encode(), capture_output=True)
-    except OSError as error:
-        text = f"PNG: expected the program rsvg-convert, got: {error.strerror}; install it, as by"
-        raise UsageError(f"{text} `apt-get install librsvg2-bin`, or take --format svg") from None
-    if made.returncode != 0:
-        said = made.stderr.decode(errors="replace").strip()
-        raise RrError(f"PNG: rsvg-convert ended with {made.returncode}: {said or 'it said nothing'}; take --format svg")
-    return made.stdout
 
 
 def _resource_lines(resource: ResourceRow) -> list[str]:

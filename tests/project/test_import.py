@@ -8,6 +8,7 @@ import inspect
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -42,6 +43,12 @@ page's, four draw pictures for notebooks. 128 of them come with asyncio, sqlite3
 
 BARE_MODULES = 12
 """Of the import alone: what decides which module a name is in, and leaves the garbage collector alone meanwhile."""
+
+HELP_MODULES = 126
+"""Of `rr-actors --help`, and a TAB for a verb: typer's, msgspec's, and a few of the base."""
+
+PS_MODULES = 384
+"""Of `rr-actors ps`, and a TAB for one of its options: these and the console's, which are nearly all of a system."""
 
 USED = "import rr_actors as rr; rr.System; rr.Manager; rr.Supervisor; rr.Actor; rr.connect"
 """What a program does with it at least."""
@@ -166,3 +173,46 @@ def test_on_another_system_than_linux_the_import_says_what_is_needed() -> None:
     assert done.stderr.splitlines()[-1] == (
         "ImportError: rr_actors needs Linux, this is darwin: run it in a Linux container or virtual machine"
     )
+
+
+def command(*arguments: str, **environment: str) -> str:
+    """A statement that runs `rr-actors` with these."""
+    return f"""
+import os
+from rr_actors.tools.cli import main
+sys.argv = {["rr-actors", *arguments]!r}
+os.environ |= {environment!r}
+with contextlib.redirect_stdout(open(os.devnull, "w")), contextlib.suppress(SystemExit):
+    main()
+"""
+
+
+def tab(*words: str) -> str:
+    """A statement that completes the last of these words, as a shell does."""
+    told = {"COMP_WORDS": " ".join(("rr-actors", *words)), "COMP_CWORD": str(len(words))}
+    return command(_RR_ACTORS_COMPLETE="complete_bash", **told)
+
+
+@pytest.mark.parametrize("statement", [command("--help"), command(), tab("p"), tab("")])
+def test_the_help_and_the_completion_of_verbs_import_no_verb(statement: str) -> None:
+    imported = imported_by(statement)
+    assert len(imported["all"]) <= HELP_MODULES
+    assert {"asyncio", "pydantic", "rich"}.intersection(imported["modules"]) == set()
+    assert "rr_actors.tools.verbs.console_verbs" not in imported["all"]
+
+
+def test_a_verb_imports_what_it_needs_and_no_more(tmp_path: Path) -> None:
+    state = ("--state", str(tmp_path))
+    for statement in (
+        command("ps", *state),
+        command("ps", "--help"),
+        tab("ps", *state, "--s"),
+        tab("kill", *state, "c"),
+    ):
+        imported = imported_by(statement)
+        assert len(imported["all"]) <= PS_MODULES
+        assert {"pydantic", "psutil", "textual", "nicegui"}.intersection(imported["modules"]) == set()
+        assert {"rich.console", "rr_actors.system.system"}.intersection(imported["all"]) == set()
+        assert [name for name in imported["all"] if name.startswith("rr_actors.tools.web")] == []
+    for statement in (command("new", "Not-A-Name"), command("version")):
+        assert "asyncio" not in imported_by(statement)["modules"]

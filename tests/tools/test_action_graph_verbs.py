@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import rr_actors as rr
 from rr_actors.managers import Actions, RunGraph
-from rr_actors.tools.recording_verbs import app
+from rr_actors.tools.verbs.verb_group import app
 from support import eventually
 
 Start = Callable[..., rr.System]

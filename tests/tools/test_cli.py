@@ -213,13 +213,12 @@ def test_a_directory_without_catalogs_is_an_error_of_one_line(tmp_path: Path) ->
     assert_one_line_error(run("check", tmp_path), str(tmp_path), "state_dir")
 
 
-def test_a_missing_extra_is_an_error_of_one_line_that_says_what_to_install(tmp_path: Path) -> None:
-    (tmp_path / "typer.py").write_text("raise ModuleNotFoundError('No module named typer', name='typer')")
+@pytest.mark.parametrize("library", ["typer", "rich"])
+def test_a_missing_extra_is_an_error_of_one_line_that_says_what_to_install(tmp_path: Path, library: str) -> None:
+    (tmp_path / f"{library}.py").write_text(f"raise ModuleNotFoundError('not installed', name={library!r})")
 
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    ran = subprocess.run(
-        [sys.executable, "-m", "rr_actors", "version"], capture_output=True, text=True, env=environment
-    )
+    ran = subprocess.run([sys.executable, "-m", "rr_actors", "tree"], capture_output=True, text=True, env=environment)
     assert_one_line_error(ran, "pip install 'rr-actors[cli]'")
 
 

@@ -25,7 +25,9 @@ from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
 from rr_actors.system.recording.event_texts import ago
-from rr_actors.tools import console_verbs, graphs
+from rr_actors.tools import graphs
+from rr_actors.tools.verbs import console_verbs
+from rr_actors.tools.verbs.verb_group import VERBS, whole
 from support import (
     LIMIT_S,
     REPOSITORY,
@@ -866,36 +868,32 @@ def test_a_dry_run_says_what_would_be_done_and_changes_nothing(shop: rr.System, 
     assert shop.registrar("shop").resources() == []
 
 
-def test_each_command_has_an_example_in_its_help() -> None:
-    script = (
-        "from rr_actors.tools.console_verbs import app\n"
-        "import typer\n"
-        "for name, each in typer.main.get_command(app).commands.items(): print(name, '|', each.epilog or '')\n"
-    )
-    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    examples = dict(line.split(" | ", 1) for line in shown.splitlines())
+NAMES = [name for modules in VERBS.values() for verbs in modules.values() for name in verbs]
 
+
+def test_each_command_has_an_example_in_its_help() -> None:
     older = {"version", "inspect", "tree", "check", "chaos"}
-    for name, example in examples.items():
-        assert name in older or example.startswith(f"Example: rr-actors {name}"), name
+    for name in NAMES:
+        assert name in older or (whole(name).epilog or "").startswith(f"Example: rr-actors {name}"), name
     assert "Example: rr-actors kill" in said("kill", "--help")
 
 
-def test_the_help_has_each_command_once_in_a_group_with_its_whole_first_sentence() -> None:
-    script = (
-        "import typer\n"
-        "from rr_actors.tools.recording_verbs import app\n"
-        "from rr_actors.tools.console_verbs import app\n"
-        "print(*typer.main.get_command(app).commands)\n"
-    )
-    names = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+def test_each_verb_is_in_the_list_of_the_verbs_with_the_first_sentence_of_its_help() -> None:
+    for modules in VERBS.values():
+        for module, verbs in modules.items():
+            for name, says in verbs.items():
+                assert (whole(name).help or "").partition("\n\n")[0].partition(". ")[0].rstrip(".") == says
+            declared = module().app.registered_commands
+            assert {info.name or info.callback.__name__.replace("_", "-") for info in declared} <= {*NAMES}
 
+
+def test_the_help_has_each_command_once_in_a_group_with_its_whole_first_sentence() -> None:
     shown = said("--help")
     commands = shown.partition("running system:\n")[2]
     assert "…" not in commands
     assert "..." not in commands
     listed = re.findall(r"^  ([a-z-]+)  ", commands, flags=re.MULTILINE)
-    assert sorted(listed) == sorted(names)
+    assert listed == NAMES
     groups = re.findall(r"^(\w.*):$", shown, flags=re.MULTILINE)
     assert groups[:4] == ["Options", "Look at a running system", "Change its resources", "Run, change and stop it"]
 
@@ -909,18 +907,24 @@ def test_a_shell_completes_what_the_running_system_has(app: rr.Registrar) -> Non
     assert completing("why", query.id[:8]) == [query.id]
 
 
-def completing(name: str, incomplete: str) -> list[str]:
-    """What is offered for the first argument of a command."""
-    script = (
-        "import sys, typer, click\n"
-        "from rr_actors.tools.console_verbs import app\n"
-        "group = typer.main.get_command(app)\n"
-        "each = group.commands[sys.argv[1]]\n"
-        "context = each.make_context(sys.argv[1], [], resilient_parsing=True)\n"
-        "first = next(one for one in each.params if one.param_type_name == 'argument')\n"
-        "print(*(item.value for item in first.shell_complete(context, sys.argv[2])))\n"
+def test_a_shell_completes_verbs_options_and_their_values() -> None:
+    assert completing("p") == ["ps", "priority"]
+    assert completing("--v") == ["--version"]
+    assert completing("resources", "--st") == ["--status", "--state"]
+    assert completing("resources", "--status", "OK", "--st") == ["--status", "--state"]  # it may be repeated
+    assert completing("graph", "--state", "/nowhere", "--st") == []
+    assert completing("ps", "--sort-by", "m") == ["memory"]
+    assert completing("nothing", "p") == ["ps", "priority"]  # as if it were not there
+
+
+def completing(*words: str) -> list[str]:
+    """What a TAB after these words offers."""
+    tab = {"_RR_ACTORS_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(("rr-actors", *words))}
+    command = Path(sys.executable).with_name("rr-actors")
+    ran = subprocess.run(
+        [command], env=os.environ | tab | {"COMP_CWORD": str(len(words))}, capture_output=True, text=True, check=True
     )
-    ran = subprocess.run([sys.executable, "-c", script, name, incomplete], capture_output=True, text=True, check=True)
+    assert ran.stderr == ""
     return ran.stdout.split()
 
 

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import rr_actors as rr
-from rr_actors.tools.recording_verbs import app
+from rr_actors.tools.verbs.verb_group import app
 
 TEXT = """
 Components:

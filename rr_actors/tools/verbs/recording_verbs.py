@@ -16,17 +16,15 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.recording.recordings import Recording, RecordingFile, add, read_recording
 from rr_actors.system.recording.timelines import read_timeline
-from rr_actors.tools.cli_commands import RECORD, JsonOption, StateOption, json_text, say, say_lines
-from rr_actors.tools.console_verbs import app
-from rr_actors.tools.terminal import planner_verbs, stream_verbs
+from rr_actors.tools.cli_commands import JsonOption, StateOption, json_text, say, say_lines
 from rr_actors.tools.web.timeline_file import html
 
-__all__ = ["app", "planner_verbs", "stream_verbs"]  # in the order of the help
+app = typer.Typer()
 
 _LISTEN_S = 10.0
 
 
-@app.command(rich_help_panel=RECORD, epilog="Example: rr-actors record crash.jsonl --seconds 30")
+@app.command(epilog="Example: rr-actors record crash.jsonl --seconds 30")
 def record(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A new file, for `sequence` and rr.read_recording().")],
     seconds: Annotated[
@@ -50,7 +48,7 @@ def record(
     say(f"recorded {count} entries in {file}{lost}")
 
 
-@app.command(rich_help_panel=RECORD, epilog="Example: rr-actors sequence 01a2085d3f7c --file crash.jsonl > load.mmd")
+@app.command(epilog="Example: rr-actors sequence 01a2085d3f7c --file crash.jsonl > load.mmd")
 def sequence(
     id: Annotated[str, typer.Argument(metavar="QUERY-OR-RESOURCE", help="Its id, or the beginning of it.")],
     file: Annotated[Path | None, typer.Option(help="A recording. Default: record the running system now.")] = None,
@@ -72,7 +70,7 @@ def sequence(
         say_lines(trace.sequence())
 
 
-@app.command(rich_help_panel=RECORD, epilog="Example: rr-actors timeline crash.jsonl > crash.svg")
+@app.command(epilog="Example: rr-actors timeline crash.jsonl > crash.svg")
 def timeline(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="A recording, or the history.jsonl of a state directory.")

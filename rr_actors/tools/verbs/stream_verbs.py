@@ -16,14 +16,15 @@ from rr_actors.base.names import short_id, short_ids
 from rr_actors.hosting.streams import Stream, StreamFrame, StreamRow
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_questions import Find
-from rr_actors.tools.cli_commands import LOOK, JsonOption, StateOption, app, say, say_json, say_table
+from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_table
 from rr_actors.tools.explanations import age_text, bytes_text, rate_text, readers_text
 from rr_actors.tools.terminal.stream_frames import frames_of, png
 
+app = typer.Typer()
 _LOOK_S = 1.0  # between two looks at a stream's rate, and at whether its resource is still there
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors streams cameras/camera")
+@app.command(epilog="Example: rr-actors streams cameras/camera")
 def streams(
     match: Annotated[str, typer.Argument(help="Only those with this text in their name or resource.")] = "",
     registrar: Annotated[str, typer.Option(help="Only this one's.")] = "",
@@ -66,9 +67,7 @@ def _facts(row: StreamRow) -> dict[str, Any]:
     return {**facts, **figures, "readers": row.readers, "missed": info.missed}
 
 
-@app.command(
-    rich_help_panel=LOOK, epilog="Example: rr-actors stream 'cameras/camera \"front\"' images --save front.png"
-)
+@app.command(epilog="Example: rr-actors stream 'cameras/camera \"front\"' images --save front.png")
 def stream(
     id: Annotated[str, typer.Argument(help="A resource's name, or its id, or the beginning or end of that.")],
     name: Annotated[str, typer.Argument(help="The stream's name, if the resource has several.")] = "",

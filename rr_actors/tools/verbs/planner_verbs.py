@@ -12,18 +12,9 @@ from rr_actors.base.toml import read_bytes
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import AskActor
-from rr_actors.tools.cli_commands import (
-    CHANGE_RESOURCES,
-    LOOK,
-    JsonOption,
-    StateOption,
-    app,
-    say,
-    say_json,
-    say_lines,
-    say_table,
-)
+from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_table
 
+app = typer.Typer()
 _ANSWER_S = 60.0
 _LOOSE = Codec(None, "answer")
 
@@ -54,7 +45,7 @@ def _say_changes(lines: list[str], none: str, as_json: bool) -> None:
         say(none)
 
 
-@app.command(rich_help_panel=CHANGE_RESOURCES, epilog="Example: rr-actors apply keep.toml --dry-run")
+@app.command(epilog="Example: rr-actors apply keep.toml --dry-run")
 def apply(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="What is to be kept from now on.")],
     keeper: KeeperOption = "keeper",
@@ -67,7 +58,7 @@ def apply(
     _say_changes(made, f"{keeper} keeps all of this already", as_json)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors keep diff")
+@app.command(epilog="Example: rr-actors keep diff")
 def keep(
     what: Annotated[Literal["get", "diff"], typer.Argument(help="get: all that is kept; diff: what is not ready.")],
     file: Annotated[
@@ -102,7 +93,7 @@ def _say_kept(rows: list[dict[str, Any]], as_json: bool) -> None:
         say("nothing is kept", err=True)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors budgets")
+@app.command(epilog="Example: rr-actors budgets")
 def budgets(
     child: Annotated[
         str, typer.Option("--budgets", metavar="ID", help="The id or path of the child that has the pools.")

@@ -1,4 +1,4 @@
-"""The commands of `rr-actors` that reach a running system through its console, and `run`, which starts one."""
+"""The commands of `rr-actors` that reach a running system through its console."""
 
 from __future__ import annotations
 
@@ -29,13 +29,9 @@ from rr_actors.system.console.console_view import Command
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools import graphs
 from rr_actors.tools.cli_commands import (
-    CHANGE_RESOURCES,
-    CHANGE_TREE,
-    LOOK,
     JsonOption,
     StateOption,
     WatchOption,
-    app,
     say,
     say_json,
     say_lines,
@@ -48,9 +44,8 @@ from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
 from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
-from rr_actors.tools.tree_runner import run_tree
 
-__all__ = ["app"]
+app = typer.Typer()
 
 _GRACE_S = 10.0  # for an answer, added to the time limit of the command
 _UNLOAD_S = 60.0  # for the unload callbacks, after a grace
@@ -142,7 +137,7 @@ def _carry_out(state: Path | None, command: Command[c.Done], as_json: bool = Fal
 # -- looking ---------------------------------------------------------------------------------------------------------
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors ps --json | jq '.[] | select(.state != \"running\")'")
+@app.command(epilog="Example: rr-actors ps --json | jq '.[] | select(.state != \"running\")'")
 def ps(
     output: Output = None,
     sort_by: Annotated[
@@ -195,7 +190,7 @@ def _child_facts(row: c.ChildRow, usages: dict[int, Any]) -> dict[str, Any]:
     return {name: getattr(row, name) for name in row.__struct_fields__} | used
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors resources /dev/video --registrar cameras")
+@app.command(epilog="Example: rr-actors resources /dev/video --registrar cameras")
 def resources(
     match: Annotated[
         str, typer.Argument(help="Only those with this text in their id, server, request or status.")
@@ -293,7 +288,7 @@ def _chosen(page: c.Resources, states: set[str], holder: str, sort_by: str | Non
     return c.Resources(len(rows), rows[:limit], page.notes)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors usage --sort-by memory_bytes --registrar programs")
+@app.command(epilog="Example: rr-actors usage --sort-by memory_bytes --registrar programs")
 def usage(
     match: Annotated[
         str, typer.Argument(help="Only those with this text in their id, server, request or status.")
@@ -350,7 +345,7 @@ def _show_usages(
         say(f"not asked: {note}", err=True)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors loads cameras --sort-by p95 --watch")
+@app.command(epilog="Example: rr-actors loads cameras --sort-by p95 --watch")
 def loads(
     match: Annotated[str, typer.Argument(help="Only those with this text in their id, server or request.")] = "",
     registrar: Annotated[
@@ -417,7 +412,7 @@ def _amount(name: str, number: float | None) -> str:
     return f"{number / 2**20:.0f} MiB" if name.endswith("_bytes") else f"{number:.6g}"
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors events --follow --event exited --event restarted --json")
+@app.command(epilog="Example: rr-actors events --follow --event exited --event restarted --json")
 def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what happens, until Ctrl-C.")] = False,
     event: Annotated[list[str] | None, typer.Option(help="Only events of this kind; may be repeated.")] = None,
@@ -510,7 +505,7 @@ def _say_missed(missed: c.Missed, as_json: bool) -> None:
         say(missed_line(missed))
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors history root/cameras")
+@app.command(epilog="Example: rr-actors history root/cameras")
 def history(
     child: Annotated[str, typer.Argument(metavar="[ID]", autocompletion=_completing(_children))] = "",
     limit: Limit = 100,
@@ -528,7 +523,7 @@ def history(
             say_lines(record.traceback.rstrip(), "    ")
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors logs cameras --previous --lines 20")
+@app.command(epilog="Example: rr-actors logs cameras --previous --lines 20")
 def logs(
     child: ChildArgument,
     lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="The newest so many.")] = c.PAGE_LIMIT,
@@ -571,7 +566,7 @@ def _say_log(path: str, lines: list[LogLine], text: LogText, as_json: bool) -> N
             say(one)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors stack cameras --timeout 10")
+@app.command(epilog="Example: rr-actors stack cameras --timeout 10")
 def stack(
     child: ChildArgument, timeout_s: Timeout = 5.0, state: StateOption = None, as_json: JsonOption = False
 ) -> None:
@@ -592,7 +587,7 @@ def stack(
             say_lines("\n".join(source), "        ")
 
 
-@app.command("dead-letters", rich_help_panel=LOOK, epilog="Example: rr-actors dead-letters --limit 5")
+@app.command("dead-letters", epilog="Example: rr-actors dead-letters --limit 5")
 def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
     """Show how many messages could not be delivered, and the newest of them."""
     with _client(state) as client:
@@ -603,7 +598,7 @@ def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOpti
         say_lines(str(DeadLetters(letters.count, letters.letters)))
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors top --state rr_state")
+@app.command(epilog="Example: rr-actors top --state rr_state")
 def top(state: StateOption = None) -> None:
     """Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys."""
     with needing("top", "top"):  # the other verbs work without it
@@ -611,7 +606,7 @@ def top(state: StateOption = None) -> None:
     watch(state)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors web --port 8080")
+@app.command(epilog="Example: rr-actors web --port 8080")
 def web(
     state: StateOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 for a free one.")] = 0,
@@ -625,7 +620,7 @@ def web(
     serve(state, lab=lab, host=host, port=port, is_child=child, say=say)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors why 01a2085d3f7c")
+@app.command(epilog="Example: rr-actors why 01a2085d3f7c")
 def why(
     id: Annotated[
         str,
@@ -642,7 +637,7 @@ def why(
             say(line)
 
 
-@app.command(rich_help_panel=LOOK, epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
+@app.command(epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
 def graph(
     what: Annotated[
         Literal["check", "show", "run", "change"] | None,
@@ -691,9 +686,7 @@ def graph(
         say(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
 
 
-@app.command(
-    rich_help_panel=LOOK, epilog="Example: rr-actors wait 'cameras/camera \"/dev/video0\"' --for OK --timeout 10"
-)
+@app.command(epilog="Example: rr-actors wait 'cameras/camera \"/dev/video0\"' --for OK --timeout 10")
 def wait(
     target: Annotated[
         str,
@@ -730,7 +723,7 @@ def wait(
 # -- driving ---------------------------------------------------------------------------------------------------------
 
 
-@app.command(rich_help_panel=CHANGE_RESOURCES, epilog="Example: rr-actors load cameras/camera '\"/dev/video0\"' --hold")
+@app.command(epilog="Example: rr-actors load cameras/camera '\"/dev/video0\"' --hold")
 def load(
     server: Annotated[str, typer.Argument(help="REGISTRAR/SERVER.", autocompletion=_completing(_servers))],
     request: Annotated[str, typer.Argument(metavar="REQUEST-AS-JSON", help="The request: '\"front\"', '{\"x\": 1}'.")],
@@ -759,7 +752,6 @@ def load(
 
 
 @app.command(
-    rich_help_panel=CHANGE_RESOURCES,
     epilog="Example: rr-actors priority 01a2085d3f7c standby",
     context_settings={"ignore_unknown_options": True},  # a negative number is no option
 )
@@ -776,7 +768,7 @@ def priority(
     _carry_out(state, commands.GivePriority(id, commands.priority_from("PRIORITY", value), dry_run), as_json)
 
 
-@app.command(rich_help_panel=CHANGE_RESOURCES, epilog="Example: rr-actors unload 01a2085d3f7c")
+@app.command(epilog="Example: rr-actors unload 01a2085d3f7c")
 def unload(
     id: Annotated[
         str,
@@ -796,10 +788,7 @@ def unload(
     _carry_out(state, commands.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
 
 
-@app.command(
-    rich_help_panel=CHANGE_RESOURCES,
-    epilog="Example: rr-actors revoke 'cameras/camera \"/dev/video0\"' 'low battery' --grace 10",
-)
+@app.command(epilog="Example: rr-actors revoke 'cameras/camera \"/dev/video0\"' 'low battery' --grace 10")
 def revoke(
     id: Annotated[
         str,
@@ -822,10 +811,7 @@ def revoke(
     _carry_out(state, commands.Revoke(id, why, grace_s, dry_run), as_json, grace_s + _UNLOAD_S)
 
 
-@app.command(
-    rich_help_panel=CHANGE_RESOURCES,
-    epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'",
-)
+@app.command(epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'")
 def status(
     target: Annotated[
         str,
@@ -892,7 +878,7 @@ def _child_lines(row: c.ChildRow, facts: dict[str, Any], served: list[c.Registra
             yield f"        {counts}"
 
 
-@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors kill cameras --signal SIGSTOP")
+@app.command(epilog="Example: rr-actors kill cameras --signal SIGSTOP")
 def kill(
     child: ChildArgument,
     signal_name: Annotated[str, typer.Option("--signal", "-s", help="A signal's name or number.")] = "SIGKILL",
@@ -913,7 +899,7 @@ def _signal_number(text: str) -> int:
     return signal.Signals[name].value
 
 
-@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors terminate root/inner/cameras")
+@app.command(epilog="Example: rr-actors terminate root/inner/cameras")
 def terminate(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
@@ -921,7 +907,7 @@ def terminate(
     _carry_out(state, commands.Terminate(child, dry_run), as_json)
 
 
-@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors restart cameras")
+@app.command(epilog="Example: rr-actors restart cameras")
 def restart(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
@@ -929,7 +915,7 @@ def restart(
     _carry_out(state, commands.Restart(child, dry_run), as_json)
 
 
-@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors start lidar.toml --under root/sensors")
+@app.command(epilog="Example: rr-actors start lidar.toml --under root/sensors")
 def start(
     spec: Annotated[
         Path, typer.Argument(metavar="SPEC.toml", help="actor = 'module:class', id = ...; or a supervisor.")
@@ -949,7 +935,7 @@ def start(
     _carry_out(state, commands.StartChild(text, under, str(spec), dry_run), as_json)
 
 
-@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors shutdown --state rr_state")
+@app.command(epilog="Example: rr-actors shutdown --state rr_state")
 def shutdown(
     wait: Annotated[bool, typer.Option("--wait", help="End when all children have stopped.")] = False,
     state: StateOption = None,
@@ -965,23 +951,3 @@ def shutdown(
         _carry_out(state, commands.ShutDown(), as_json)
         for _ in happens:  # until the system's console ends, after its children
             pass
-
-
-@app.command(rich_help_panel=CHANGE_TREE, epilog="Example: rr-actors run robot.toml --state /var/lib/robot --log debug")
-def run(
-    tree: Annotated[Path, typer.Argument(metavar="TREE.toml", help="The tree, as Supervisor.from_toml reads it.")],
-    state: Annotated[
-        Path, typer.Option("--state", envvar="RR_STATE", metavar="DIR", help="Its state directory.")
-    ] = Path("rr_state"),
-    config: Annotated[Path | None, typer.Option(help="Its configuration, as SystemConfig.from_toml reads it.")] = None,
-    name: Annotated[str, typer.Option(help="Its name, for logs.")] = "system",
-    log: Annotated[Literal["debug", "info", "warning", "error"], typer.Option(help="What its log tells.")] = "info",
-    as_json: Annotated[bool, typer.Option("--json", help="The log as one object of JSON a line.")] = False,
-    watch: Annotated[bool, typer.Option("--watch", help="Restart a child whose module has changed.")] = False,
-) -> None:
-    """Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second one kills what is left.
-
-    Exit code 1 if the tree gave up by itself.
-    """
-    if not run_tree(tree, state, config, name, log_level=log, log_json=as_json, watch=watch):
-        raise typer.Exit(1)

@@ -1,0 +1,73 @@
+"""The commands of `rr-actors` that need neither a system nor a state directory."""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rr_actors.base import __version__
+from rr_actors.base.checks import needing
+from rr_actors.base.errors import UsageError, shown
+from rr_actors.tools.cli_commands import say_lines
+
+app = typer.Typer()
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    typer.echo(__version__)
+
+
+_TEMPLATES = Path(__file__).parents[1] / "new_project"
+
+
+@app.command(epilog="Example: rr-actors new robot")
+def new(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="The project's: lower-case letters, digits and single hyphens.")
+    ],
+) -> None:
+    """Make a small project: two managers, an application, a test that kills one, a systemd unit, a Dockerfile."""
+    module = name.replace("-", "_")
+    if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
+        raise UsageError(f"NAME: expected lower-case letters, digits and single hyphens, got {shown(name)}")
+    if keyword.iskeyword(module) or importlib.util.find_spec(module) is not None:
+        raise UsageError(f"NAME: expected no word of Python and no name of an installed module, got {shown(name)}")
+    Path(name).mkdir()
+    for template in sorted(_TEMPLATES.rglob("*.txt")):
+        path, text = (
+            text.replace("_NAME_", name).replace("_MODULE_", module)
+            for text in (str(template.relative_to(_TEMPLATES)), template.read_text())
+        )
+        target = Path(name, path.removesuffix(".txt"))
+        target.parent.mkdir(exist_ok=True)
+        target.write_text(text)
+    typer.echo(f"made {name}: see {name}/README.md, or: cd {name}; python -m pytest; python -m {module}")
+
+
+@app.command(epilog="Example: rr-actors import-temoto components.yaml pipes.yaml > pipes.toml")
+def import_temoto(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE.yaml...", help="A components.yaml and a pipes.yaml, or several.")
+    ],
+) -> None:
+    """Print the files of a temoto_component_manager as one TOML file for the manager Pipes."""
+    with needing("import-temoto", "temoto"):
+        from rr_actors.managers.pipes import temoto_files
+
+    say_lines(temoto_files.import_temoto(files))
+
+
+@app.command(add_help_option=False, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def chaos(context: typer.Context) -> None:
+    """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-P", "-m", "rr_actors.testing", *context.args])

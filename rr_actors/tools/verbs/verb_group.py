@@ -1,0 +1,285 @@
+"""The command `rr-actors` itself: which verbs it has, in groups, and the import of the one that is called.
+
+A verb's module imports the console, storage or a whole system, which takes longer than all else. So the list of the
+verbs stands here, for the help and for completion, and one function for each module imports it when a verb is called.
+These are import statements, and no names in a table, so that freezers and the tests of layers see them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, cast, get_type_hints
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from rr_actors.base import __version__
+from rr_actors.base.checks import needing
+from rr_actors.base.errors import UsageError
+from rr_actors.runtime.garbage import left_alone
+
+
+def _console() -> ModuleType:
+    from rr_actors.tools.verbs import console_verbs
+
+    return console_verbs
+
+
+def _planner() -> ModuleType:
+    from rr_actors.tools.verbs import planner_verbs
+
+    return planner_verbs
+
+
+def _streams() -> ModuleType:
+    from rr_actors.tools.verbs import stream_verbs
+
+    return stream_verbs
+
+
+def _recording() -> ModuleType:
+    from rr_actors.tools.verbs import recording_verbs
+
+    return recording_verbs
+
+
+def _state() -> ModuleType:
+    from rr_actors.tools.verbs import state_verbs
+
+    return state_verbs
+
+
+def _system() -> ModuleType:
+    from rr_actors.tools.verbs import system_verbs
+
+    return system_verbs
+
+
+def _project() -> ModuleType:
+    from rr_actors.tools.verbs import project_verbs
+
+    return project_verbs
+
+
+VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
+    "Look at a running system": {
+        _console: {
+            "ps": (
+                "Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its "
+                "start) and memory"
+            ),
+            "resources": "List the resources of the running system, and who holds each",
+            "usage": "Show what each resource uses now, CPU and memory for instance, of servers that can say it",
+            "loads": "Show which loads wait now, and how often and how long loads of each server had to wait",
+            "events": "Show the latest events of the tree; with --follow show new events, also those of resources",
+            "history": "Show the starts and exits of a child and all below it, or of all children, with reasons",
+            "logs": "Show the last log lines of a child, also of the processes that it had before",
+            "stack": "Show where each thread of a child's process is now, also if the child is stuck",
+            "dead-letters": "Show how many messages could not be delivered, and the newest of them",
+            "top": "Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys",
+            "web": (
+                "Serve a live web page of a running system: its tree, its resources, the last minutes; "
+                "print its address"
+            ),
+            "why": "Say who holds a resource, for whom, since when, and what it waits for",
+            "graph": (
+                "Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz"
+            ),
+            "wait": (
+                "Wait until a child or a resource is in a state; before the system runs, for that, too; "
+                "exit code 1 if in vain"
+            ),
+        },
+        _planner: {
+            "keep": "Show what a Keeper keeps, how many replicas are ready, and why others are not",
+            "budgets": (
+                "Show the pools of a Budgets: how much each has, what is used and free, and how many "
+                "loads wait for room"
+            ),
+        },
+        _streams: {
+            "streams": (
+                "List the open streams: frames and bytes a second, the age of the newest frame, readers, "
+                "and what they missed"
+            ),
+            "stream": "Show a stream's rate; or read it as one reader more, and show its frames or save one",
+        },
+    },
+    "Change its resources": {
+        _console: {
+            "load": "Load a resource and show its response; without --hold or --as it is released again at once",
+            "priority": "Give a query of any holder a priority; what its resource depends on follows",
+            "unload": (
+                "Release a query of any holder; with --force take a resource away from all its holders, "
+                "which hear FATAL"
+            ),
+            "revoke": (
+                "Take a resource away from its holders in its owner's name: what depends on it ends "
+                "first, or replaces it"
+            ),
+            "status": (
+                "Show how a child or a resource is; with STATE, send a resource's status to its holders "
+                "in its owner's name"
+            ),
+        },
+        _planner: {
+            "apply": (
+                "Have a Keeper keep what another file wants, and show what changes: + is added, - is removed, ~ differs"
+            )
+        },
+    },
+    "Run, change and stop it": {
+        _console: {
+            "kill": "Send a signal to a child's process; if the child ends, its supervisor handles that as any end",
+            "terminate": "Stop a child in order",
+            "restart": "Start a child again",
+            "start": "Add a child to the running tree, and start it",
+            "shutdown": "Stop the whole system in order, as its own stop() does",
+        },
+        _system: {
+            "run": (
+                "Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second "
+                "one kills what is left"
+            )
+        },
+    },
+    "Record what happens": {
+        _recording: {
+            "record": "Record the events, exits and callbacks of the system, and the messages between its registrars",
+            "sequence": (
+                "Draw the trace of a load, over all processes, as a Mermaid sequence diagram; with "
+                "--json, print its entries"
+            ),
+            "timeline": (
+                "Draw what happened: a lane for each child, a bar for each life, marks for events and their reasons"
+            ),
+        }
+    },
+    "Look into a state directory, whether its system runs or not": {
+        _state: {
+            "inspect": "Show every registrar's resources, the queries on them, and the queries that it holds elsewhere",
+            "tree": "Show each registrar's own queries, and below them the resources that they depend on",
+            "check": "Check the catalogs against each other; exit code 1 if they disagree",
+        }
+    },
+    "This machine, and projects": {
+        _system: {
+            "doctor": (
+                "Say what this machine lacks or limits of what a system needs, each with what to do; exit "
+                "code 1 if it lacks any"
+            )
+        },
+        _project: {
+            "version": "Print the version",
+            "new": (
+                "Make a small project: two managers, an application, a test that kills one, a systemd "
+                "unit, a Dockerfile"
+            ),
+            "import-temoto": "Print the files of a temoto_component_manager as one TOML file for the manager Pipes",
+            "chaos": (
+                "Run a system of its own, kill and harm its processes at random, and check every promise in the end"
+            ),
+        },
+    },
+}
+"""Of each group, its verbs: the module that declares them, and the first sentence of each one's help."""
+
+
+class Verb(TyperCommand):
+    """A verb."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        _convert_no_more_than_needed(self, ctx)
+        return super().parse_args(ctx, args)
+
+
+class _Verbs(TyperGroup):
+    """The verbs, in groups. An option before the verb is an error that says where options stand."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for name, says in (each for modules in VERBS.values() for verbs in modules.values() for each in verbs.items()):
+            self.add_command(TyperCommand(name, help=says))  # for lists alone
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        for group, modules in VERBS.items():
+            with formatter.section(group):
+                formatter.write_dl([each for verbs in modules.values() for each in verbs.items()])
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        _convert_no_more_than_needed(self, ctx)
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if type(error).__name__ != "NoSuchOption":  # click's, of which newer versions of typer have a copy
+                raise
+            order = "a command's options stand after it: rr-actors ps --state DIR"
+            raise UsageError(f"{cast('Any', error).message}; {order}") from error
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, listed, rest = super().resolve_command(ctx, args)
+        return name, listed and whole(listed.name or ""), rest
+
+
+def whole(name: str) -> Verb:
+    """Return a verb with its arguments and options; import its module for that."""
+    (module,) = (module for modules in VERBS.values() for module, verbs in modules.items() if name in verbs)
+    with needing("the command line", "cli"), left_alone():
+        declared = module().app
+    for info in declared.registered_commands:
+        if (info.name or typer.main.get_command_name(info.callback.__name__)) == name:
+            info.cls = Verb
+            found = typer.main.get_command_from_info(info, pretty_exceptions_short=False, rich_markup_mode=None)
+            return cast("Verb", found)
+    raise KeyError(name)
+
+
+_PLAIN: dict[Any, Callable[[str], object]] = {str: str, str | None: str, Path: Path, Path | None: Path}
+
+
+def _convert_no_more_than_needed(command: Any, ctx: Any) -> None:
+    """Have typer convert no default, which has its type already, no text, no path, and nothing for a completion.
+
+    Newer versions of typer import pydantic for the first value that they convert, which takes as long as all libraries
+    that a verb needs.
+    """
+    types = get_type_hints(command.callback)
+    for param in command.get_params(ctx):
+        param.process_value = functools.partial(_process, param, _PLAIN.get(types.get(param.name)))
+
+
+def _process(param: Any, plain: Callable[[str], object] | None, ctx: Any, value: Any) -> Any:
+    if ctx.resilient_parsing or (ctx.get_parameter_source(param.name).name == "DEFAULT" and not param.required):
+        return () if value is None and (param.multiple or param.nargs == -1) else value
+    if plain is not None and isinstance(value, str):
+        return plain(value)
+    return cast("Any", type(param)).process_value(param, ctx, value)
+
+
+app = typer.Typer(
+    name="rr-actors", cls=_Verbs, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
+)
+
+
+def _version_wanted(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_version_wanted, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """See and drive a running system of rr_actors; look into the state of one that has ended; run one from files.
+
+    A command finds its system by --state DIR (after the command), by RR_STATE, or takes the one that runs.
+
+    Exit codes: 0 done; 1 the answer is no; 2 the call was wrong, or names something that does not exist; 3 no running
+    system was reached; 4 the system tried, and could not do it.
+    """
