@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import msgspec
@@ -19,6 +19,7 @@ from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Presence
 
 T = TypeVar("T")
+_Asked = TypeVar("_Asked")
 
 _ASKED_AT_ONCE = 16
 
@@ -96,9 +97,7 @@ def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
 
 
 def ask_registrars(node: Node, ask: Callable[[Registrar], T]) -> dict[str, T | RrError]:
-    """Ask every registrar that is up, several at a time, and return the answers by name; of one that fails, its error.
-
-    A process that has stopped holds up nobody but itself: else a snapshot would wait for one after another.
+    """Ask every registrar that is up, as ask_each() does, and return the answers by name; of one that fails, its error.
 
     Args:
         node: the node of any process of the system.
@@ -112,8 +111,18 @@ def ask_registrars(node: Node, ask: Callable[[Registrar], T]) -> dict[str, T | R
             return error
 
     up = [name for name, status in node.statuses().items() if status is Presence.UP]
+    return dict(zip(up, ask_each(up, answer), strict=True))
+
+
+def ask_each(asked: Sequence[_Asked], ask: Callable[[_Asked], T]) -> list[T]:
+    """Call `ask` with each of them, several at a time, and return the results in the order of `asked`.
+
+    One that waits for a process that has stopped holds up only itself.
+    """
+    if len(asked) < 2:
+        return [ask(one) for one in asked]
     with concurrent.futures.ThreadPoolExecutor(_ASKED_AT_ONCE, thread_name_prefix="rr-actors-snapshot") as threads:
-        return dict(zip(up, threads.map(answer, up), strict=True))
+        return list(threads.map(ask, asked))
 
 
 def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:

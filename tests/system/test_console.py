@@ -35,7 +35,7 @@ from rr_actors.system.console.console_commands import (
 from rr_actors.system.console.console_messages import Entries, Events, Follow, Letters, Missed, Resources
 from rr_actors.system.console.console_questions import Find, ListDeadLetters, ListHistory, ListResources
 from rr_actors.system.console.running_systems import running_systems
-from support import Calls, Gate, Served, Workshop, eventually, lives, serve, wait_gone
+from support import Calls, Gate, Served, Workshop, eventually, hang, lives, pid_of, serve, wait_gone
 from support_inside import console_of, node_of
 from support_managers import Order, Shop
 
@@ -255,6 +255,47 @@ def test_a_page_has_the_rows_that_are_visible_and_how_many_there_are(
     assert [row.request for row in one.rows] == ['"item 123"']
     assert len(console.resources().rows) == 701  # by two pages
     assert len(console.queries("app", "item 12").rows) == 10
+
+
+def test_a_page_over_several_registrars_has_their_rows_in_order_wherever_it_begins_and_ends(
+    system: rr.System, app: rr.Registrar, console: ConsoleClient
+) -> None:
+    for name, count in (("a", 3), ("b", 0), ("c", 4)):
+        serve(system.open_registrar(name), "thing")
+        app.load_all([(f"{name}/thing", number) for number in range(count)])
+    names = [(row.server, row.request) for row in console.resources().rows]
+    assert names == [("a/thing", str(n)) for n in range(3)] + [("c/thing", str(n)) for n in range(4)]
+
+    for offset in range(9):
+        for limit in range(1, 9):
+            page = console.ask(ListResources(offset=offset, limit=limit))
+            found = [(row.server, row.request) for row in page.rows]
+            assert (page.total, found) == (7, names[offset : offset + limit]), (offset, limit)
+
+
+@pytest.mark.slow
+def test_a_list_waits_once_for_all_managers_that_do_not_answer(
+    start: Start, workshop: Workshop, state_dir: Path
+) -> None:
+    names = [f"shop{number}" for number in range(5)]
+    system = start(*(rr.ChildSpec(Shop, id=name, args=(str(workshop.root),)) for name in names))
+    system.open_registrar("app").load("shop0/thing", Order("a"))
+    pids = [pid_of(system, name) for name in names[1:]]
+    with ConsoleClient(find_console(state_dir)) as console:
+        for pid in pids:
+            hang(pid)
+        begun = time.monotonic()
+        registrars = {row.name: row for row in console.registrars().rows}
+        between = time.monotonic()
+        resources = console.resources()
+        ended = time.monotonic()
+        for pid in pids:
+            os.kill(pid, signal.SIGCONT)
+    assert registrars["shop0"].counts["resources"] == 1
+    assert all("within 5 s" in registrars[name].error for name in names[1:])
+    assert [row.server for row in resources.rows] == ["shop0/thing"]
+    assert len(resources.notes) == 4
+    assert max(between - begun, ended - between) < 10.0  # each of the four would wait for 5 s after the one before
 
 
 def test_a_search_finds_what_a_request_says_and_not_the_bytes_around_it(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import TypeVar
 
 import msgspec
 
-from rr_actors.base.errors import NotSerializable, RrError
+from rr_actors.base.errors import NotSerializable
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_view import Caller, Verb, View, room_for
+from rr_actors.system.snapshots import ask_each
 
 _A = TypeVar("_A")
 
@@ -35,7 +35,7 @@ class ListRegistrars(Listing[c.Registrars], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> c.Registrars:
         names = [name for name in view.node.statuses() if self.match in name]
         wanted = names[self.offset : self.offset + self.limit]
-        return c.Registrars(len(names), [view.described(name) for name in wanted])
+        return c.Registrars(len(names), ask_each(wanted, view.described))
 
 
 class ListResources(Listing[c.Resources], frozen=True):
@@ -67,9 +67,9 @@ class ListLoads(Listing[c.Loads], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> c.Loads:
         found, notes = view.page("loads", self.registrar, self.match, self.offset, self.limit)
         said = found.said
-        for provider in {row.server.partition("/")[0] for row in found.queries if self.registrar}:
-            with contextlib.suppress(RrError):  # it is gone, and its load as well
-                said |= view.page("loads", provider, "")[0].said
+        providers = dict.fromkeys(row.server.partition("/")[0] for row in found.queries if self.registrar)
+        for reported in ask_each(list(providers), view.load_reports):
+            said |= reported
         rows = [msgspec.structs.replace(row, said=said.get(row.id, "")) for row in found.queries]
         return c.Loads(found.total, rows, found.loads[: c.SERVERS_LIMIT], notes)
 

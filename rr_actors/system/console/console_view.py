@@ -29,8 +29,8 @@ from rr_actors.base.names import child_meant, no_child
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.pages import LoadRow, Page, QueryRow, ResourceRow, ServerRow, Wanted, What
-from rr_actors.registrar.registrar import Registrar, page
+from rr_actors.registrar.pages import Page, ResourceRow, Wanted, What
+from rr_actors.registrar.registrar import Registrar, Usages, page
 from rr_actors.runtime.processes.lifeline import stopped
 from rr_actors.supervision.event_history import Record, TreeLog, records_of
 from rr_actors.supervision.supervisor import SupervisorRef
@@ -38,7 +38,7 @@ from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import ClientRegistrars
 from rr_actors.system.recording.figures import Figure
 from rr_actors.system.registrar_lookup import open_registrar, registrar_in
-from rr_actors.system.snapshots import describe_supervisor
+from rr_actors.system.snapshots import ask_each, describe_supervisor
 from rr_actors.wire.name_service import Presence
 
 _LOOK_S = 5.0
@@ -219,27 +219,39 @@ class View:
             return c.RegistrarRow(name, status.value, error=readable(text_of(error)))
 
     def page(self, what: What, registrar: str, match: str, offset: int = 0, limit: int = 0) -> tuple[Page, list[str]]:
-        """Return a page over several registrars, and notes on registrars that do not answer."""
-        total, resources, queries, notes, response = 0, list[ResourceRow](), list[QueryRow](), list[str](), ""
-        said = dict[str, str]()
-        servers, loads, streams = list[ServerRow](), list[LoadRow](), list[StreamRow]()
-        for name in self.up(registrar):
-            left = limit - len(resources) - len(queries) - len(streams)
-            wanted = Wanted(what, match, max(0, offset - total), left)
+        """Return a page over several registrars, and notes on registrars that do not answer.
+
+        All are asked at once how many rows they have, and then those with rows in the page for these.
+        """
+        names = self.up(registrar)
+        if len(names) == 1:
+            pages, notes = self._pages({names[0]: Wanted(what, match, offset, limit)})
+        else:
+            pages, notes = self._pages(dict.fromkeys(names, Wanted(what, match, limit=0)))
+            rows, more = self._pages(_parts(pages, Wanted(what, match, offset, limit)))
+            pages, notes = pages | rows, notes + more
+        return _joined(list(pages.values())), notes
+
+    def _pages(self, wanted: Mapping[str, Wanted]) -> tuple[dict[str, Page], list[str]]:
+        """Return a page of each registrar that answers, in the order of `wanted`, and notes on the others."""
+
+        def ask(name: str) -> Page | RrError:
             try:
-                found = page(self.registrar(name), wanted)
+                return page(self.registrar(name), wanted[name])
             except RrError as error:
-                notes.append(readable(text_of(error)))
-            else:
-                total += found.total
-                resources += found.resources
-                queries += found.queries
-                servers += found.servers
-                loads += found.loads
-                streams += found.streams
-                said |= found.said
-                response = response or found.response
-        return Page(total, resources, queries, servers, loads, streams, response, said), notes
+                return error
+
+        names = list(wanted)
+        answers = list(zip(names, ask_each(names, ask), strict=True))
+        pages = {name: answer for name, answer in answers if not isinstance(answer, RrError)}
+        return pages, [readable(text_of(answer)) for _, answer in answers if isinstance(answer, RrError)]
+
+    def load_reports(self, registrar: str) -> dict[str, str]:
+        """Return the last reports of a registrar's load callbacks, by the queries that wait; none if it is gone."""
+        try:
+            return self.page("loads", registrar, "")[0].said
+        except RrError:
+            return {}
 
     def usages(
         self, resources: Sequence[tuple[str, str]], notes: list[str]
@@ -248,12 +260,17 @@ class View:
 
         Add notes on registrars that do not answer. A registrar has _USAGE_S for all its callbacks.
         """
-        usages, failures = dict[str, dict[str, float]](), dict[str, str]()
-        for name in dict.fromkeys(name for name, _ in resources):
+
+        def ask(name: str) -> Usages | RrError:
             try:
-                found = self.registrar(name).usage(of=[id for one, id in resources if one == name], timeout_s=_USAGE_S)
+                return self.registrar(name).usage(of=[id for one, id in resources if one == name], timeout_s=_USAGE_S)
             except RrError as error:
-                notes.append(readable(text_of(error)))
+                return error
+
+        usages, failures = dict[str, dict[str, float]](), dict[str, str]()
+        for found in ask_each(list(dict.fromkeys(name for name, _ in resources)), ask):
+            if isinstance(found, RrError):
+                notes.append(readable(text_of(found)))
             else:
                 usages |= found
                 failures |= found.failures
@@ -283,8 +300,34 @@ class View:
         """Return the resource of this name at its holders: they have 60 in a request that its server reads as 60.0."""
         queries = self.page("queries", "", part, limit=c.PAGE_LIMIT)[0].queries
         named = [row for row in queries if name in (row.name, f"{row.server} {row.request}")]
-        found = [self.page("id", row.server.partition("/")[0], row.id)[0].resources for row in named[:_ALIKE]]
+        found = ask_each(named[:_ALIKE], lambda row: self.page("id", row.server.partition("/")[0], row.id)[0].resources)
         return list({row.id: row for rows in found for row in rows}.values())
+
+
+def _parts(pages: Mapping[str, Page], wanted: Wanted) -> dict[str, Wanted]:
+    """Return which rows of a page each registrar has, given how many rows it has in all."""
+    parts, before = dict[str, Wanted](), 0
+    for name, found in pages.items():
+        begin = max(wanted.offset, before)
+        end = min(wanted.offset + wanted.limit, before + found.total)
+        if begin < end:
+            parts[name] = msgspec.structs.replace(wanted, offset=begin - before, limit=end - begin)
+        before += found.total
+    return parts
+
+
+def _joined(pages: Sequence[Page]) -> Page:
+    """Return the rows of several registrars as one page."""
+    return Page(
+        sum(found.total for found in pages),
+        [row for found in pages for row in found.resources],
+        [row for found in pages for row in found.queries],
+        [row for found in pages for row in found.servers],
+        [row for found in pages for row in found.loads],
+        [row for found in pages for row in found.streams],
+        next((found.response for found in pages if found.response), ""),
+        {id: text for found in pages for id, text in found.said.items()},
+    )
 
 
 def _last_seen(records: list[Record], root: str, why: str) -> Iterator[c.ChildRow]:
