@@ -153,7 +153,7 @@ def _prepare(directory: Path) -> Feed:
     """Byte 0: how many segments are folded, and whether the catalog is opened, too; the rest: what is done to them."""
     place = directory / "registrar"
     path = place / "catalog.sqlite3"
-    open_store(path).close()
+    open_store(path, durability="power").close()  # has its file from the first opening on
     empty = path.read_bytes()
     folder = Folder.at(place)
     meta, _ = read_catalog(folder, path)

@@ -341,7 +341,9 @@ def catalog_path(state_dir: Path, registrar: str) -> Path:
 
 
 def read_catalog(path: Path, table: str) -> list[dict[str, Any]]:
-    """All rows of a table, as a person with the sqlite3 tool would read them."""
+    """All rows of a table, as a person with the sqlite3 tool would read them; none before the file is made."""
+    if not path.exists():
+        return []
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=5.0)) as connection:
         connection.row_factory = sqlite3.Row
         return [dict(row) for row in connection.execute(f"SELECT * FROM {table}")]

@@ -8,6 +8,7 @@ one that was never written. A clean end removes the progress, because the SQLite
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import io
 import os
@@ -21,19 +22,23 @@ from rr_actors.base.errors import CatalogError, CatalogLocked
 from rr_actors.base.folder import Folder, NotAFile
 from rr_actors.base.reporting.log import Log
 
+_LONGEST = 200  # bytes: more than a lock's file has
+
 _log = Log(__name__)
 
 
 class Reached(msgspec.Struct, frozen=True, gc=False):
     """A catalog's progress: its id, how often it was opened, and the last segment of its journal that is begun.
 
-    `in_tables`: the catalog has no journal, and the number is that of the last commit in the tables.
+    `in_tables`: the catalog has no journal, and the number is that of the last commit in the tables. `is_made`: whether
+    it has its SQLite file; one that has committed nothing has none, nor one whose commits are all in its journal.
     """
 
     id: str
     epoch: int
     number: int
     in_tables: bool = False
+    is_made: bool = True
 
 
 class CatalogLock:
@@ -61,10 +66,14 @@ class CatalogLock:
         self.reached = _read(self._file)[1]
         self._write(os.getpid())
 
-    def note(self, reached: Reached | None) -> None:
-        """Note the catalog's progress in the lock's file; None removes the note."""
+    def note(self, reached: Reached | None, *, needed: bool = False) -> None:
+        """Note the catalog's progress in the lock's file; None removes the note.
+
+        Raises:
+            OSError: the note is needed, as nothing else has it, and cannot be written.
+        """
         self.reached = reached
-        self._write(os.getpid())
+        self._write(os.getpid(), needed=needed)
 
     def release(self, *, remove: bool = False) -> None:
         """Release the lock, and with `remove` remove its file; the lock is released even if that raises an OSError."""
@@ -136,32 +145,38 @@ class CatalogLock:
                 pid=pid,
             ) from error
         self._file, self._size = file, os.fstat(file.fileno()).st_size
+        self._noted = os.pread(file.fileno(), _LONGEST, 0)
 
-    def _write(self, pid: int | None) -> None:
+    def _write(self, pid: int | None, *, needed: bool = False) -> None:
         """Write pid and progress in one call, with a fixed length: a killed process leaves the old text or the new."""
         reached = self.reached
         if reached is None:
             text = "" if pid is None else str(pid)
         else:
-            kind = "tables" if reached.in_tables else "journal"
+            kind = "tables" if reached.in_tables else "journal" if reached.is_made else "new"
             noted = f"{reached.id} {reached.epoch} {kind} {reached.number:020}"
             text = f"{'' if pid is None else pid}\n{noted} {zlib.crc32(noted.encode()):08x}\n"
-        with contextlib.suppress(OSError):  # a full disk: the commits are elsewhere, and safe
-            os.pwrite(self._file.fileno(), text.encode(), 0)
-            if len(text) < self._size:
-                os.ftruncate(self._file.fileno(), len(text))
-            self._size = len(text)
+        with contextlib.nullcontext() if needed else contextlib.suppress(OSError):  # commits are elsewhere, and safe
+            fd, data = self._file.fileno(), text.encode()
+            written = os.pwrite(fd, data, 0)
+            if written < len(data):  # a full disk: what was noted before is good
+                os.pwrite(fd, self._noted[:written], 0)
+                os.ftruncate(fd, self._size)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if len(data) < self._size:
+                os.ftruncate(fd, len(data))
+            self._noted, self._size = data, len(data)
 
 
 def _read(file: io.FileIO) -> tuple[int | None, Reached | None]:
     """Return the holder's pid and the noted progress; None for one that is missing or damaged."""
-    first, _, second = os.pread(file.fileno(), 200, 0).decode(errors="replace").partition("\n")
+    first, _, second = os.pread(file.fileno(), _LONGEST, 0).decode(errors="replace").partition("\n")
     pid = int(first) if first.isascii() and first.isdigit() else None
     noted, _, checksum = second.rstrip("\n").rpartition(" ")
     if f"{zlib.crc32(noted.encode()):08x}" != checksum or not noted:
         return pid, None
     id_, epoch, kind, number = noted.split(" ")
-    return pid, Reached(id_, int(epoch), int(number), in_tables=kind == "tables")
+    return pid, Reached(id_, int(epoch), int(number), in_tables=kind == "tables", is_made=kind != "new")
 
 
 _locks: weakref.WeakSet[CatalogLock] = weakref.WeakSet()  # weak: an interrupted caller may never get its lock

@@ -14,7 +14,7 @@ import struct
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,8 @@ from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Dr
 from rr_actors.storage import checked_records
 from rr_actors.storage.checked_records import Damage
 from rr_actors.storage.sql_tables import Meta, net_of
-from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
+from rr_actors.storage.sqlite_store import SqliteStore, segments_among
+from rr_actors.storage.witness import segment_prefix
 
 _AT_MOST = 1_000_000  # changes in the journal: those of many seconds. The folding has failed all the time, or hangs
 
@@ -126,7 +127,8 @@ class JournaledStore:
         """Close the store as the contract says. The next opening folds the changes that cannot be folded now."""
         with self._tidying:
             try:
-                self._fold()
+                if self._tables.is_made or not erase:
+                    self._fold()
             except CatalogError as error:
                 if not erase:
                     _log.warning("%s", error)
@@ -146,14 +148,20 @@ class JournaledStore:
         full = self._full  # a folding that ends now replaces the list: so the meta row comes next
         meta = self._tables.meta
         number = (full[-1].number if full else meta.folded) + 1
-        segment = Segment(self._tables.folder, self.path, meta, number, self._end)
+        begins = number == 1 and not self._tables.is_made
+        segment = Segment(self._tables.folder, self.path, meta, number, self._end, begins=begins)
         self._tables.note(number)
+        if begins:
+            self._tables.note_outside()
         return segment
 
     def _fold(self) -> None:
+        was_made = self._tables.is_made
         changes: list[Change] = []
         try:
             with self._lock:
+                if not was_made and not self._full and not any(net_of(self._pending).puts.values()):
+                    self._begin_again()
                 segment = self._segment
                 if segment is not None and segment.end.records:
                     self._end = segment.end
@@ -167,8 +175,19 @@ class JournaledStore:
             with self._lock:
                 self._pending = changes + self._pending
             raise
+        if not was_made and self._tables.is_made:
+            with self._lock:  # from now on a catalog without its file is a damaged one
+                self._tables.note(self._full[-1].number if self._segment is None else self._segment.number)
         full, self._full = self._full, []
         for segment in full:
+            segment.remove()
+
+    def _begin_again(self) -> None:
+        """Forget all commits of a catalog without a file, which have come to nothing. With the lock."""
+        segment, self._segment, self._pending = self._segment, None, []
+        if segment is not None:
+            self._tables.forget_outside()  # first: a crash leaves no record of what is not there
+            self._tables.note(0)
             segment.remove()
 
 
@@ -184,6 +203,7 @@ class JournaledStore:
 # from an unfinished one, which belongs to a commit that was never acknowledged.
 
 _MAGIC = b"RRACJ\0\0\2"
+_FIRST = b"RRACF\0\0\2"  # of segment 1 of a catalog whose SQLite file is made later: with it all is in the journal
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
 _CHECKSUM = struct.Struct("<I")
 _UINT64 = b"\xcf"  # msgpack's first byte of an integer of eight bytes; a search for it alone is quicker
@@ -210,17 +230,23 @@ class Segment:
         meta: the catalog's meta row.
         number: the segment's number. A file of that name is from a failed attempt, and is written over.
         before: the end of the segment before; any value if that is folded.
+        begins: whether the catalog has no SQLite file before this segment is folded.
 
     Raises:
         OSError: the segment cannot be made; at most an empty file is left.
     """
 
-    def __init__(self, folder: Folder, catalog: Path, meta: Meta, number: int, before: End) -> None:
+    def __init__(
+        self, folder: Folder, catalog: Path, meta: Meta, number: int, before: End, *, begins: bool = False
+    ) -> None:
         self.number = number
         self.name = f"{segment_prefix(catalog)}{number}"
         self._folder = folder
         place = (meta.id.encode(), meta.epoch, number)
-        header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
+        if begins:
+            before = End(0, _checksum_of(meta.registrar))
+        magic = _FIRST if begins else _MAGIC
+        header = _HEADER.pack(magic, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
         self._records = 0
         self._file = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
@@ -271,6 +297,23 @@ class Found(msgspec.Struct, frozen=True):
     def last(self) -> int:
         """The highest number of a segment; 0 without segments."""
         return max(self.contents, default=0)
+
+    def first(self, registrars: Collection[str]) -> Meta | None:
+        """Return the meta row of a catalog without an SQLite file, all of which is in its journal; None for another.
+
+        Args:
+            registrars: the names that its registrar can have; none: any.
+
+        Raises:
+            Damage: it is that of another registrar.
+        """
+        data = self.contents.get(1)
+        if data is None or not data.startswith(_FIRST):
+            return None
+        _, id, epoch, _, _, checksum, _ = _HEADER.unpack_from(data)
+        if registrars and checksum not in map(_checksum_of, ("", *registrars)):
+            raise Damage("a journal that another registrar has begun")
+        return Meta(id.rstrip(b"\0").decode(), epoch, 0)
 
     def epoch_after(self, folded: int) -> int:
         """Return the last opening that wrote a segment after segment `folded`; 0 if there is none."""
@@ -346,6 +389,10 @@ def read(folder: Folder, catalog: Path) -> Found:
     return found
 
 
+def _checksum_of(registrar: str) -> int:
+    return zlib.crc32(registrar.encode())
+
+
 def _check_lengths(changes: Sequence[Change]) -> None:
     for change in changes:
         if isinstance(change, Put) and (size := len(_encode(change.row))) > _LONGEST:
@@ -370,9 +417,10 @@ def _numbers(type_: type[Row]) -> Callable[[Row], tuple[int, ...]]:
 def _checked(name: str, number: int, data: bytes) -> bytes | None:
     """Check the header of a segment, and return the segment's bytes; None if the header was not written whole."""
     header = data[: _HEADER.size]
-    if not any(header) or (len(header) < _HEADER.size and _MAGIC.startswith(header[: len(_MAGIC)])):
+    magic = header[: len(_MAGIC)]
+    if not any(header) or (len(header) < _HEADER.size and (_MAGIC.startswith(magic) or _FIRST.startswith(magic))):
         return None
-    if len(header) < _HEADER.size or not header.startswith(_MAGIC):
+    if len(header) < _HEADER.size or magic not in (_MAGIC, _FIRST):
         raise Damage(f"{name}, which is something else than a part of a catalog's journal")
     if _HEADER.unpack(header)[3] != number or zlib.crc32(header[: -_CHECKSUM.size]) != _HEADER.unpack(header)[-1]:
         raise Damage(f"{name}, whose beginning is damaged, or another file's")

@@ -27,7 +27,7 @@ from rr_actors.storage import journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
 from rr_actors.storage.journaled_store import JournaledStore
-from rr_actors.storage.witness import Known, Witness, missing_text
+from rr_actors.storage.witness import Known, Witness, is_missing, missing_text
 
 Durability = Literal["process", "power"]
 
@@ -116,13 +116,21 @@ def _open_in_directory(
         return store
 
 
+def is_there(path: str | os.PathLike[str]) -> bool:
+    """Return whether there is a catalog, also one that has only its lock, or all in its journal; False if unknown."""
+    path = Path(path)
+    return os.path.lexists(path) or os.path.lexists(path.with_suffix(".lock")) or not is_missing(path)
+
+
 def remove_unneeded(path: Path, witness: Witness) -> None:
     """Remove a catalog that nobody has open, with its directory, if it has nothing that would be missed.
 
     Raises:
         CatalogError: as open_store() describes; or the catalog cannot be removed.
     """
-    if not os.path.lexists(path) or is_needed(content_of(read_rows(path))):
+    if not is_there(path) or is_needed(content_of(read_rows(path))):
+        return
+    if is_missing(path) and witness.known() is not None:  # it was removed: the next opening says so
         return
     store = open_store(path, witness=witness)
     needed = True
@@ -231,7 +239,8 @@ def _open_locked(
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
-        meta, content, left = sqlite_store.NONE, content_of(()), _Left()
+        meta, content = sqlite_store.NONE, content_of(())
+        left = _Left(epoch=0 if lock.reached is None else lock.reached.epoch)
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(folder, path).name)
     else:
         if known is not None:
@@ -241,10 +250,14 @@ def _open_locked(
         spent = witness.spent()
     changes: sql_tables.Net | None = sql_tables.net_of(left.changes)
     place = (spent + 1, max(meta.folded, left.last), registrar or meta.registrar)
-    if folder.has(path.name):
+    if meta.id:
+        if not sqlite_store.has_file(folder, path):  # all is in the journal; from here on as after any crash
+            sqlite_store.create(folder, path, durability, sql_tables.Meta(meta.id, meta.epoch, 0, registrar))
         meta = sql_tables.Meta(meta.id, *place)
     else:
-        meta = sqlite_store.create(folder, path, durability, *place)
+        meta = sql_tables.Meta(os.urandom(8).hex(), *place)
+        if durability == "power" or known is not None or left.segments or meta.folded:
+            sqlite_store.create(folder, path, durability, meta)
         if durability != "power":  # with it the first commit is SQLite's, and must not wait for the opening of the file
             changes = None
     store = sqlite_store.SqliteStore(folder, path, lock, durability, meta, changes, content, witness)
@@ -275,16 +288,29 @@ def _read(
         witness: has the name of the catalog's registrar, if that is known.
     """
     found = journaled_store.read(folder, path)  # first: the file then has the segments that are folded meanwhile
+    first, is_new = None, reached is not None and not reached.is_made
+    if not sqlite_store.has_file(folder, path):
+        first = found.first(() if witness is None else (witness.registrar, witness.formerly))
+        is_new = is_new or first is not None
     if not folder.has(path.name):
-        if found.contents and sqlite_store.segments_among(folder.names(), path):  # otherwise it was erased meanwhile
+        left = not is_new and any(found.contents.values())
+        if left and sqlite_store.segments_among(folder.names(), path):  # otherwise it was erased meanwhile
             damaged(path, f"no such file, but {found.segments[0]}, which belongs to it")
-        if reached is not None:
+        if reached is not None and reached.is_made:
             damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
-    meta, content = sqlite_store.read_catalog(folder, path)
+    if is_new and folder.has(path.name) and not sqlite_store.has_file(folder, path):
+        meta, content = sqlite_store.NONE, content_of(())  # a tool has left an empty file in its place
+    else:
+        meta, content = sqlite_store.read_catalog(folder, path)
+    if not meta.id and first is not None:
+        meta = first
     if witness is not None and meta.registrar not in ("", witness.registrar, witness.formerly):
         damaged(path, f"that of the registrar {meta.registrar!r} in the place of that of {witness.registrar!r}")
-    if reached is not None and reached.id != meta.id:
-        _log.warning("%s: another catalog than the one that was open here, and was not closed; that one is lost", path)
+    if reached is not None and reached.id != meta.id and (meta.id or reached.is_made):
+        if reached.is_made or reached.number:  # otherwise that one had nothing
+            _log.warning(
+                "%s: another catalog than the one that was open here, and was not closed; that one is lost", path
+            )
         reached = None
     begun = 0
     if reached is not None and not reached.in_tables:

@@ -9,6 +9,7 @@ opening.py has read and checked an existing catalog before a store is made.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import re
@@ -27,7 +28,7 @@ from rr_actors.registrar.model.rows import Change, Content, content_of
 from rr_actors.storage import checked_records, sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
-from rr_actors.storage.witness import Known, Witness
+from rr_actors.storage.witness import Known, Witness, segment_prefix
 
 APPLICATION_ID = 0x52524143  # "RRAC"
 
@@ -50,14 +51,15 @@ class SqliteStore:
         folder, path: the catalog's directory, which close() closes, and its checked file there.
         lock: the lock, already held; close() releases it.
         durability: "power": each commit waits for the disk.
-        meta, changes: committed at once; an older schema is migrated in the same commit. Without changes the file has
-            this meta row already, and SQLite opens it when it is used first.
+        meta, changes: committed at once; an older schema is migrated in the same commit. Without changes there is no
+            file yet, or it has this meta row already; SQLite makes or opens it when it is used first.
         content: the file's content after that.
         witness: the record of this catalog outside of its directory.
 
     Attributes:
         folder, path: as given.
         meta: the meta row in the file.
+        is_made: whether there is a file.
 
     Raises:
         sqlite3.Error: the changes could not be written; the lock is still held.
@@ -79,8 +81,9 @@ class SqliteStore:
         self.path = path
         self.meta = meta
         self.epoch = meta.epoch
+        self.is_made = has_file(folder, path)
         self._witness = witness
-        self._has_journal = durability != "power"
+        self._durability: Literal["process", "power"] = durability
         self._lock = lock
         self._writing = threading.Lock()
         self._synchronous = "FULL" if durability == "power" else "NORMAL"
@@ -93,9 +96,9 @@ class SqliteStore:
             except BaseException:
                 self._close_file()
                 raise
-        self.note(meta.folded)
-        if witness is not None:
-            witness.note(Known(meta.id, meta.epoch, str(path)), synced=durability == "power")
+        self.note(meta.folded, needed=not self.is_made)  # the opening is counted nowhere else
+        if self.is_made:
+            self.note_outside()
         self._content: Content | None = content  # as read at the opening; None once returned or out of date
         self._wal = files_of(path)[1]  # SQLite fills it again from its beginning: its size is not that of its content
         self._pages = 0  # an estimate of the pages written since the last copy
@@ -106,6 +109,8 @@ class SqliteStore:
         if self._opened is None:
             if self._closed:
                 raise sqlite3.ProgrammingError("the catalog is closed")
+            if not self.is_made:
+                self._make()
             uri = f"{self.path.as_uri()}?mode=rw"  # never an empty file in place of one that was removed
             connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
             self._opened = cursor = connection.cursor()
@@ -122,6 +127,30 @@ class SqliteStore:
     def _connection(self) -> sqlite3.Connection:
         return self._cursor.connection
 
+    def _make(self) -> None:
+        if not has_file(self.folder, self.path):
+            create(self.folder, self.path, self._durability, self.meta)
+        elif not self._is_its_file():  # else an interrupt came just after it was made
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
+        self.is_made = True
+
+    def _is_its_file(self) -> bool:
+        try:
+            return read_catalog(self.folder, self.path)[0].id == self.meta.id
+        except (CatalogError, Damage, sqlite3.Error):
+            return False
+
+    def note_outside(self) -> None:
+        """Record outside of its directory that the catalog has something, so that it is missed if it is removed."""
+        if self._witness is not None:
+            known = Known(self.meta.id, self.epoch, str(self.path))
+            self._witness.note(known, synced=self._durability == "power")
+
+    def forget_outside(self) -> None:
+        """Remove that record, because the catalog has nothing, and no file."""
+        if self._witness is not None:
+            self._witness.forget(self.epoch)
+
     def _close_file(self) -> None:
         cursor, self._opened = self._opened, None
         if cursor is not None:
@@ -133,6 +162,8 @@ class SqliteStore:
         if self._content is not None:
             content, self._content = self._content, None
             return content
+        if not self.is_made:
+            return content_of(())
         with errors_named(self.path):
             return sql_tables.read_all(self._connection)
 
@@ -163,14 +194,16 @@ class SqliteStore:
         meta = msgspec.structs.replace(self.meta, folded=number)
         try:
             self._write(changes, meta)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
             text = f"{self.path}: expected to {expected}, got: {error}; {if_not}"
             raise CatalogError(text, path=str(self.path)) from error
         self.meta = meta
 
-    def note(self, number: int) -> None:
-        """Note in the lock's file that this segment of the journal is begun, or that this commit is in the tables."""
-        self._lock.note(Reached(self.meta.id, self.epoch, number, in_tables=not self._has_journal))
+    def note(self, number: int, *, needed: bool = False) -> None:
+        """Have CatalogLock.note() note that a segment of the journal is begun, or that a commit is in the tables."""
+        in_tables = self._durability == "power"
+        reached = Reached(self.meta.id, self.epoch, number, in_tables=in_tables, is_made=self.is_made)
+        self._lock.note(reached, needed=needed)
 
     def keep_lock(self) -> None:
         """Take the lock again if its file was removed, as CatalogLock.keep() does."""
@@ -246,7 +279,7 @@ class SqliteStore:
                     self._close_file()
                     if erase:
                         self._erase()
-                    elif settled and not self.folder.has(self._wal.name):
+                    elif settled and self.is_made and not self.folder.has(self._wal.name):
                         self._lock.note(None)
                 finally:
                     self._lock.release(remove=erase)
@@ -272,9 +305,10 @@ def files_of(path: Path) -> list[Path]:
     return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
 
 
-def segment_prefix(path: Path) -> str:
-    """Return the prefix of the names of the journal's segments; a number follows it."""
-    return f"{path.stem}.journal."
+def has_file(folder: Folder, path: Path) -> bool:
+    """Return whether the catalog has its SQLite file. A tool that looks before it is made leaves an empty one."""
+    found = folder.look(path.name)
+    return found is not None and found.st_size > 0
 
 
 def segments_among(names: Iterable[str], path: Path) -> list[str]:
@@ -284,30 +318,30 @@ def segments_among(names: Iterable[str], path: Path) -> list[str]:
     return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
-def create(
-    folder: Folder, path: Path, durability: Literal["process", "power"], epoch: int, folded: int, registrar: str
-) -> sql_tables.Meta:
-    """Make an empty catalog under another name and rename it: a crash leaves all of it or nothing.
+def create(folder: Folder, path: Path, durability: Literal["process", "power"], meta: sql_tables.Meta) -> None:
+    """Make a catalog with this meta row alone, under another name, and rename it: a crash leaves all of it or nothing.
 
-    SQLite makes it in memory, and it is written at once. Returns its meta row.
+    SQLite makes it in memory, and it is written at once.
     """
-    meta = sql_tables.Meta(os.urandom(8).hex(), epoch, folded, registrar)
     new = path.with_name(path.name + ".new")
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
-        with contextlib.suppress(FileNotFoundError):  # left by a crash
+        if folder.has(file.name):  # left by a crash
             folder.unlink(file.name)
     with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
         connection.deserialize(_without_meta())
         connection.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
         image = connection.serialize()
     image = image[: _WAL_MODE_AT.start] + _WAL_MODE + image[_WAL_MODE_AT.stop :]
-    with folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
-        checked_records.write_whole(file.fileno(), image, 0)
-        os.fsync(file.fileno())
-    folder.rename(new.name, path.name)
+    try:
+        with folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
+            checked_records.write_whole(file.fileno(), image, 0)
+            os.fsync(file.fileno())
+        folder.rename(new.name, path.name)
+    except BaseException:
+        folder.discard(new.name)
+        raise
     if durability == "power":
         os.fsync(folder.fd)
-    return meta
 
 
 @functools.cache
@@ -375,7 +409,7 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
 
     No process may have the file open.
     """
-    if not meta.id or folder.look(files_of(path)[1].name) is None:  # SQLite would make a file that is not there
+    if folder.look(files_of(path)[1].name) is None or not folder.has(path.name):
         return
     uri = f"{path.as_uri()}?immutable=1"
     with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:

@@ -105,12 +105,22 @@ def tell_of_missing(state_dir: str | os.PathLike[str]) -> list[str]:
         with Folder.at(state_dir) as state, state.inner(_PLACE) as place:
             for name in sorted(place.names()):
                 known = None if name.startswith(".") else _read(place, name)
-                if known is not None and not os.path.exists(known.path):
+                if known is not None and is_missing(Path(known.path)):
                     missing.append(name)
                     _log.warning("%s", missing_text(name, known))
     except OSError as error:
         _log.warning("%s: which catalogs there were cannot be read: %s", state_dir, error)
     return missing
+
+
+def segment_prefix(path: Path) -> str:
+    """Return the prefix of the names of the segments of a catalog's journal; a number follows it."""
+    return f"{path.stem}.journal."
+
+
+def is_missing(path: Path) -> bool:
+    """Return whether a catalog has neither its SQLite file nor the first segment of its journal."""
+    return not (os.path.exists(path) or os.path.exists(path.with_name(f"{segment_prefix(path)}1")))
 
 
 def missing_text(registrar: str, known: Known) -> str:

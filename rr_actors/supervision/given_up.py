@@ -8,7 +8,6 @@ held there. `clear` removes it from the catalog instead, for what no server will
 from __future__ import annotations
 
 import functools
-import os
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from rr_actors.registrar.core.releasing import forgetting, owing
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.model.rows import Change, Content, Held, Notice, Peer, Resource, Row, apply, rows_of
 from rr_actors.registrar.model.store import is_needed
-from rr_actors.storage.opening import open_store
+from rr_actors.storage.opening import is_there, open_store
 from rr_actors.storage.witness import Witness
 from rr_actors.wire.name_service import Presence
 
@@ -43,7 +42,7 @@ async def give_up(node: Node, name: str, *, clear: bool = False, erase: bool = F
         CatalogError: its catalog cannot be opened.
     """
     config, state_dir = node.config.registrar(name), Path(node.info.state_dir)
-    if not await node.dispatcher.workers.run(os.path.exists, config.catalog_path(state_dir)):
+    if not await node.dispatcher.workers.run(is_there, config.catalog_path(state_dir)):
         await node.retire(name)
         return
     await node.dispatcher.workers.run(owe, config, state_dir)

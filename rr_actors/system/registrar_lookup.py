@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import os
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -35,8 +34,8 @@ from rr_actors.registrar.model.rows import (
 )
 from rr_actors.registrar.registrar import Registrar, registrar_of
 from rr_actors.registrar.remote_registrar import RegistrarHandle
-from rr_actors.storage.opening import move_catalog, read_rows, remove_unneeded
-from rr_actors.storage.witness import Witness, tell_of_missing
+from rr_actors.storage.opening import is_there, move_catalog, read_rows, remove_unneeded
+from rr_actors.storage.witness import Known, Witness, tell_of_missing
 from rr_actors.supervision.given_up import change, contents, give_up
 from rr_actors.wire.name_service import Presence
 
@@ -137,9 +136,9 @@ def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> 
 def _catalogs(config: SystemConfig, state_dir: Path) -> dict[str, Path]:
     """Return the catalogs on disk, by the names of their registrars, which are sorted."""
     placed = {name: config.registrar(name).catalog_path(state_dir) for name in config.registrars}
-    others = set(state_dir.glob(f"*/{CATALOG_FILE}")) - {*placed.values()}
+    others = {place / CATALOG_FILE for place in state_dir.iterdir()} - {*placed.values()}
     found = sorted(({catalog.parent.name: catalog for catalog in others} | placed).items())
-    return {name: catalog for name, catalog in found if os.path.exists(catalog)}  # not if it cannot be looked at
+    return {name: catalog for name, catalog in found if is_there(catalog)}
 
 
 def take_over(config: SystemConfig, state_dir: Path, renamed: Mapping[str, str]) -> None:
@@ -170,13 +169,15 @@ def take_over(config: SystemConfig, state_dir: Path, renamed: Mapping[str, str])
 def _take_over(config: SystemConfig, state_dir: Path, name: str, old: str) -> None:
     before, after = (config.registrar(one).catalog_path(state_dir) for one in (old, name))
     theirs = Witness(state_dir, old)
-    if theirs.known() is None and not os.path.lexists(before):
-        return
-    if before.parent != after.parent and os.path.lexists(before):
+    if theirs.known() is None:
+        if not is_there(before):
+            return
+        theirs.note(Known("", 0, str(before)))  # without a file it has none, and the next start goes on by that
+    if before.parent != after.parent and is_there(before):
         remove_unneeded(after, Witness(state_dir, name))
         move_catalog(before, after)
     changes = functools.partial(_in_the_name_of, name, old)
-    if os.path.lexists(after):
+    if is_there(after):
         change(config.registrar(name), state_dir, changes, formerly=old)
     for peer, catalog in _catalogs(config, state_dir).items():
         if peer not in (name, old):
@@ -215,7 +216,7 @@ def _in_the_name_of(name: str, old: str, content: Content, _epoch: int) -> list[
 
 def _has_something(catalog: Path, origin: str) -> bool:
     """Return whether a provider's catalog has a query of `origin`, or a notice for it."""
-    rows = read_rows(catalog) if os.path.exists(catalog) else ()
+    rows = read_rows(catalog) if is_there(catalog) else ()
     return any(isinstance(row, ServedQuery | Notice) and row.origin == origin for row in rows)
 
 

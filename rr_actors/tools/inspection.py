@@ -32,7 +32,7 @@ from rr_actors.registrar.model.rows import (
     content_of,
     is_own,
 )
-from rr_actors.storage.opening import read_rows
+from rr_actors.storage.opening import is_there, read_rows
 
 _SECOND_LOOK_S = 0.5
 
@@ -120,7 +120,8 @@ def _catalogs(root: Path) -> list[Path]:
         try:
             path.stat()
         except (FileNotFoundError, NotADirectoryError):
-            continue
+            if not is_there(path):
+                continue
         except OSError:
             pass
         found.append(path)

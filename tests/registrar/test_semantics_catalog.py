@@ -15,7 +15,7 @@ import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import ServedQuery
 from rr_actors.storage.journaled_store import JournaledStore
-from rr_actors.storage.opening import read_rows
+from rr_actors.storage.opening import open_store, read_rows
 from support import Calls, Workshop, catalog_path, eventually, read_catalog, serve
 from support_managers import Order, Shop
 
@@ -38,9 +38,13 @@ def test_the_catalog_is_one_sqlite_file_per_registrar_in_wal_mode_with_a_schema_
     app: rr.Registrar, provider: rr.Registrar, state_dir: Path
 ) -> None:
     serve(provider, "thing")
+    for registrar in (app, provider):
+        path = catalog_path(state_dir, registrar.name)
+        assert [file.name for file in path.parent.iterdir()] == ["catalog.lock"], "it holds nothing yet"
     app.load("provider/thing", "x")
-    for name in ("app", "provider"):
-        path = catalog_path(state_dir, name)
+    for registrar in (app, provider):
+        registrar.save_catalog()
+        path = catalog_path(state_dir, registrar.name)
         assert path.is_file()
         assert pragma(path, "journal_mode") == "wal"
         assert pragma(path, "user_version") >= 1
@@ -157,12 +161,12 @@ def test_without_save_on_modify_changes_are_written_at_stop(
 def test_erase_on_destruct_removes_the_catalog_at_close(system: rr.System, state_dir: Path) -> None:
     path = catalog_path(state_dir, "passing")
     passing = system.open_registrar("passing", rr.RegistrarConfig(name="passing", erase_on_destruct=True))
-    assert path.exists()
+    assert path.parent.exists()
     passing.close()
-    assert not path.exists()
+    assert not path.parent.exists()
     kept = system.open_registrar("kept")
     kept.close()
-    assert catalog_path(state_dir, "kept").exists()
+    assert catalog_path(state_dir, "kept").parent.exists()
 
 
 def test_erase_on_destruct_leaves_a_catalog_whose_releases_a_provider_that_is_down_has_to_hear_of(
@@ -217,6 +221,7 @@ def test_location_puts_the_catalog_elsewhere(
     provider = system.open_registrar("provider", rr.RegistrarConfig(name="provider", location=elsewhere))
     serve(provider, "thing")
     app.load("provider/thing", "x")
+    provider.save_catalog()
     files = [path for path in (elsewhere, *elsewhere.rglob("*")) if path.is_file() and path.suffix != ".lock"]
     assert any(file.read_bytes()[:15] == b"SQLite format 3" for file in files)
     assert not catalog_path(state_dir, "provider").exists()
@@ -346,8 +351,8 @@ def test_on_damage_aside_renames_the_file_and_starts_empty(
 
 
 def test_a_newer_catalog_is_refused_and_left_as_it_is(system: rr.System, state_dir: Path) -> None:
-    system.open_registrar("modern").close()
     path = catalog_path(state_dir, "modern")
+    open_store(path, durability="power").close()
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA user_version = 999")
         connection.commit()

@@ -70,6 +70,13 @@ def left_by(place: Path, durability: Durability, *, folded: int = 40, more: int 
     return place / "left" / "app" / "catalog.sqlite3"
 
 
+def fill(path: Path) -> None:
+    """Have a catalog made with a row."""
+    store = opened(path, "process")
+    store.commit([Put(Peer("hub"))])
+    store.close()
+
+
 def opened(path: Path, durability: Durability) -> Store:
     return open_store(path, durability=durability, witness=Witness(path.parent.parent, path.parent.name))
 
@@ -149,8 +156,7 @@ def test_commits_that_vanish_with_the_newest_segment_are_told_of(
 def test_a_directory_that_is_removed_is_told_of_at_the_start_and_when_it_is_opened(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with rr.System(state_dir=tmp_path / "state") as system:
-        system.open_registrar("app")
+    fill(tmp_path / "state" / "app" / "catalog.sqlite3")
     shutil.rmtree(tmp_path / "state" / "app")
     with rr.System(state_dir=tmp_path / "state") as system:
         assert f"app: expected its catalog {tmp_path}/state/app/catalog.sqlite3" in caplog.text
@@ -163,10 +169,34 @@ def test_a_directory_that_is_removed_is_told_of_at_the_start_and_when_it_is_open
     assert warnings_in(caplog) == []
 
 
+def test_a_catalog_that_is_all_in_its_journal_is_missed_and_one_that_has_come_to_nothing_is_not(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    state = tmp_path / "state"
+    path = state / "app" / "catalog.sqlite3"
+    store = opened(path, "process")
+    store.commit(committed(1))
+    store.commit([Drop("queries", "q001")])
+    store.tidy()
+    assert Witness(state, "app").known() is None
+    store.commit(committed(2))
+    shutil.copytree(state, tmp_path / "killed")
+    store.close()
+    shutil.rmtree(state)
+    (tmp_path / "killed").rename(state)
+    assert tell_of_missing(state) == warnings_in(caplog) == []
+    shutil.rmtree(path.parent)
+    assert tell_of_missing(state) == ["app"]
+    caplog.clear()
+    store = opened(path, "process")
+    assert store.epoch == 2
+    store.close()
+    assert f"app: expected its catalog {path} (opened 1 times), got none" in caplog.text
+
+
 def test_directories_that_are_swapped_are_refused_by_name(tmp_path: Path) -> None:
-    with rr.System(state_dir=tmp_path) as system:
-        system.open_registrar("one")
-        system.open_registrar("two")
+    for name in ("one", "two"):
+        fill(tmp_path / name / "catalog.sqlite3")
     (tmp_path / "one").rename(tmp_path / "three")
     (tmp_path / "two").rename(tmp_path / "one")
     with (
@@ -188,7 +218,7 @@ def test_an_older_copy_is_told_from_the_one_that_was_opened_last_and_its_epoch_i
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "app" / "catalog.sqlite3"
-    opened(path, "process").close()
+    fill(path)
     shutil.copytree(path.parent, tmp_path / "copy")
     for _ in range(3):
         opened(path, "process").close()
@@ -341,7 +371,7 @@ def test_the_epochs_of_a_catalog_that_is_lost_are_not_used_again(
 ) -> None:
     path, witness = tmp_path / "app" / "catalog.sqlite3", Witness(tmp_path, "app")
     for _ in range(3):
-        open_store(path, witness=witness).close()
+        fill(path)
     spoil(path.parent)
     store = open_store(path, witness=witness, on_damage="aside")
     assert store.epoch == 4

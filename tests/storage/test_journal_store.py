@@ -24,7 +24,7 @@ from typing import Any
 import pytest
 
 from rr_actors.base.config import RegistrarConfig
-from rr_actors.base.errors import CatalogDamaged, CatalogError
+from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked
 from rr_actors.base.folder import Folder
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model.catalog import Catalog, Decision
@@ -36,6 +36,7 @@ from rr_actors.storage.catalog_lock import CatalogLock
 from rr_actors.storage.journaled_store import JournaledStore, Segment
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import SqliteStore
+from rr_actors.storage.witness import Witness
 from rr_actors.supervision.given_up import forget
 from support import REPOSITORY
 from support_interrupts import interrupted
@@ -50,6 +51,13 @@ def path(tmp_path: Path) -> Path:
 def journaled(path: Path) -> JournaledStore:
     store = open_store(path)
     assert isinstance(store, JournaledStore)
+    return store
+
+
+def made(path: Path) -> JournaledStore:
+    """A store of an empty catalog whose SQLite file is made."""
+    store = journaled(path)
+    open_tables(store)
     return store
 
 
@@ -118,9 +126,9 @@ def in_parts(store: JournaledStore, *commits: Sequence[Change]) -> None:
 
 def test_a_commit_is_in_the_journal_at_once_and_in_the_sqlite_file_when_it_is_tidied(path: Path) -> None:
     store = journaled(path)
-    assert (segments(path), store.wants_tidying()) == ([], False)
+    assert (names(path), store.wants_tidying()) == (["catalog.lock"], False)
     store.commit([Put(query("a"))])
-    assert (segments(path), store.wants_tidying(), folded(path)) == (["catalog.journal.1"], True, [])
+    assert (names(path), store.wants_tidying()) == (["catalog.journal.1", "catalog.lock"], True)
     assert read_rows(path) == content(store) == [query("a")]
     store.tidy()
     assert (segments(path), store.wants_tidying(), folded(path)) == ([], False, ["a"])
@@ -138,6 +146,7 @@ def test_a_commit_is_in_the_journal_at_once_and_in_the_sqlite_file_when_it_is_ti
 
 def test_what_comes_and_goes_before_it_is_folded_is_in_no_table(path: Path) -> None:
     store = journaled(path)
+    open_tables(store)
     for n in range(50):
         store.commit([Put(query(f"{n}"))])
         store.commit([Drop("queries", f"{n}")])
@@ -243,6 +252,7 @@ def test_descriptors_are_not_used_up_by_what_waits_to_be_folded(path: Path) -> N
 
 def test_another_tool_that_holds_the_sqlite_file_holds_up_no_commit(path: Path) -> None:
     store = journaled(path)
+    open_tables(store)
     store.commit([Put(query("a"))])
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as tool:
         tool.execute("BEGIN IMMEDIATE")
@@ -253,6 +263,123 @@ def test_another_tool_that_holds_the_sqlite_file_holds_up_no_commit(path: Path) 
     store.tidy()
     assert (folded(path), segments(path)) == (["a", "b"], [])
     store.close()
+
+
+# -- before the SQLite file is made ---------------------------------------------------------------------------------
+
+
+def test_openings_that_write_nothing_are_counted_and_leave_their_lock(path: Path) -> None:
+    for epoch in range(1, 4):
+        store = journaled(path)
+        assert (store.epoch, content(store), names(path)) == (epoch, [], ["catalog.lock"])
+        if epoch == 2:
+            path = left_by(path)  # killed
+        store.close()
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    store.close()
+    assert names(path) == ["catalog.lock", "catalog.sqlite3"]
+    store = journaled(path)
+    assert (store.epoch, content(store)) == (5, [query("a")])
+    store.close()
+
+
+@pytest.mark.parametrize("size", [56, 80])
+def test_a_full_disk_makes_no_opening_forgotten(path: Path, size: int) -> None:
+    """The lock's file alone counts them, and takes a part of a longer text."""
+    with full_disk(0), pytest.raises(CatalogError, match=f"{path}: .*File too large"):
+        journaled(path)
+    store = journaled(path)
+    with full_disk(size), pytest.raises(CatalogError):
+        store.commit([Put(part("r", b"x" * 100))])
+    copy = left_by(path)
+    store.close()
+    store = journaled(copy)
+    assert (store.epoch, content(store)) == (2, [])
+    store.close()
+
+
+def test_a_catalog_that_is_all_in_its_journal_is_read_locked_and_opened_by_the_next(path: Path) -> None:
+    store = journaled(path)
+    in_parts(store, [Put(query("a"))], [Put(query("b"))], [Drop("queries", "a")])
+    assert names(path) == [*(f"catalog.journal.{n}" for n in (1, 2, 3)), "catalog.lock"]
+    assert in_order(read_rows(path)) == content(store) == [query("b")]
+    with pytest.raises(CatalogLocked, match="this process"):
+        open_store(path)
+    for durability in ("process", "power"):
+        copy = left_by(path, f"copy-{durability}")
+        again = open_store(copy, durability=durability)
+        assert (content(again), again.epoch, names(copy)[:2]) == ([query("b")], 2, ["catalog.lock", "catalog.sqlite3"])
+        again.close()
+    store.close()
+    assert (names(path), read_rows(path)) == (["catalog.lock", "catalog.sqlite3"], [query("b")])
+
+
+def test_a_tool_that_looks_before_there_is_a_file_does_no_harm(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for changes in ([], [Put(query("a"))]):
+        store = journaled(path)
+        store.commit(changes)
+        with contextlib.closing(sqlite3.connect(path)) as tool:
+            assert tool.execute("SELECT name FROM sqlite_schema").fetchall() == []
+        assert path.stat().st_size == 0
+        copy = left_by(path)
+        store.close()
+        again = journaled(copy)
+        assert (content(again), again.epoch) == (
+            [change.row for change in changes if type(change) is Put],
+            store.epoch + 1,
+        )
+        again.close()
+    assert read_rows(path) == [query("a")]
+    assert caplog.messages == []
+
+
+def test_a_copy_that_is_put_in_the_place_of_a_catalog_that_held_nothing_is_opened_without_a_word(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    made(path).close()
+    other = path.parent.with_name("other") / path.name
+    journaled(other).close()
+    shutil.copy(path, other)
+    store = journaled(other)
+    assert store.epoch == 2
+    store.close()
+    assert caplog.messages == []
+
+
+def test_a_commit_that_vanishes_before_there_is_a_file_is_told_of(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    copy = left_by(path)
+    store.close()
+    copy.with_name("catalog.journal.1").unlink()
+    store = journaled(copy)
+    assert (content(store), store.epoch) == ([], 2)
+    store.close()
+    assert f"{copy}: catalog.journal.1: missing" in caplog.text
+
+
+def test_a_journal_alone_that_another_registrar_has_begun_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "one" / "catalog.sqlite3"
+    store = open_store(path, witness=Witness(tmp_path, "one"))
+    store.commit([Put(query("a"))])
+    copy = left_by(path, "two")
+    store.close()
+    with pytest.raises(CatalogDamaged, match=f"{copy}: .*a journal that another registrar has begun"):
+        open_store(copy, witness=Witness(tmp_path, "two"))
+    assert read_rows(copy) == [query("a")]
+
+
+def test_a_catalog_whose_file_was_made_is_damaged_without_it_also_after_a_crash(path: Path) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    store.tidy()
+    copy = left_by(path)
+    store.close()
+    for file in copy.parent.glob("catalog.sqlite3*"):
+        file.unlink()
+    with pytest.raises(CatalogDamaged, match="no such file, though it was opened 1 times and is not closed"):
+        journaled(copy)
 
 
 # -- full disks ----------------------------------------------------------------------------------------------------
@@ -280,13 +407,14 @@ def test_a_commit_that_failed_first_of_all_leaves_nothing_behind(path: Path) -> 
     with pytest.raises(OverflowError):
         store.commit([Put(query("a", 2**63))])
     store.close()
-    assert names(path) == ["catalog.lock", "catalog.sqlite3"]
+    assert names(path) == ["catalog.lock"]
 
 
 def open_tables(store: JournaledStore) -> None:
-    """Let SQLite open its files, which it does when it folds first."""
-    store.commit([Drop("queries", "none")])
-    store.tidy()
+    """Have the SQLite file made and opened, which the first folding does. Two segments are folded then."""
+    for change in (Put(query("first")), Drop("queries", "first")):
+        store.commit([change])
+        store.tidy()
 
 
 def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_is_room(path: Path) -> None:
@@ -300,11 +428,11 @@ def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_i
         with full_disk(wal.stat().st_size + 4096), pytest.raises(CatalogError, match=f"{path}: .*stay in the journal"):
             store.tidy()
         assert content(store) == in_order(read_rows(path)) == rows
-    assert segments(path) == [f"catalog.journal.{n}" for n in (2, 3, 4)]
+    assert segments(path) == [f"catalog.journal.{n}" for n in (3, 4, 5)]
     copy = left_by(path)
     with full_disk(wal.stat().st_size + 4096):
         store.close()
-    assert segments(path) == [f"catalog.journal.{n}" for n in (2, 3, 4)]
+    assert segments(path) == [f"catalog.journal.{n}" for n in (3, 4, 5)]
     for catalog in (path, copy):
         assert in_order(read_rows(catalog)) == rows
         store = journaled(catalog)
@@ -325,14 +453,14 @@ def test_the_first_changes_stay_in_the_journal_if_the_disk_has_no_room_for_the_f
     assert read_rows(path) == [query("a")]
 
 
-def test_a_file_that_was_removed_before_the_first_folding_is_not_made_again(path: Path) -> None:
+def test_what_is_put_in_the_place_of_a_file_that_is_not_made_yet_is_not_written_over(path: Path) -> None:
     store = journaled(path)
     store.commit([Put(query("a"))])
-    aside = path.rename(path.with_name("aside"))
-    with pytest.raises(CatalogError, match=f"{path}: .*stay in the journal"):
+    path.write_text("a copy of last week")
+    with pytest.raises(CatalogError, match=f"{path}: .*File exists.*stay in the journal"):
         store.tidy()
-    assert not path.exists()
-    aside.rename(path)
+    assert path.read_text() == "a copy of last week"
+    path.unlink()
     store.tidy()
     store.close()
     assert read_rows(path) == [query("a")]
@@ -340,7 +468,7 @@ def test_a_file_that_was_removed_before_the_first_folding_is_not_made_again(path
 
 def test_no_commit_folds_or_waits_for_the_folding_however_many_changes_wait(path: Path) -> None:
     """A tool keeps the SQLite file locked: a thread that folds waits for a second, and fails."""
-    store = journaled(path)
+    store = made(path)
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as tool:
         tool.execute("BEGIN IMMEDIATE")
         store.commit([Put(query("a", n)) for n in range(100_001)])
@@ -437,6 +565,22 @@ def test_an_interrupt_of_a_commit_leaves_no_descriptor(path: Path) -> None:
         gc.collect()  # an error holds what its traceback leads to
         assert descriptors(path) == 0, where
     assert point > 20
+
+
+@pytest.mark.slow
+def test_an_interrupt_while_the_file_is_made_leaves_it_to_the_next_folding(path: Path) -> None:
+    point, where = 0, "not yet"
+    while where:
+        point += 1
+        store = journaled(path)
+        store.commit([Put(query("a"))])
+        where = interrupted(store.tidy, point).where
+        store.commit([Put(query("b"))])
+        store.tidy()
+        assert folded(path) == ["a", "b"], where
+        store.close(erase=True)
+        assert not path.parent.exists(), where
+    assert point > 100
 
 
 def test_an_interrupt_while_a_catalog_is_locked_leaves_it_free(path: Path) -> None:
@@ -553,7 +697,7 @@ def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room
             noted.save()
     assert 3 <= caplog.text.count("app: ") <= 6
     assert f"{path}: expected to take 1 change(s) from its journal" in caplog.text
-    assert (content(store), segments(path)) == ([row], ["catalog.journal.2"])
+    assert (content(store), segments(path)) == ([row], ["catalog.journal.3"])
     assert read_rows(left_by(path)) == [row]
     loop.advance(1.0)
     assert (segments(path), loop.timers) == ([], [])
@@ -566,18 +710,18 @@ def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room
 
 
 def test_a_journal_without_its_sqlite_file_is_refused_by_name_and_left_as_it_is(path: Path) -> None:
-    store = journaled(path)
+    store = made(path)
     store.commit([Put(query("a"))])
     copy = left_by(path)
     store.close()
     for file in copy.parent.glob("catalog.sqlite3*"):
         file.unlink()
-    before = copy.with_name("catalog.journal.1").read_bytes()
+    before = copy.with_name("catalog.journal.3").read_bytes()
     for attempt in (journaled, read_rows):
-        with pytest.raises(CatalogDamaged, match=f"{copy}: .*no such file, but catalog.journal.1, which belongs to it"):
+        with pytest.raises(CatalogDamaged, match=f"{copy}: .*no such file, but catalog.journal.3, which belongs to it"):
             attempt(copy)
-    assert names(copy) == ["catalog.journal.1", "catalog.lock"]
-    assert copy.with_name("catalog.journal.1").read_bytes() == before
+    assert names(copy) == ["catalog.journal.3", "catalog.lock"]
+    assert copy.with_name("catalog.journal.3").read_bytes() == before
 
 
 def spoil_its_file(path: Path) -> None:
@@ -590,8 +734,8 @@ def spoil_a_segment(path: Path) -> None:
 
 def another_catalogs(path: Path) -> None:
     store = journaled(path.parent.with_name("another") / path.name)
-    in_parts(store, [Put(query("x"))], [Put(query("y"))])
-    shutil.copy(store.path.with_name("catalog.journal.2"), path.parent)
+    in_parts(store, [Put(query("x"))], [Put(query("y"))], [Put(query("z"))])
+    shutil.copy(store.path.with_name("catalog.journal.3"), path.parent)
     store.close(erase=True)
 
 
@@ -608,7 +752,7 @@ def test_damage_is_refused_by_name_with_its_journal_as_it_is_or_set_aside_with_i
     path: Path, spoil: Callable[[Path], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     for n in (1, 2):
-        store = journaled(path)
+        store = made(path)
         in_parts(store, [Put(query("a"))], [Put(query("b"))])
         copy = left_by(path)
         store.close(erase=True)

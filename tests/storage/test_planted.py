@@ -166,7 +166,9 @@ def test_a_location_that_a_user_has_chosen_may_be_a_link(tmp_path: Path) -> None
     other.mkdir()
     chosen = tmp_path / "chosen"
     chosen.symlink_to(other)
-    open_store(chosen / "catalog.sqlite3", witness=Witness(state, "maker")).close()
+    store = open_store(chosen / "catalog.sqlite3", witness=Witness(state, "maker"))
+    store.commit([Put(Peer("hub"))])
+    store.close()
     assert (other / "catalog.sqlite3").exists()
 
 

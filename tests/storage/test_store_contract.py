@@ -244,23 +244,31 @@ def test_its_files_are_private(either: FileDisk) -> None:
     store.close()
 
 
-def test_a_catalog_that_holds_nothing_has_one_file_and_its_lock_and_waits_for_the_disk_once(
+def test_a_catalog_that_holds_nothing_is_a_lock_two_descriptors_and_no_wait_for_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its -wal would be two files more, two descriptors, and another wait."""
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", synced.append)
     descriptors = len(os.listdir("/proc/self/fd"))
     path = tmp_path / "reg" / "catalog.sqlite3"
     store = open_store(path)
     try:
-        assert sorted(file.name for file in path.parent.iterdir()) == ["catalog.lock", "catalog.sqlite3"]
+        assert [file.name for file in path.parent.iterdir()] == ["catalog.lock"]
         assert len(os.listdir("/proc/self/fd")) == descriptors + 2  # the lock, and the directory
+        assert synced == []
+        assert read_rows(path) == []
+        store.commit([Put(query("a"))])
+        store.commit([Drop("queries", "a")])
+        store.tidy()
+        assert [file.name for file in path.parent.iterdir()] == ["catalog.lock"], "it has come to nothing"
+        store.commit([Put(query("a"))])
+        assert synced == [], "no commit waits for the disk"
+        store.tidy()
         assert len(synced) == 1
         with contextlib.closing(sqlite3.connect(path)) as connection:
             assert connection.execute("PRAGMA journal_mode").fetchall() == [("wal",)]
             assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
-            assert connection.execute("SELECT epoch, folded FROM meta").fetchall() == [(1, 0)]
+            assert connection.execute("SELECT epoch, folded FROM meta").fetchall() == [(1, 1)]
     finally:
         store.close()
 
@@ -514,15 +522,29 @@ def test_a_row_that_cannot_be_written_takes_its_whole_commit_back(either: FileDi
     store.close()
 
 
-def test_a_full_disk_at_opening_is_an_error_that_names_the_catalog_and_leaves_no_lock(either: FileDisk) -> None:
+def test_a_full_disk_when_the_file_is_made_is_an_error_that_names_the_catalog_and_loses_nothing(
+    either: FileDisk,
+) -> None:
+    """With durability "power" that is when it is opened; else some time after the first commit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
-        with pytest.raises(CatalogError, match=str(either.path)):
-            either.open()
+        if either.durability == "power":
+            with pytest.raises(CatalogError, match=str(either.path)):
+                either.open()
+        else:
+            store = either.open()
+            store.commit([Put(query("a"))])
+            with pytest.raises(CatalogError, match=f"{either.path}: .* they stay in the journal, and are safe there"):
+                store.tidy()
+            store.close()
+            assert read_rows(either.path) == [query("a")]
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    either.open().close()
+    store = either.open()
+    assert content(store) == ([] if either.durability == "power" else [query("a")])
+    store.close()
+    assert sorted(file.name for file in either.path.parent.iterdir()) == ["catalog.lock", "catalog.sqlite3"]
 
 
 def test_a_place_where_no_directory_can_be_is_an_error_that_names_it(tmp_path: Path) -> None:

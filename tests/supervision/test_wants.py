@@ -126,6 +126,7 @@ def test_a_catalog_that_another_process_holds_is_waited_for_and_not_counted(
     later = rr.Backoff(delay_s=0.5, factor=1.0, maximum_s=0.5)  # until the catalog is held
     system = start(rr.ChildSpec(Maker, id="maker", backoff=later))
     query = system.open_registrar("app").load("maker/thing", "one")
+    system.registrar("maker").save_catalog()
     old = pid_of(system, "maker")
     kill(system, "maker")
     with held(catalog_path(state_dir, "maker")):

@@ -193,7 +193,7 @@ class Node(ProcessNode):
         if status is not None or not registrar.startswith(CLIENTS):
             return status is _GONE
         # If an application is killed, its next start alone gives up its clients. Later ones find no catalog of them.
-        return not os.path.exists(self.config.registrar(registrar).catalog_path(self.info.state_dir))
+        return not os.path.exists(self.config.registrar(registrar).catalog_path(self.info.state_dir).parent)
 
     def close_registrar(self, name: str, status: Presence | None) -> None:
         """Close a registrar if it is open, and write its status into the directory; None: write nothing."""
