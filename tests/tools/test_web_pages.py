@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -28,7 +29,7 @@ from playwright.async_api import Page, Route
 import rr_actors as rr
 from rr_actors.managers import Actions, RunGraph
 from rr_actors.system import web_process
-from support import LIMIT_S, Workshop, child, kill, lives, pid_of, quickly, serve, wait_gone
+from support import LIMIT_S, Workshop, child, hang, kill, lives, pid_of, quickly, serve, wait_gone
 from support_browser import Chromium, Tab, needs_chromium, web
 from support_managers import Order, Shop
 
@@ -923,6 +924,18 @@ def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(
     assert len(late) > 300
     print(f"{sent} events; behind: median {late[len(late) // 2]:.2f} s, most {late[-1]:.2f} s")
     assert late[-1] < 1.0 + stood_s, late[-10:]  # while the storm itself stands, there is nothing newer to show
+
+
+def test_a_kill_is_shown_while_a_manager_answers_nothing(start: Start, tab: Tab) -> None:
+    system = start(rr.ChildSpec(rr.Manager, id="still"), rr.ChildSpec(rr.Actor, id="actor"))
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees(node("root/actor"), "running")
+        still = pid_of(system, "still")
+        hang(still)
+        kill(system, "actor")
+        tab.sees(node("root/actor"), "↻1", "running")
+        os.kill(still, signal.SIGCONT)
 
 
 @pytest.mark.parametrize(

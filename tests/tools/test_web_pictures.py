@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,14 +16,14 @@ import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import Holder, ResourceRow, ServerRow
 from rr_actors.system.console.console_client import ConsoleClient
-from rr_actors.system.console.console_messages import Entries, Event, Events, RegistrarRow
+from rr_actors.system.console.console_messages import Entries, RegistrarRow
 from rr_actors.system.console.console_questions import ListServers
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.web import sequence_page
 from rr_actors.tools.web.graph_picture import Chart, around, chart, edges_in, neighbours_of, rows_of_server, travels
 from rr_actors.tools.web.sequence_page import Recorder
 from rr_actors.tools.web.watch import Moment, Watch
-from support import Gate, child, eventually, kill, serve
+from support import Gate, child, eventually, hang, kill, pid_of, serve
 from support_inside import node_of
 
 Start = Callable[..., rr.System]
@@ -170,7 +172,7 @@ def test_a_watch_keeps_what_was_and_shares_what_has_not_changed(start: Start, st
     watch = Watch(state_dir)
     watch.start()
     try:
-        eventually(lambda: not watch.now.problem)
+        eventually(lambda: watch.now.stale == "" and not watch.now.problem)
         before = watch.now
         kill(system, "a")
         eventually(lambda: any(row.restarts and row.state == "running" for row in watch.now.children))
@@ -199,17 +201,24 @@ def test_a_watch_has_all_resources_also_if_their_statuses_are_together_too_long_
         watch.stop()
 
 
-def test_a_watch_looks_at_once_for_news_of_the_tree_alone(start: Start, state_dir: Path) -> None:
-    start()
+def test_a_watch_knows_the_children_while_a_registrar_does_not_answer(
+    start: Start, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    system = start(rr.ChildSpec(rr.Manager, id="still"), rr.ChildSpec(rr.Actor, id="actor"))
+    monkeypatch.setattr("rr_actors.tools.web.watch._LOOK_S", 0.5)
     watch = Watch(state_dir)
-    of_a_resource = {"registrar": "app", "server": "app/thing", "resource_id": "x"}
+    watch.start()
     try:
-        for kind in ("loaded", "status", "progress", "dead_letter"):
-            watch._hear(Events([Event(1, 1.0, kind, of_a_resource)]))
-        assert watch._news.is_set()
-        assert not watch._tree_news.is_set()
-        watch._hear(Events([Event(2, 1.0, "exited", {"path": "root/a"})]))
-        assert watch._tree_news.is_set()
+        eventually(lambda: watch.now.stale == "" and not watch.now.problem)
+        still = pid_of(system, "still")
+        hang(still)
+        eventually(lambda: watch.now.stale, what="no answer of the registrar")
+        kill(system, "actor")
+        eventually(lambda: any(row.restarts and row.state == "running" for row in watch.now.children))
+        assert watch.now.problem == ""
+        assert [row.name for row in watch.now.registrars] == ["still"]
+        os.kill(still, signal.SIGCONT)
+        eventually(lambda: watch.now.stale == "", what="the registrar's answer")
     finally:
         watch.stop()
 

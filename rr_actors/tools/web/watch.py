@@ -1,7 +1,8 @@
 """Watch: the state of one system for the pages, now and in the last minutes.
 
-Two threads wait for the system: one for its events, one for the rows that a page can show. The pages wait for neither:
-when `version` has changed, they show the newest moment.
+Three threads wait for the system: one for its events, one for its tree, one for the rows of registrars and resources.
+So news of a child never waits for many rows. The pages wait for none of them: when `version` has changed, they show the
+newest moment.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 import msgspec
@@ -45,8 +47,9 @@ _TREE_S = 0.1
 _NEWS_S = 0.4
 _SELDOM_S = 2.0
 """The least time between two looks after a child's event, and after a resource's; the longest time between looks."""
-_SHARE = 10
+_TREE_PAUSE, _ROWS_PAUSE = 2.0, 10.0
 _LONGEST_S = 5.0
+"""How many times longer than a look the pause after it is, for the tree and for the rows; the longest pause."""
 _AGAIN_S = 0.5
 _LOOK_S = 10.0
 _STREAMS = 4  # of one resource that are shown as pictures
@@ -60,11 +63,12 @@ class Moment:
     """The state of a system at one time.
 
     Attributes:
-        at: seconds since the epoch.
+        at: seconds since the epoch; 0.0 before the first answer.
         resources: all resources, if there are few.
         servers: else the servers, with their resources counted.
         total: the number of all resources.
         problem: why no system runs, or why it does not answer; "" if it answers.
+        stale: why registrars and resources may have changed; "" if they have not, None before their first answer.
     """
 
     at: float
@@ -74,10 +78,40 @@ class Moment:
     total: int = 0
     problem: str = ""
     servers: tuple[ServerRow, ...] = ()
+    stale: str | None = None
 
     def says_the_same(self, other: Moment) -> bool:
         """Return whether another moment differs only in its time."""
         return replace(self, at=other.at) == other
+
+
+class _Looks:
+    """The looks at one part of a system, in a thread: soon after news of that part, and seldom without.
+
+    Args:
+        look: asks the system, and returns the longest time until the next look.
+        pause: how many times longer than a look the pause after it is.
+
+    Attributes:
+        soon, news: set to have a look at once, or when the last look has become older.
+    """
+
+    def __init__(self, look: Callable[[], float], pause: float) -> None:
+        self.soon, self.news = threading.Event(), threading.Event()
+        self._look, self._pause = look, pause
+
+    def run(self, closed: threading.Event) -> None:
+        """Look again and again, until `closed` and `soon` are set."""
+        while not closed.is_set():
+            began = time.monotonic()
+            latest = began + self._look()
+            took_s = time.monotonic() - began
+            closed.wait(max(_TREE_S, min(self._pause * took_s, _LONGEST_S)))
+            while not self.soon.wait(0.05) and time.monotonic() < latest:
+                if self.news.is_set() and time.monotonic() > began + _NEWS_S:
+                    break
+            self.soon.clear()
+            self.news.clear()
 
 
 @dataclass
@@ -104,8 +138,10 @@ class Watch:
 
     def __post_init__(self) -> None:
         self.link = ConsoleLink(self.state_dir)
-        self._tree_news, self._news = threading.Event(), threading.Event()
+        self._tree = _Looks(self._look_at_tree, _TREE_PAUSE)
+        self._rows = _Looks(self._look_at_rows, _ROWS_PAUSE)
         self._closed = threading.Event()
+        self._changing = threading.Lock()
         self._versions = itertools.count(1)
         self._lanes, self._lanes_lock = Lanes(), threading.Lock()
         self.figures = FigureCurves()
@@ -113,8 +149,12 @@ class Watch:
         self._latest = 0.0  # the time of the newest record in the lanes
         self._timeline: tuple[int, Timeline] | None = None  # and the version that it shows
         self._threads = [
-            threading.Thread(target=target, name=f"rr-watch-{target.__name__.strip('_')}", daemon=True)
-            for target in (self._follow, self._keep_looking)
+            threading.Thread(target=target, name=f"rr-watch-{name}", daemon=True)
+            for name, target in (
+                ("follow", self._follow),
+                ("tree", partial(self._tree.run, self._closed)),
+                ("rows", partial(self._rows.run, self._closed)),
+            )
         ]
 
     @property
@@ -154,30 +194,30 @@ class Watch:
         return made[1]
 
     def start(self) -> None:
-        """Start both threads."""
+        """Start the threads."""
         for thread in self._threads:
             thread.start()
 
     def stop(self) -> None:
-        """Close the connections, and wait until both threads have ended."""
+        """Close the connections, and wait until the threads have ended."""
         self._closed.set()
-        self._tree_news.set()
+        self.look_soon()
         self.link.close()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join()
 
     def look_soon(self) -> None:
-        """Ask for the rows again soon, as a page has changed something."""
-        self._tree_news.set()
+        """Ask for the tree and the rows again soon, as a page has changed something."""
+        self._tree.soon.set()
+        self._rows.soon.set()
 
     # -- in the thread that follows events ---------------------------------------------------------------------------
 
     def _follow(self) -> None:
         while not self._closed.is_set():
             problem = self.link.follow(self._reached, self._hear)
-            if not self.now.problem:
-                self._add(replace(self.now, at=time.time(), problem=problem))
+            self._change(partial(replace, problem=problem, stale=problem))
             self._closed.wait(_AGAIN_S)
 
     def _reached(self, welcome: c.Welcome) -> None:
@@ -185,22 +225,22 @@ class Watch:
         with contextlib.suppress(RrError):  # the system ends
             records = self._ask(questions.ListHistory(limit=c.PAGE_LIMIT)).records
             self._note(*(event_of(record) for record in records if record.at > self._latest))
-        self._tree_news.set()
+        self.look_soon()
 
     def _hear(self, part: c.Events | c.Missed) -> None:
         if isinstance(part, c.Missed):
             self.missed += part.count
             self.heard += part.count
-            self._tree_news.set()
+            self.look_soon()
         else:
             self.events.extend(part.events)
             for event in part.events:
                 self.lines.take(event)
             self._note(*part.events)
             self.heard += len(part.events)
-            self._news.set()
+            self._rows.news.set()
             if any("path" in event.facts for event in part.events):  # an event of the tree
-                self._tree_news.set()
+                self.look_soon()
         self.version = next(self._versions)
 
     def _note(self, *events: c.Event) -> None:
@@ -210,52 +250,42 @@ class Watch:
                 if "path" in event.facts:
                     self._latest = max(self._latest, event.at)
 
-    # -- in the thread that asks -------------------------------------------------------------------------------------
+    # -- in the threads that look ------------------------------------------------------------------------------------
 
-    def _keep_looking(self) -> None:
-        while not self._closed.is_set():
-            began = time.monotonic()
-            self._look()
-            took_s = time.monotonic() - began
-            self._closed.wait(max(_TREE_S, min(_SHARE * took_s, _LONGEST_S)))
-            self._wait_for_news(began)
-
-    def _wait_for_news(self, began: float) -> None:
-        """Wait for a child's event, or for a resource's event and an older look, or until the last look is old."""
-        is_counting = any(row.recent_restarts for row in self.now.children)  # a restart window empties by itself
-        latest = began + (_NEWS_S if is_counting else _SELDOM_S)
-        while not self._tree_news.wait(0.05) and time.monotonic() < latest:
-            if self._news.is_set() and time.monotonic() > began + _NEWS_S:
-                break
-        self._tree_news.clear()
-        self._news.clear()
-
-    def _look(self) -> None:
+    def _look_at_tree(self) -> float:
         try:
-            moment = self._asked()
+            pages = read_pages(self._ask, questions.ListChildren(), CHILDREN)
+            children = [row for page in pages for row in page.rows][:CHILDREN]
         except RrError as error:
-            since = self.now.at if self.now.problem and self.now.at else time.time()
-            moment = replace(self.now, at=since, problem=str(error))
-        self._add(moment)
-
-    def _asked(self) -> Moment:
-        before = self.now
-        pages_of_tree = read_pages(self._ask, questions.ListChildren(), CHILDREN)
-        children = [row for page in pages_of_tree for row in page.rows]
+            self._change(partial(replace, problem=str(error)))
+            return _SELDOM_S
         with self._lanes_lock:
             for row in children if self._latest else ():  # after the records of what was before
                 self._lanes.sees(row.path, row.pid or 0, time.time())
-        registrars = self._ask(questions.ListRegistrars()).rows
-        self.figures.take(children, registrars)
-        total, resources, servers = self._asked_resources(grouped=bool(before.servers))
-        return Moment(
-            time.time(),
-            _shared([msgspec.structs.replace(row, up_s=None) for row in children[:CHILDREN]], before.children),
-            _shared(registrars, before.registrars),
-            _shared(resources, before.resources),
-            total,
-            servers=before.servers if servers == list(before.servers) else tuple(servers),
+        rows = [msgspec.structs.replace(row, up_s=None) for row in children]
+        self._change(lambda now: replace(now, children=_shared(rows, now.children), problem=""))
+        is_counting = any(row.recent_restarts for row in children)  # a restart window empties by itself
+        return _NEWS_S if is_counting else _SELDOM_S
+
+    def _look_at_rows(self) -> float:
+        try:
+            registrars = self._ask(questions.ListRegistrars()).rows
+            total, resources, servers = self._asked_resources(grouped=bool(self.now.servers))
+        except RrError as error:
+            self._change(partial(replace, stale=str(error)))
+            return _SELDOM_S
+        self.figures.take(self.now.children, registrars)
+        self._change(
+            lambda now: replace(
+                now,
+                registrars=_shared(registrars, now.registrars),
+                resources=_shared(resources, now.resources),
+                total=total,
+                servers=now.servers if servers == list(now.servers) else tuple(servers),
+                stale="",
+            )
         )
+        return _SELDOM_S
 
     def _asked_resources(self, *, grouped: bool) -> tuple[int, list[ResourceRow], list[ServerRow]]:
         """Return how many resources there are; and all of them, or where these are too many the servers.
@@ -274,13 +304,24 @@ class Watch:
     def _ask(self, request: Verb[_A]) -> _A:
         return self.link.ask(request, _LOOK_S)
 
+    # -- in all of these threads -------------------------------------------------------------------------------------
+
+    def _change(self, change: Callable[[Moment], Moment]) -> None:
+        """Add the moment that differs by `change`. While the system does not answer, its time is since when."""
+        with self._changing:
+            now, new = self.now, change(self.now)
+            self._add(replace(new, at=now.at if now.problem and new.problem else time.time()))
+
     def _add(self, moment: Moment) -> None:
         if moment.says_the_same(self.now):
             return
         self.moments.append(moment)
-        while len(self.moments) > _KEPT or self.moments[0].at < moment.at - KEPT_S or not self.moments[0].at:
+        while len(self.moments) > 1 and self._is_past(self.moments[0]):
             self.moments.popleft()
         self.version = next(self._versions)
+
+    def _is_past(self, oldest: Moment) -> bool:
+        return len(self.moments) > _KEPT or oldest.at < self.now.at - KEPT_S or not oldest.at
 
 
 def _shared(rows: Sequence[_Row], before: tuple[_Row, ...]) -> tuple[_Row, ...]:

@@ -252,6 +252,8 @@ class Page(ABC):
         """Say above the page that it does not show the running system of now."""
         now, at = self.watch.now, self.at
         text = f"No answer since {_clock(now.at)}: {now.problem}." if now.problem and now.at else ""
+        if now.stale and not text:
+            text = f"Registrars and resources may have changed: {now.stale}."
         if at is not None:
             text = f"This is the picture of {_clock(at)}. Details and events are of now, and buttons are off."
         self._banner.text = text
@@ -559,7 +561,8 @@ class ResourcesPage(Page):
             self._graph.options.clear()
             self._graph.options.update(self._options(self._seen()))
         how = ": the chosen one, with all above and below it" if self._focus else ": a click opens a server"
-        self._said.text = f"{moment.total:,} resource{'' if moment.total == 1 else 's'}{how * grouped}"
+        said = f"{moment.total:,} resource{'' if moment.total == 1 else 's'}{how * grouped}"
+        self._said.text = "" if moment.stale is None else said  # they are not counted yet
         self._back.set_visibility(grouped and bool(self._focus or self._opened))
         if self.at is None:
             self._table.refresh()
