@@ -37,6 +37,9 @@ pytestmark = [needs_chromium, pytest.mark.timeout(120)]
 
 Start = Callable[..., rr.System]
 
+_STANDS_S = 4.0
+"""How long a browser stands in a test: a page that queued all its looks would have 20 of them to show then."""
+
 
 @pytest.fixture
 def shop(start: Start, workshop: Workshop) -> rr.System:
@@ -936,6 +939,37 @@ def test_a_kill_is_shown_while_a_manager_answers_nothing(start: Start, tab: Tab)
         kill(system, "actor")
         tab.sees(node("root/actor"), "↻1", "running")
         os.kill(still, signal.SIGCONT)
+
+
+def test_a_browser_that_stood_shows_the_newest_state_and_not_all_that_it_missed(start: Start, tab: Tab) -> None:
+    system = start()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "thing")
+    thing = app.load("provider/thing", "one")
+    note = """() => { window.shown = [];
+        const log = document.querySelector('[role=log]');
+        new MutationObserver(() => window.shown.push(log.dataset.seq)).observe(log, { attributeFilter: ['data-seq'] });
+    }"""
+    stand = "until => { while (Date.now() / 1000 < until); window.shown.length = 0; }"
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees(".rr-status", "pid")
+        provider.send_status(thing.resource_id, rr.Status("UPDATE", "the first one"))
+        tab.sees("[role=log]", "the first one")
+        tab.do(tab.page.evaluate(note))
+        until = time.time() + _STANDS_S
+        standing = threading.Thread(target=lambda: tab.do(tab.page.evaluate(stand, until)))
+        standing.start()
+        for number in itertools.count():  # 10 a second: the page looks five times a second
+            if time.time() > until - 0.5:
+                break
+            provider.send_status(thing.resource_id, rr.Status("UPDATE", f"number {number}"))
+            time.sleep(0.1)
+        provider.send_status(thing.resource_id, rr.Status("UPDATE", "the last one"))
+        standing.join()
+        tab.sees("[role=log]", "the last one")
+        shown = tab.do(tab.page.evaluate("window.shown"))
+    assert len(shown) <= 3, shown  # what was on its way, the newest state, and what came while that was drawn
 
 
 @pytest.mark.parametrize(

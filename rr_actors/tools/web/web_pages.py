@@ -1,7 +1,8 @@
 """The pages about a running system: its tree, its resources, and both as they were some minutes ago.
 
-A page does not wait for the system while it is drawn. Five times a second it looks for news in the Watch. When its
-reader chooses something, a thread asks the system for it.
+A page does not wait for the system while it is drawn. It shows a new moment of the Watch at once, and all else five
+times a second. A browser that is slower gets the newest state when it has taken the last one: nothing queues up for it.
+When its reader chooses something, a thread asks the system for it.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -38,7 +39,11 @@ from rr_actors.tools.web.resource_table import ResourceTable
 from rr_actors.tools.web.tree_picture import TreePicture
 from rr_actors.tools.web.watch import CHILDREN, Moment, Watch
 
+_MOMENT_S = 0.05
 _LOOK_S = 0.2
+"""The time between two looks for a new moment, which cost next to nothing, and for all news."""
+_TAKEN_S = 10.0
+"""How long a browser may take for what it was sent, before the page sends it more all the same."""
 _PICTURE_S = 0.5
 _LINES = 200  # events: the newest are in sight, and the others are scrolled to
 _ROWS = 300  # of the panel
@@ -127,7 +132,10 @@ class Page(ABC):
         self.at: float | None = None  # the time that is shown; None for now
         self._zero = 0.0  # the time at the slider's right end, while it is in the past
         self._drawn: object = None
+        self._newest: Moment | None = None
         self._heard = -1
+        self._looked = 0.0
+        self._client = ui.context.client
         ui.add_css(CSS)
         with ui.row().classes("rr-bar"):
             ui.label("rr-actors").classes("text-bold")
@@ -151,7 +159,7 @@ class Page(ABC):
                 with ui.element("div").classes("rr-events-box w-full").props('tabindex="0"'):
                     self._events = ui.label().classes("rr-events").props('role="log" aria-label="events"')
         self._look()  # what is known already is in the page itself: nobody waits for the first news
-        ui.timer(_LOOK_S, self._look, immediate=False)
+        ui.timer(_MOMENT_S, self._keep_up, immediate=False)
 
     @abstractmethod
     def build(self) -> None:
@@ -221,9 +229,20 @@ class Page(ABC):
         self.at = self._zero + back if back < 0 else None
         self._look()
 
+    async def _keep_up(self) -> None:
+        """Show what is new, and wait until the browser has taken it. Later news wait for that, and show as one."""
+        if time.monotonic() >= self._looked + _LOOK_S:
+            self._look()
+        elif self.at is None and self.watch.now is not self._newest:
+            self._show_moment()
+        if self._client.outbox.updates:
+            with contextlib.suppress(TimeoutError):
+                await self._client.run_javascript("0", timeout=_TAKEN_S)
+
     def _look(self) -> None:
         """Show the news of the watch."""
-        watch, moment = self.watch, self.moment
+        watch = self.watch
+        self._looked = time.monotonic()
         if self.at is None:
             begins = watch.moments[0].at
             self._slider.props["min"] = min(-1, round(begins - time.time())) if begins else -1
@@ -234,6 +253,12 @@ class Page(ABC):
             self._heard = watch.heard
             self._events.props(f"data-seq={watch.events[-1].seq if watch.events else 0}")
             self._show_lines()
+        self._show_moment()
+
+    def _show_moment(self) -> None:
+        """Show the moment that is chosen, and whether it is of a system that answers."""
+        watch, moment = self.watch, self.moment
+        self._newest = moment
         self._warn()
         problem = watch.now.problem
         self._status.text = f"{problem}: waiting for it" if problem else _named(watch)
@@ -593,9 +618,9 @@ class ResourcesPage(Page):
     def step(self) -> set[str]:
         """Return the nodes that the newest statuses have just reached on their way up, slowed down for the picture.
 
-        It returns none while the page shows the past.
+        It returns none while the page shows the past, or servers in place of resources.
         """
-        if self.at is not None:
+        if self.at is not None or self._seen().servers:
             return set()
         statuses = [event for event in self.watch.events.copy() if event.event == "status" and event.at > self._began]
         told = [(str(event.facts.get("resource_id")), event.at) for event in statuses[-_STEPS:]]

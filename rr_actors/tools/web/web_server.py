@@ -34,7 +34,11 @@ from rr_actors.tools.web.web_pages import FiguresPage, LoadsPage, ResourcesPage,
 _CLOSE_S = 1
 _LOOK_S = 20.0
 _AWAY_S = 15.0
-"""How long a page may lose its connection, on a busy machine say, and go on as it was. Later it is loaded anew."""
+_LAB_AWAY_S = 3.0
+"""How long a page may lose its connection, on a busy machine say, and go on as it was. Later it is loaded anew.
+
+A browser that is slow may leave a ping unanswered for 0.4 times as long. A run of the lab ends with its page: sooner.
+"""
 
 
 def serve(
@@ -77,7 +81,7 @@ def serve(
             ("/figures", "figures", partial(FiguresPage, watch)),
             ("/sequence", "sequence", partial(SequencePage, watch, recorder)),
         ):
-            ui.page(path, title=f"rr-actors: {name}", reconnect_timeout=_AWAY_S)(page)
+            ui.page(path, title=f"rr-actors: {name}")(page)
         add_rows(watch)
         _add_metrics(watch)
         app.on_startup(watch.start)
@@ -88,7 +92,15 @@ def serve(
     app.on_startup(lambda: say(f"http://{shown}:{port}/{'lab' if lab else ''}?token={keys.token}"))
     served = FastAPI(openapi_url=None)
     binding.MAX_PROPAGATION_TIME = math.inf  # it prints a warning where the machine is busy
-    ui.run_with(served, title="rr-actors", favicon="🎭", dark=None, language="en-US", show_welcome_message=False)
+    ui.run_with(
+        served,
+        title="rr-actors",
+        favicon="🎭",
+        dark=None,
+        language="en-US",
+        show_welcome_message=False,
+        reconnect_timeout=_LAB_AWAY_S if lab else _AWAY_S,
+    )
     config = uvicorn.Config(
         Access(served, keys, host, port), log_level="warning", timeout_graceful_shutdown=_CLOSE_S, server_header=False
     )
