@@ -25,7 +25,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 import rr_actors as rr
 from benchmarks.measure import time_each
 from benchmarks.table import Row, text
-from benchmarks.workload import Ask, Echo
+from benchmarks.workload import Answer, Ask
 
 _PAINT_S, _KILL_S = 2.0, 0.3
 _CPU_PERCENT, _MORE_MIB = 10.0, 50.0
@@ -44,28 +44,34 @@ _NOTE_KILLS = """() => { window.seen = {}; setInterval(() => {
 }, 10); }"""
 
 
-class Busy(Echo):
-    """An Echo with a resource that has statuses all the time, until its process is killed."""
+class Busy(rr.Manager):
+    """Echoes as Echo does, and has a resource with statuses all the time. No resource needs its process."""
 
-    _stopping: threading.Event | None = None
+    @rr.server("echo", recovery="keep")
+    def load_echo(self, request: Ask) -> Answer:
+        return Answer(request.payload)
 
     @rr.server("pulse")
     def load_pulse(self, a_second: float) -> None:
-        resource, stopping = rr.current().resource_id, threading.Event()
-        self._stopping = stopping
+        resource, self.stopping = rr.current().resource_id, threading.Event()
 
         def beat() -> None:
             number = 0
-            while not stopping.wait(1 / a_second):
+            while not self.stopping.wait(1 / a_second):
                 number += 1
                 self.registrar.send_status(resource, rr.Status("WARNING" if number % 2 else "OK", f"beat {number}"))
 
-        threading.Thread(target=beat, name="pulse", daemon=True).start()
+        self.beating = threading.Thread(target=beat, name="pulse", daemon=True)
+        self.beating.start()
+
+    @load_pulse.recover
+    def recover_pulse(self, a_second: float, response: None) -> None:
+        self.load_pulse(a_second)
 
     @load_pulse.unload
     def unload_pulse(self, a_second: float, response: None) -> None:
-        if self._stopping is not None:
-            self._stopping.set()
+        self.stopping.set()
+        self.beating.join()
 
 
 @contextmanager
