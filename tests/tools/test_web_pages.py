@@ -8,8 +8,10 @@ import itertools
 import json
 import logging
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -658,6 +660,31 @@ async def saved_svg(page: Page) -> Path:
     async with page.expect_download() as download:
         await page.get_by_role("button", name="save SVG").click()
     return Path(await (await download.value).path())
+
+
+def test_a_browser_that_leaves_while_its_page_loads_makes_the_server_say_nothing(
+    start: Start, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PYTEST_CURRENT_TEST")  # with it NiceGUI leaves out a middleware
+    with start().serve_web() as page:
+        address, _, token = page.url.partition("?token=")
+        headers = {"Authorization": f"Bearer {token}"}
+
+        def read(path: str) -> str:
+            wanted = urllib.request.Request(urllib.parse.urljoin(address, path), headers=headers)
+            with urllib.request.urlopen(wanted, timeout=LIMIT_S) as answer:
+                return answer.read().decode()
+
+        files = set(re.findall(r"/_nicegui/[\w./-]+\.js", read("/resources")))
+        assert files
+        place = urllib.parse.urlsplit(address)
+        for file in files:
+            lines = f"GET {file} HTTP/1.1", f"Host: {place.netloc}", f"Authorization: Bearer {token}", "", ""
+            with socket.create_connection((place.hostname, place.port), LIMIT_S) as leaving:
+                leaving.sendall("\r\n".join(lines).encode())
+        for file in files:  # when these are answered, the others are done with
+            assert read(file)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_prometheus_reads_figures_with_the_token_in_a_header(shop: rr.System) -> None:

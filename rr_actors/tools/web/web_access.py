@@ -19,6 +19,8 @@ Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
+_UNANSWERED = "No response returned."
+"""The RuntimeError of Starlette for a request whose client has left before the answer began."""
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _HEADERS = (
     # Nothing is loaded from elsewhere. No other page may show this one in a frame, where it could steal clicks.
@@ -65,12 +67,28 @@ class Access:
         headers = _Headers(scope["headers"])
         problem = self._foreign(scope["type"], headers)
         if not problem and self._has(headers):
-            await self.app(scope, receive, _with_headers(send))
+            await self._pass_on(scope, receive, _with_headers(send))
         elif not problem and scope["type"] == "http" and self._has_token(scope):
             await _reply(send, 200, *self._welcome(scope["path"]))
         else:
             text = problem or "open the address that rr-actors web has printed: it ends in a token"
             await _refuse(scope["type"], send, text)
+
+    async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on. NiceGUI's middleware raises an error for a client that has left: it concerns nobody."""
+        has_left = False
+
+        async def receive_or_note() -> MutableMapping[str, Any]:
+            nonlocal has_left
+            message = await receive()
+            has_left = has_left or message["type"] == "http.disconnect"
+            return message
+
+        try:
+            await self.app(scope, receive_or_note, send)
+        except RuntimeError as error:
+            if not has_left or str(error) != _UNANSWERED:
+                raise
 
     def _foreign(self, kind: str, headers: _Headers) -> str:
         """Return why a request's Host or Origin is refused; "" if both are right."""
