@@ -47,9 +47,12 @@ _TREE_S = 0.1
 _NEWS_S = 0.4
 _SELDOM_S = 2.0
 """The least time between two looks after a child's event, and after a resource's; the longest time between looks."""
-_TREE_PAUSE, _ROWS_PAUSE = 2.0, 10.0
-_LONGEST_S = 5.0
-"""How many times longer than a look the pause after it is, for the tree and for the rows; the longest pause."""
+_SHARE = 10
+_TREE_PAUSE_S, _ROWS_PAUSE_S = 0.2, 5.0
+"""A pause is ten times as long as the look before it, and no longer than this: after a look at the tree, at the rows.
+
+A look at the tree is cheap. It takes long where the machine is busy, as while a killed manager recovers.
+"""
 _AGAIN_S = 0.5
 _LOOK_S = 10.0
 _STREAMS = 4  # of one resource that are shown as pictures
@@ -90,15 +93,15 @@ class _Looks:
 
     Args:
         look: asks the system, and returns the longest time until the next look.
-        pause: how many times longer than a look the pause after it is.
+        pause_s: the longest pause after a look.
 
     Attributes:
         soon, news: set to have a look at once, or when the last look has become older.
     """
 
-    def __init__(self, look: Callable[[], float], pause: float) -> None:
+    def __init__(self, look: Callable[[], float], pause_s: float) -> None:
         self.soon, self.news = threading.Event(), threading.Event()
-        self._look, self._pause = look, pause
+        self._look, self._pause_s = look, pause_s
 
     def run(self, closed: threading.Event) -> None:
         """Look again and again, until `closed` and `soon` are set."""
@@ -106,7 +109,7 @@ class _Looks:
             began = time.monotonic()
             latest = began + self._look()
             took_s = time.monotonic() - began
-            closed.wait(max(_TREE_S, min(self._pause * took_s, _LONGEST_S)))
+            closed.wait(max(_TREE_S, min(_SHARE * took_s, self._pause_s)))
             while not self.soon.wait(0.05) and time.monotonic() < latest:
                 if self.news.is_set() and time.monotonic() > began + _NEWS_S:
                     break
@@ -138,8 +141,8 @@ class Watch:
 
     def __post_init__(self) -> None:
         self.link = ConsoleLink(self.state_dir)
-        self._tree = _Looks(self._look_at_tree, _TREE_PAUSE)
-        self._rows = _Looks(self._look_at_rows, _ROWS_PAUSE)
+        self._tree = _Looks(self._look_at_tree, _TREE_PAUSE_S)
+        self._rows = _Looks(self._look_at_rows, _ROWS_PAUSE_S)
         self._closed = threading.Event()
         self._changing = threading.Lock()
         self._versions = itertools.count(1)
