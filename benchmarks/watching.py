@@ -37,11 +37,17 @@ _PATIENCE_MS = 60_000
 _AT_ONCE = 500
 
 # Notes when the tree shows that a child does not run, or was restarted, by its path.
-_NOTE_KILLS = """() => { window.seen = {}; setInterval(() => {
-  for (const one of document.querySelectorAll('[data-path]'))
-    if (!one.innerText.includes('running') || one.innerText.includes('↻'))
-      window.seen[one.dataset.path] ??= Date.now() / 1000;
-}, 10); }"""
+_NOTE_KILLS = """() => {
+  const note = () => {
+    for (const one of document.querySelectorAll('[data-path]'))
+      if (!one.textContent.includes('running') || one.textContent.includes('↻'))
+        window.seen[one.dataset.path] ??= Date.now() / 1000;
+  };
+  window.seen = {};
+  window.noting?.disconnect();
+  window.noting = new MutationObserver(note);
+  window.noting.observe(document.querySelector('.rr-tree'), { subtree: true, childList: true, characterData: true });
+}"""
 
 
 class Busy(rr.Manager):
