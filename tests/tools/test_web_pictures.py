@@ -23,7 +23,7 @@ from rr_actors.tools.web import sequence_page
 from rr_actors.tools.web.graph_picture import Chart, around, chart, edges_in, neighbours_of, rows_of_server, travels
 from rr_actors.tools.web.sequence_page import Recorder
 from rr_actors.tools.web.watch import Moment, Watch
-from support import Gate, child, eventually, hang, kill, pid_of, serve
+from support import LIMIT_S, Gate, child, eventually, hang, kill, pid_of, serve, wait_respawned
 from support_inside import node_of
 
 Start = Callable[..., rr.System]
@@ -182,6 +182,24 @@ def test_a_watch_keeps_what_was_and_shares_what_has_not_changed(start: Start, st
         assert {id(row) for row in before.children} & {id(row) for row in watch.now.children}
         assert watch.now.registrars is before.registrars
         assert child(system, "a").state == "running"
+    finally:
+        watch.stop()
+
+
+def test_a_watch_that_comes_late_has_the_events_before_it_and_a_timeline_until_now(
+    start: Start, state_dir: Path
+) -> None:
+    system = start(rr.ChildSpec(rr.Actor, id="early"))
+    wait_respawned(system, "early", kill(system, "early"))
+    watch = Watch(state_dir)
+    watch.start()
+    try:
+        eventually(lambda: watch.now.stale == "" and watch.heard)
+        told = [str(line) for line in watch.lines.lines()]
+        assert any("exited" in line and "root/early" in line and "SIGKILL" in line for line in told)
+        before = watch.timeline().until
+        eventually(lambda: watch.timeline().until > before)
+        assert time.time() - watch.timeline().until < LIMIT_S
     finally:
         watch.stop()
 

@@ -28,7 +28,7 @@ from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
 from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.recordings import entry_of
-from rr_actors.system.recording.timeline_lanes import Lanes
+from rr_actors.system.recording.timeline_lanes import Lane, Lanes
 from rr_actors.system.recording.timelines import Timeline
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.event_lines import EventLines, event_of
@@ -150,7 +150,9 @@ class Watch:
         self.figures = FigureCurves()
         self._thumbnails = Thumbnails()
         self._latest = 0.0  # the time of the newest record in the lanes
-        self._timeline: tuple[int, Timeline] | None = None  # and the version that it shows
+        self._lanes_of: tuple[int, list[Lane], float | None] | None = (
+            None  # the lanes of a version, and when they began
+        )
         self._threads = [
             threading.Thread(target=target, name=f"rr-watch-{name}", daemon=True)
             for name, target in (
@@ -188,13 +190,11 @@ class Watch:
     def timeline(self) -> Timeline:
         """Return the timeline of all that is known: the records of the state directory, and the events since then."""
         version, now = self.version, self.now
-        if (made := self._timeline) is None or made[0] != version:
+        if (made := self._lanes_of) is None or made[0] != version:
             with self._lanes_lock:
-                lanes, began = self._lanes.lanes(), self._lanes.began
-            until = now.at if now.problem and now.at else time.time()
-            title = self.welcome.system if self.welcome is not None else ""
-            made = self._timeline = version, Timeline(lanes, began or until, until, title)
-        return made[1]
+                made = self._lanes_of = version, self._lanes.lanes(), self._lanes.began
+        until = now.at if now.problem and now.at else time.time()
+        return Timeline(made[1], made[2] or until, until, self.welcome.system if self.welcome is not None else "")
 
     def start(self) -> None:
         """Start the threads."""
@@ -227,7 +227,11 @@ class Watch:
         self.welcome = welcome
         with contextlib.suppress(RrError):  # the system ends
             records = self._ask(questions.ListHistory(limit=c.PAGE_LIMIT)).records
-            self._note(*(event_of(record) for record in records if record.at > self._latest))
+            before = [event_of(record) for record in records if record.at > self._latest]
+            for event in before:
+                self.lines.take(event)
+            self._note(*before)
+            self.heard += len(before)
         self.look_soon()
 
     def _hear(self, part: c.Events | c.Missed) -> None:
