@@ -175,7 +175,7 @@ def test_a_connection_stays_open_when_the_source_changes(start: Start, tmp_path:
         world.fail("camera")
         assert program.hears() == "hello lidar"
         assert program.asks("how far") == "lidar: how far"
-        assert (choice.response.server, choice.response.address) == ("sensors/lidar", address)
+        eventually(lambda: (choice.response.server, choice.response.address) == ("sensors/lidar", address))
         assert Program(address).hears() == "hello lidar"
 
 

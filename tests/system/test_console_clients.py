@@ -370,6 +370,6 @@ def test_a_load_that_its_client_cannot_hear_of_any_more_is_released_once(
         peer.close()
 
         eventually(lambda: connection not in console.connections)
-        assert holder.queries() == []
+        eventually(lambda: holder.queries() == [])
     eventually(lambda: not console.connections)
     assert "is not released" not in caplog.text
