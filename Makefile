@@ -1,7 +1,7 @@
 # Every target sets up the virtual environment it needs on first use, and again when pyproject.toml changes.
 #   make demo   the robot's mission on real processes, with the faults
 #   make lab    experiments to learn from, on a web page: kill a child and see what its supervisor does
-#   make test   the tests, side by side on two cores and more: a few minutes
+#   make test   the tests, side by side on two cores and more: ten minutes on two
 #   make test-all  those that take longer, too: faults at every operation, fixed worlds of the simulation, breakages
 #   make lint   ruff, pyright, import-linter
 #   make docs   the docs as a site, in build/docs/index.html, with the reference of all public names; without the network
