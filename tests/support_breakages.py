@@ -359,7 +359,7 @@ BREAKAGES = {
     "what nobody holds is kept": Breakage("recovery", "retire does nothing", _unheld_are_kept, _LOST),
     "what a provider has is not taken back": Breakage("recovery", "_take_back does nothing", _not_taken_back, _LOST),
     "what a provider lists is taken for nothing": Breakage(
-        "recovery", "reconcile reads an empty list", _nothing_is_agreed, _LOST
+        "recovery", "reconcile reads an empty list", _nothing_is_agreed, (*_LOST, "are used of", "does not say why of")
     ),
     "the first release unloads": Breakage("protocol", "_release does not count", _released_by_the_first, _LOST),
     "an unload callback is not run": Breakage(

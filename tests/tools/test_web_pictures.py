@@ -195,6 +195,7 @@ def test_a_watch_that_comes_late_has_the_events_before_it_and_a_timeline_until_n
     watch.start()
     try:
         eventually(lambda: watch.now.stale == "" and watch.heard)
+        assert watch.moments[0].stale is not None  # the slider begins with a whole picture
         told = [str(line) for line in watch.lines.lines()]
         assert any("exited" in line and "root/early" in line and "SIGKILL" in line for line in told)
         before = watch.timeline().until
@@ -246,11 +247,11 @@ def test_a_watch_keeps_ten_minutes_and_a_bounded_number_of_moments(start: Start,
     watch = Watch(state_dir)
     try:
         for number in range(5000):
-            watch._add(Moment(1000.0 + number / 100, total=number))
+            watch._add(Moment(1000.0 + number / 100, total=number, stale=""))
         assert len(watch.moments) == 3000
-        watch._add(Moment(2000.0, total=1))
+        watch._add(Moment(2000.0, total=1, stale=""))
         assert [moment.at for moment in watch.moments] == [2000.0]
-        watch._add(Moment(2001.0, total=1))  # nothing has changed
+        watch._add(Moment(2001.0, total=1, stale=""))  # nothing has changed
         assert len(watch.moments) == 1
     finally:
         watch.stop()

@@ -328,7 +328,8 @@ class Watch:
         self.version = next(self._versions)
 
     def _is_past(self, oldest: Moment) -> bool:
-        return len(self.moments) > _KEPT or oldest.at < self.now.at - KEPT_S or not oldest.at
+        is_whole = oldest.at and oldest.stale is not None  # not before the first answer, nor before the rows came
+        return not is_whole or len(self.moments) > _KEPT or oldest.at < self.now.at - KEPT_S
 
 
 def _shared(rows: Sequence[_Row], before: tuple[_Row, ...]) -> tuple[_Row, ...]:
