@@ -83,7 +83,9 @@ def sit_down(state_dir: Path, scene: Callable[[Person], Awaitable[None]]) -> Non
     async def play() -> None:
         terminal = Terminal(ConsoleLink(state_dir))
         async with terminal.run_test(size=(80, 24)) as pilot:
-            await scene(Person(terminal, pilot))
+            person = Person(terminal, pilot)
+            await person.sees(lambda: "Tab changes the pane" in terminal.status)  # later words are of what is pressed
+            await scene(person)
 
     asyncio.run(play())
 
