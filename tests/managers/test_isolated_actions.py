@@ -86,7 +86,7 @@ class Overdue(Hang):
 
 
 class Wait(rr.Action):
-    """Stops when it is told to, and says on disk when it pauses."""
+    """Ends when it is asked to, and writes a file when it pauses."""
 
     Input = In
     isolate = True
