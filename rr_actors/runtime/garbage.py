@@ -7,7 +7,7 @@ import gc
 import threading
 from collections.abc import Generator
 
-_lock = threading.Lock()
+_lock = threading.RLock()  # the collection within may run a finalizer that imports a name of the package
 _asleep = 0
 _was_on = False
 _shared = False

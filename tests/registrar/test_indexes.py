@@ -216,3 +216,26 @@ print(counts[1] - counts[0] >= 5_000, counts[2] <= counts[1], gc.isenabled())
     ran = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, check=True)
 
     assert ran.stdout.split() == ["True", "True", "True"]
+
+
+def test_a_finalizer_that_the_collection_of_a_block_runs_may_have_a_block_of_its_own() -> None:
+    script = """
+from rr_actors.runtime.garbage import left_alone
+
+class Ring:
+    ended = False
+    def __init__(self):
+        self.ring = self
+    def __del__(self):
+        with left_alone():
+            Ring.ended = True
+
+kept = []
+for _ in range(40):  # in a row without a full collection: some of them begin with one
+    with left_alone():
+        Ring()  # it counts as old when the block ends
+        kept.append([[number] for number in range(3000)])
+print(Ring.ended)
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=20)
+    assert ran.stdout == "True\n"
