@@ -19,6 +19,7 @@ import rr_actors as rr
 from benchmarks.measure import Samples
 from benchmarks.table import Row
 from benchmarks.workload import Ask, Echo, Empty, load_all, running
+from rr_actors.runtime.processes.child_bootstrap import PRELOAD
 
 _LIMIT_S = 60.0
 
@@ -55,7 +56,8 @@ def children(count: int, times: int) -> list[Row]:
         with _bare() as start_bare:
             seconds["bare"].append(start_bare(count))
         with tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir:
-            system = rr.System(rr.Supervisor(specs, max_restarts=2 * count), state_dir=state_dir)
+            config = rr.SystemConfig(preload=[Empty.__module__])  # a bare child imports nothing of its own either
+            system = rr.System(rr.Supervisor(specs, max_restarts=2 * count), state_dir=state_dir, config=config)
             start = time.perf_counter()
             with system:
                 seconds["started"].append(time.perf_counter() - start)
@@ -142,7 +144,7 @@ def _kill_all(system: rr.System) -> float:
 _BARE = """
 import multiprocessing, sys, time
 context = multiprocessing.get_context("forkserver")
-context.set_forkserver_preload(["rr_actors"])  # with what a child of rr_actors has at hand, too
+context.set_forkserver_preload({preload!r})  # so that a bare child is forked from as large a process
 for line in sys.stdin:
     pipes = [context.Pipe() for _ in range(int(line))]
     children = [context.Process(target=there.send_bytes, args=(b"ready",)) for _, there in pipes]
@@ -164,7 +166,8 @@ It is no file, as each child would import its main program again.
 @contextmanager
 def _bare() -> Iterator[Callable[..., float]]:
     """A call that starts so many bare children and waits for the first word of each; seconds."""
-    process = subprocess.Popen([sys.executable, "-c", _BARE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    code = _BARE.format(preload=list(PRELOAD))
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin
     assert process.stdout
     asked, answers = process.stdin, process.stdout

@@ -41,6 +41,16 @@ def until_told(child: Inherited) -> int:
     return int(child.control.recv(16) or b"0")
 
 
+def say_environment(child: Inherited) -> int:
+    """Say what environment it has, and what one a program has that it starts."""
+    printed = subprocess.run([sys.executable, "-c", _PRINTS], capture_output=True, check=True)
+    _say(child.control, own=dict(os.environ), of_program=json.loads(printed.stdout))
+    return 0
+
+
+_PRINTS = "import json, os; print(json.dumps(dict(os.environ)))"
+
+
 def raise_at_once(child: Inherited) -> int:
     raise ValueError("as it was told")
 

@@ -136,6 +136,10 @@ class Dispatcher:
             raise
         return Course(self, coroutine)
 
+    def is_behind(self) -> bool:
+        """Return whether calls wait, or one runs: what the calling thread asked for may not have been done."""
+        return bool(self._calls)
+
     def is_loop_thread(self) -> bool:
         """Return whether the calling thread is the loop's."""
         return threading.get_ident() == self._ident
@@ -186,7 +190,7 @@ class Dispatcher:
     def _drain(self) -> None:
         self._turn += 1  # before the first call: a call() from now on wakes the loop again
         for left in range(len(self._calls) - 1, -1, -1):
-            fn, args = self._calls.popleft()
+            fn, args = self._calls[0]
             self.more = left > 0
             try:
                 fn(*args)
@@ -194,6 +198,7 @@ class Dispatcher:
                 logger.exception("%s raised on the loop", getattr(fn, "__qualname__", fn))
             except BaseException as error:  # SystemExit on the loop would end all actors of the process
                 logger.error("%s raised on the loop", getattr(fn, "__qualname__", fn), exc_info=error)
+            self._calls.popleft()  # is_behind() counts a call until it has returned
 
     def _begin(self, loop: asyncio.AbstractEventLoop) -> asyncio.Future[None]:
         self._ident = threading.get_ident()

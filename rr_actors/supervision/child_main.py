@@ -57,7 +57,7 @@ def main(inherited: Inherited) -> int:
     child = ChildProcess(inherited, info, path, spec, classes)
 
     signal.signal(signal.SIGTERM, lambda _signal, _frame: dispatcher.closed or dispatcher.call(child.terminate))
-    return dispatcher.run(child.live())
+    return dispatcher.course(child.live()).wait()  # no handler of this thread raises, so no other thread shields it
 
 
 def _break(path: str, *args: Any, **kwargs: Any) -> Any:

@@ -49,8 +49,8 @@ logger = Log("rr_actors.supervision")
 SWEEP_DELAY_S = 0.05
 """Seconds from a death to the search for processes outside its group. Mostly the successor has started by then."""
 
-LAID_OUT = 2
-"""How many processes are made before their turn. Otherwise processors would be idle."""
+LAID_OUT = max(2, len(os.sched_getaffinity(0)))
+"""How many processes are made before their turn: one for each processor, as otherwise processors would be idle."""
 
 FENCE_S = 1.0
 """The longest wait for the end of the processes below a dead supervisor. The kernel kills them within milliseconds."""

@@ -79,6 +79,22 @@ def test_a_child_finds_its_parents_surroundings(
     assert said["argv"] == sys.argv
 
 
+def test_a_child_and_its_programs_have_the_environment_that_the_parent_has_now(
+    spawner: Spawner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RR_ACTORS_TEST_VARIABLE", "at first")
+    monkeypatch.setenv("RR_ACTORS_TEST_REMOVED", "at first")
+    with started(spawner) as first:  # the fork server has these
+        assert hear(first.control)["variable"] == "at first"
+    monkeypatch.setenv("RR_ACTORS_TEST_VARIABLE", "changed")
+    monkeypatch.delenv("RR_ACTORS_TEST_REMOVED")
+    monkeypatch.setenv("RR_ACTORS_TEST_ADDED", "later")
+    with started(spawner, "support_children:say_environment") as child:
+        said = hear(child.control)
+    assert said["own"] == dict(os.environ)
+    assert said["of_program"] == dict(os.environ)
+
+
 def test_the_exit_code_is_what_the_entry_returns(spawner: Spawner) -> None:
     with started(spawner) as child:
         assert child.exited is None

@@ -73,8 +73,7 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         # The parent decides what a ^C means. Not SIG_IGN: programs that this process starts would inherit that.
         signal.signal(signal.SIGINT, _ignore)
-        os.environ.clear()
-        os.environ.update(environment)
+        _set_environment(environment)
         lifeline.hold(life, parent_pid)
         os.close(_SERVER._forkserver_alive_fd)  # /dev/null here: the server's launcher has the real one
         _forget_false_tracker()
@@ -88,6 +87,15 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
             traceback.print_exc()
     finally:
         leave(code)
+
+
+def _set_environment(environment: dict[str, str]) -> None:
+    """Give this process its parent's environment. Most of it is inherited: to set a variable anew copies memory."""
+    for name in os.environ.keys() - environment.keys():
+        del os.environ[name]
+    for name, value in environment.items():
+        if os.environ.get(name) != value:
+            os.environ[name] = value
 
 
 def _say_why(control: socket.socket, error: BaseException) -> bool:
