@@ -1,11 +1,14 @@
-"""What the machine itself can do: raw multiprocessing.Pipe echoes in other processes, and a Pykka ask in this one."""
+"""What the machine itself can do: raw multiprocessing.Pipe echoes in other processes; in this one, an echo between two
+threads, and a Pykka ask."""
 
 from __future__ import annotations
 
 import itertools
 import multiprocessing
+import queue
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -54,6 +57,29 @@ def in_turn(operations: list[Callable[[], Any]]) -> Callable[[], Any]:
     """One call that makes the next of these calls, and after the last the first again."""
     following = itertools.cycle(operations)
     return lambda: next(following)()
+
+
+@contextmanager
+def thread_echo(payload: bytes) -> Iterator[Callable[[], Any]]:
+    """A call that gives `payload` to another thread through a SimpleQueue, and waits for it to come back."""
+    there: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    back: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def answer() -> None:
+        while (got := there.get()) is not None:
+            back.put(got)
+
+    def echo() -> bytes:
+        there.put(payload)
+        return back.get()
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    try:
+        yield echo
+    finally:
+        there.put(None)
+        thread.join()
 
 
 class _Echo(pykka.ThreadingActor):

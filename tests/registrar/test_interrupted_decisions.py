@@ -124,7 +124,7 @@ class Stage:
         return [name for name in INDEXES if compared(getattr(fresh, name)) != compared(getattr(kept, name))]
 
 
-WITH = {getattr(DirectPaths, name).__code__ for name in ("commit", "join", "hold", "owe", "forget_released")}
+WITH = {getattr(DirectPaths, name).__code__ for name in ("commit", "join", "leave", "hold", "owe", "forget_released")}
 
 
 class Interrupts:
@@ -257,9 +257,14 @@ def joins(state: DirectPaths) -> None:
     assert state.join(load("r")) is not None
 
 
+def leaves(state: DirectPaths) -> None:
+    assert state.leave(Unload("r", "app")) is not None
+
+
 # What had happened before by decisions, and by threads; and what is interrupted.
 QUICK: dict[str, tuple[list[Any], list[Any], Callable[[DirectPaths], None]]] = {
     "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [], joins),
+    "an unload that leaves others": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [joins], leaves),
     "a load by line": ([UP], [begins], holds),
     "a release by line": ([UP], [begins, holds], owes),
     "a release by line of what is on disk": ([UP], [begins, holds, saves], owes),

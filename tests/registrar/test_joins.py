@@ -1,7 +1,11 @@
-"""Joins: a thread that loads what a registrar of its own process has, and somebody holds, joins it itself."""
+"""Joins: a thread that loads what a registrar of its own process has, and somebody holds, joins it itself.
+
+Leaving: a thread that releases what others hold, too, decides that itself.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import signal
@@ -17,13 +21,13 @@ from hypothesis import strategies as st
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.core import loading
+from rr_actors.registrar.core import loading, unloading
 from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.effects import Reply
-from rr_actors.registrar.model.messages import Load, Loaded, Unload
-from rr_actors.registrar.model.rows import Phase, Put, ServedQuery
+from rr_actors.registrar.model.messages import Fetch, Load, Loaded, Unload, Unloaded
+from rr_actors.registrar.model.rows import Drop, Phase, Put, ServedQuery
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.storage.opening import read_rows
@@ -89,7 +93,11 @@ def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[An
             decide(general, [(step, None)])
             decide(fast, [(step, None)])
             continue
+        leaves = isinstance(step, Unload) and unloading.leave(general, step)
         decision = decide(general, [(step, step.origin)])
+        if leaves:  # the thread answers, and the row is all that changes
+            assert decision.effects == [Reply(step.origin, Unloaded(step.query_id))]
+            assert (decision.changes, decision.later) == ([Drop("queries", step.query_id)], {})
         query = loading.join(fast, step) if isinstance(step, Load) else None
         if query is None:
             decide(fast, [(step, step.origin)])
@@ -160,6 +168,35 @@ def test_what_was_refused_before_is_not_joined() -> None:
     assert loading.join(provider, ask()) is None
 
 
+@pytest.mark.parametrize(
+    "meanwhile", [let_go, not_to_be_unloaded, lambda provider: None], ids=["gone", "not unloaded", "the last"]
+)
+def test_what_nobody_else_holds_is_not_left(meanwhile: Callable[[Catalog], None]) -> None:
+    provider = catalog()
+    meanwhile(provider)
+    assert not unloading.leave(provider, Unload("q", "app"))
+
+
+def test_what_another_holds_is_left_by_its_holder_alone() -> None:
+    provider = catalog()
+    decide(provider, [(ask("more"), "app")])
+    assert unloading.leave(provider, Unload("more", "app"))
+    assert not unloading.leave(provider, Unload("more", "bpp"))
+    assert not unloading.leave(provider, Unload("never", "app"))
+
+
+def test_what_has_a_status_on_its_way_or_a_priority_is_not_left() -> None:
+    provider = catalog()
+    decide(provider, [(ask("more"), "app")])
+    decide(provider, [(Load("first", "cam", b"front", "app", "", 0, 9, 5), "app")])
+    assert not unloading.leave(provider, Unload("more", "app"))
+    decide(provider, [(Unload("first", "app"), "app")])
+    assert unloading.leave(provider, Unload("more", "app"))
+    decide(provider, [(Fetch("app", True), "app")])
+    decide(provider, [(c.SetStatus("q", "e", rr.State.WARNING, "", "ticket"), None)])
+    assert not unloading.leave(provider, Unload("more", "app"))
+
+
 # -- of real registrars ----------------------------------------------------------------------------------------------
 
 
@@ -178,6 +215,56 @@ def test_it_is_on_disk_when_the_load_returns_and_no_loop_was_woken(
     assert query.response == {"of": "x", "number": 1}
     assert len(served.loads) == 1
     assert query.id in [held.id for held in app.queries()]
+
+
+def test_a_holder_less_is_on_disk_when_the_unload_returns_and_no_loop_was_woken(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = app.load("provider/thing", "x")
+    app.stats()
+    with monkeypatch.context() as patch:
+        patch.setattr(Dispatcher, "hand_over", None)
+        query.unload()
+    assert query.id not in on_disk(state_dir)
+    assert query.id not in [held.id for held in app.queries()]
+    assert [resource.holders for resource in provider.resources()] == [("app",)]
+    assert list(served.unloads) == []
+    with pytest.raises(rr.RrError):
+        query.unload()
+
+
+def test_a_release_waits_behind_what_the_loop_has_to_do(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, gate: Gate
+) -> None:
+    query = app.load("provider/thing", "x")
+    dispatcher = actor_of(app).node.dispatcher
+    dispatcher.call(gate)
+    gate.wait_arrived()
+    unloading = threading.Thread(target=query.unload)
+    unloading.start()
+    unloading.join(0.2)
+    assert unloading.is_alive()
+    gate.open()
+    unloading.join(10)
+    assert [resource.holders for resource in provider.resources()] == [("app",)]
+
+
+def test_a_release_that_cannot_be_written_is_not_done_and_is_owed(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = app.load("provider/thing", "x")
+    store = actor_of(provider).commits.store
+
+    def full(_changes: Any) -> None:
+        raise CatalogError("disk full", path="provider.db")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "commit", full)
+        with contextlib.suppress(rr.RrError):
+            query.unload(timeout_s=0.3)
+        assert [len(resource.queries) for resource in provider.resources()] == [2]
+    eventually(lambda: [len(resource.queries) for resource in provider.resources()] == [1])
+    assert list(served.unloads) == []
 
 
 def test_it_is_one_holder_more_whatever_comes_in_next(

@@ -32,7 +32,7 @@ from rr_actors.registrar.core.notices import (
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Decision
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import ForceUnload, GraceOver, LingerOver, UnloadDone, UnloadErred, Unregister
 from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer, StartPause
 from rr_actors.registrar.model.messages import Gone, Reprioritised, Unload, Unloaded, UnloadRefused
@@ -90,6 +90,19 @@ def _release(decision: Decision, query: ServedQuery) -> None:
     decision.cause(Reply(query.origin, Unloaded(query.id)))
     if last:
         unheld(decision, resource)
+
+
+def leave(catalog: Catalog, message: Unload) -> bool:
+    """Return whether unload() will answer at once, and cause nothing else: other holders keep the resource.
+
+    A thread of this process may then decide the Unload itself.
+    """
+    query = catalog.queries.get(message.query_id)
+    if query is None or query.origin != message.origin or query.id in catalog.notices_on:
+        return False
+    if query.resource_id in catalog.recovering or query.resource_id in catalog.ranked:
+        return False
+    return len(catalog.holders[query.resource_id]) > 1
 
 
 def unheld(decision: Decision, resource: Resource) -> None:

@@ -1,4 +1,4 @@
-"""The fast paths for one row: a load that joins others, and the loads and unloads of a thread's own direct line."""
+"""The fast paths for one row: a load that joins others, an unload that leaves others, and those of direct lines."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import Protocol
 
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.loading import join, loaded
+from rr_actors.registrar.core.unloading import leave
 from rr_actors.registrar.engine.registrar_state import LoadWaiter, RegistrarState, answered_by_line
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import ABSENT
-from rr_actors.registrar.model.messages import Load, Loaded
+from rr_actors.registrar.model.messages import Load, Loaded, Unload, Unloaded
 from rr_actors.registrar.model.rows import OK, PENDING, Held
 from rr_actors.runtime import interpreter
 
@@ -50,6 +51,21 @@ class DirectPaths(RegistrarState):
             if not written:
                 return None
             return loaded(catalog, query.id, catalog.resources[query.resource_id])
+
+    def leave(self, unload: Unload) -> Unloaded | None:
+        """Decide an Unload of a resource that others hold, too. Return None if the loop has to decide it.
+
+        A thread of this process calls it. If it is interrupted behind the commit, the query is released, and the thread
+        does not get the answer.
+        """
+        with self.lock:
+            if self.waiting or self.closed or not leave(self.whole(), unload):
+                return None
+            try:
+                self.commit(((unload, unload.origin),))
+            except Exception:  # a full disk, or a defect: the loop will meet it again, and report it
+                return None
+            return Unloaded(unload.query_id)
 
     def begin_directly(
         self, query: Asked, request: bytes, ended: LoadWaiter, priority: int = 0, own: bool = False

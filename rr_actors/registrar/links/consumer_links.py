@@ -232,14 +232,18 @@ class Consumers:
         self.received_directly(line, message, more=True)
 
     @any_thread
-    def join_here(self, load: Load, hello: Hello) -> Loaded | None:
-        """Decide a Load of a thread of this process, with the Hello of its line, by the fast path.
+    def answer_here(self, message: Message, hello: Hello) -> Message | None:
+        """Answer a thread of this process, with the Hello of its line, by a fast path. Return None if it has to send.
 
-        Return None if the Load has to be sent.
+        An Unload is decided behind what the thread has asked of the loop before.
         """
         if self._provider.closed or interpreter.possible() or not self.listens_to(hello):
             return None
-        return self._provider.join(load)
+        if type(message) is Load:
+            return self._provider.join(message)
+        if type(message) is Unload and not self._provider.gathers() and not self._provider.node.dispatcher.is_behind():
+            return self._provider.leave(message)
+        return None
 
     def lost_directly(self, line: Any, _reason: Exception | None) -> None:
         """Note that a direct line is down: the consumer's link carries the answers that it waits for."""

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from rr_actors.hosting.process_node import ProcessNode
 from rr_actors.registrar.links.consumer_links import Consumers
-from rr_actors.registrar.model.messages import Load, Message
+from rr_actors.registrar.model.messages import Message
 from rr_actors.runtime.time_limits import left_until
 from rr_actors.wire.transport import Hello
 
@@ -25,7 +25,8 @@ class Provider(Protocol):
 class LocalLine:
     """An Exchange of a thread with a registrar of this process; for the registrar it is a Link.
 
-    The calling thread itself joins a resource that is loaded and held. The loop decides all other messages.
+    The calling thread itself joins a resource that is loaded and held, and leaves one that others hold, too. The loop
+    decides all other messages.
     """
 
     def __init__(self, node: ProcessNode, registrar: Provider, hello: Hello) -> None:
@@ -41,8 +42,8 @@ class LocalLine:
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
-        if type(message) is Load and (joined := consumers.join_here(message, self.hello)) is not None:
-            return joined
+        if (answer := consumers.answer_here(message, self.hello)) is not None:
+            return answer
         if not self._unanswered and self._answers.empty():
             self._unanswered.append(None)
         self._node.dispatcher.hand_over(consumers.received_here, self, message)
