@@ -71,7 +71,9 @@ def begin(path: str, levels: dict[str, int], send: Callable[[dict[str, Any]], bo
     logging.lastResort = Forwarder(path, send)  # pyright: ignore[reportAttributeAccessIssue] - a handler is what it is
     logging.basicConfig = _configure_if_asked
     for name, level in levels.items():
-        logging.getLogger(name).setLevel(level)
+        logger = logging.getLogger(name)
+        if logger.level != level:  # to set it goes through all loggers
+            logger.setLevel(level)
 
 
 _basic_config = logging.basicConfig

@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
@@ -69,7 +68,11 @@ def is_frozen() -> bool:
 def name_process(name: str) -> None:
     """Set the name by which ps, top and htop show this process; the kernel keeps 15 bytes. From any thread."""
     with contextlib.suppress(OSError):  # a system without /proc: the name stays "python"
-        Path("/proc/self/comm").write_bytes(name.encode()[:15])
+        comm = os.open("/proc/self/comm", os.O_WRONLY | os.O_CLOEXEC)
+        try:
+            os.write(comm, name.encode()[:15])
+        finally:
+            os.close(comm)
 
 
 def hurried(work: Callable[[A], object], argument: A) -> None:
