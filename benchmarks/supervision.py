@@ -56,7 +56,7 @@ def children(count: int, times: int) -> list[Row]:
         with _bare() as start_bare:
             seconds["bare"].append(start_bare(count))
         with tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir:
-            config = rr.SystemConfig(preload=[Empty.__module__])  # a bare child imports nothing of its own either
+            config = rr.SystemConfig(preload=(Empty.__module__,))  # a bare child imports nothing of its own either
             system = rr.System(rr.Supervisor(specs, max_restarts=2 * count), state_dir=state_dir, config=config)
             start = time.perf_counter()
             with system:
