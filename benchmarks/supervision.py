@@ -49,12 +49,17 @@ def crashes(times: int, held: int) -> list[Row]:
 
 
 def children(count: int, times: int) -> list[Row]:
-    """Children in processes of their own: started, and killed at once; beside as many bare forkserver children."""
-    seconds: dict[str, list[float]] = {"bare": [], "started": [], "back": []}
+    """Children in processes of their own: started, and killed at once; beside as many bare forkserver children.
+
+    Bare children do nothing, or have an event loop in a thread that listens on a socket.
+    """
+    seconds: dict[str, list[float]] = {"bare": [], "listening": [], "started": [], "back": []}
     specs = [rr.ChildSpec(Empty, id=f"child{number}") for number in range(count)]
     for _ in range(times):
         with _bare() as start_bare:
             seconds["bare"].append(start_bare(count))
+        with _bare("listen") as start_bare:
+            seconds["listening"].append(start_bare(count))
         with tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir:
             config = rr.SystemConfig(preload=(Empty.__module__,))  # a bare child imports nothing of its own either
             system = rr.System(rr.Supervisor(specs, max_restarts=2 * count), state_dir=state_dir, config=config)
@@ -62,15 +67,18 @@ def children(count: int, times: int) -> list[Row]:
             with system:
                 seconds["started"].append(time.perf_counter() - start)
                 seconds["back"].append(_kill_all(system))
-    bare, started, back = (Samples(tuple(taken)) for taken in seconds.values())
+    bare, listening, started, back = (Samples(tuple(taken)) for taken in seconds.values())
     return [
         Row(f"{count} bare forkserver children started and ready", bare.median, "s", max(bare.seconds)),
+        Row(f"{count} that have a loop and listen", listening.median, "s", max(listening.seconds)),
         Row(
             f"{count} children started and ready", started.median, "s", max(started.seconds), at_most=1.5 * count / 100
         ),
         Row("  beside the bare children", started.median / bare.median, "times", at_most=1.2),
+        Row("  beside those that listen", started.median / listening.median, "times"),
         Row(f"{count} children killed at once, until all are back", back.median, "s", max(back.seconds)),
         Row("  beside the bare children", back.median / bare.median, "times", at_most=1.5),
+        Row("  beside those that listen", back.median / listening.median, "times"),
     ]
 
 
@@ -143,11 +151,12 @@ def _kill_all(system: rr.System) -> float:
 
 _BARE = """
 import multiprocessing, sys, time
+from benchmarks import bare_child
 context = multiprocessing.get_context("forkserver")
 context.set_forkserver_preload({preload!r})  # so that a bare child is forked from as large a process
 for line in sys.stdin:
     pipes = [context.Pipe() for _ in range(int(line))]
-    children = [context.Process(target=there.send_bytes, args=(b"ready",)) for _, there in pipes]
+    children = [context.Process(target=bare_child.{target}, args=(there,)) for _, there in pipes]
     began = time.perf_counter()
     for child in children:
         child.start()
@@ -164,9 +173,13 @@ It is no file, as each child would import its main program again.
 
 
 @contextmanager
-def _bare() -> Iterator[Callable[..., float]]:
-    """A call that starts so many bare children and waits for the first word of each; seconds."""
-    code = _BARE.format(preload=list(PRELOAD))
+def _bare(target: str = "say") -> Iterator[Callable[..., float]]:
+    """A call that starts so many bare children and waits for the first word of each; seconds.
+
+    Args:
+        target: the name of the function of benchmarks/bare_child.py that they run.
+    """
+    code = _BARE.format(preload=["benchmarks.bare_child", *PRELOAD], target=target)
     process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin
     assert process.stdout
