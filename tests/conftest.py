@@ -22,7 +22,8 @@ from hypothesis import settings
 
 import rr_actors as rr
 from rr_actors.base.reporting import log
-from rr_actors.runtime import interpreter, thread_rules
+from rr_actors.registrar.engine import registrar_state
+from rr_actors.runtime import thread_rules
 from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, serve
 
 _MARK = "RR_ACTORS_TESTS"
@@ -151,8 +152,8 @@ def _describe(pid: int) -> str:
 @pytest.fixture(autouse=True)
 def short_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The handler of pytest-timeout raises, and waits for nothing: with it the main thread may take short cuts."""
-    handlers = tuple(number for number in interpreter._SIGNALS if number is not signal.SIGALRM)
-    monkeypatch.setattr(interpreter, "_SIGNALS", handlers)
+    handlers = tuple(number for number in registrar_state._SIGNALS if number is not signal.SIGALRM)
+    monkeypatch.setattr(registrar_state, "_SIGNALS", handlers)
 
 
 _handler: Any = pytest.LogCaptureFixture.handler

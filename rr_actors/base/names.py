@@ -56,12 +56,13 @@ def parse_server_id(text: object) -> ServerId:
     return ServerId(check_name(registrar, "registrar name"), check_name(server, "server name"))
 
 
-_parsed = functools.lru_cache(1024)(parse_server_id)
+parsed_server = functools.lru_cache(1024)(parse_server_id)
+"""Split a server id, a str, as parse_server_id() does, with a cache for the latest 1024 texts."""
 
 
 def parse_server(server: object) -> ServerId:
-    """Split a server id as parse_server_id() does, with a cache for the latest 1024 texts."""
-    return _parsed(server) if type(server) is str else parse_server_id(server)
+    """Split a server id as parse_server_id() does, with the cache if it is a str."""
+    return parsed_server(server) if type(server) is str else parse_server_id(server)
 
 
 def child_meant(name: str, paths: Collection[str]) -> str | None:

@@ -9,6 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypedDict, TypeVar, cast
 
 import msgspec
@@ -99,9 +100,17 @@ def status_callback(
     if not callable(callback):
         raise UsageError(f"{what}: expected a callable, got {type(callback).__name__} ({shown(callback)})")
     ours = described(callback, what)
-    with examined(what):
-        check_takes(callback, ("status",), who, field)
+    if not _takes_one(callback):
+        with examined(what):
+            check_takes(callback, ("status",), who, field)
     return ours
+
+
+def _takes_one(callback: Callable[..., Any]) -> bool:
+    """Return whether it is a plain function of one parameter, as nearly all are: no need to read its signature."""
+    if type(callback) is not FunctionType or callback.__dict__:  # which may have a signature for readers
+        return False
+    return callback.__code__.co_argcount == 1 and not callback.__code__.co_kwonlyargcount
 
 
 def checked_callback(callback: Callable[..., Any]) -> Callable[..., Any]:
@@ -196,7 +205,8 @@ def checked(
     options = cast("LoadKeywords", given)  # this call's own dict
     for name in options.keys() - names.__annotations__.keys():
         raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}")
-    options["timeout_s"] = time_limit(options.get("timeout_s", DEFAULTS.timeout_s))
+    if "timeout_s" in options:
+        options["timeout_s"] = time_limit(options["timeout_s"])
     codec = None if response_type is None else codec_for(response_type)
     on_status = options.get("on_status")
     status_callback(on_status, called.removesuffix("_async"))

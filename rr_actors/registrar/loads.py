@@ -8,8 +8,11 @@ it can, on a connection of its own (links/provider_link.py), and then there is n
 from __future__ import annotations
 
 import abc
+import asyncio
 import contextlib
 import functools
+import math
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
@@ -279,7 +282,7 @@ class Loads:
             RrError: how the load ended.
         """
         dispatcher = self.calls.dispatcher
-        if is_deciding() or not dispatcher.may_block():
+        if is_deciding() or asyncio._get_running_loop() is not None:  # else this thread is no loop's
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
             self.calls.check_may_wait()
         hearer = None if options.progress is False else hearer_of(options.progress, self.actor)
@@ -398,7 +401,7 @@ class Loads:
                 connections.cut(line)
 
         timeout_s = options.timeout_s
-        deadline = deadline_of(timeout_s)
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         try:
             line = connections.take(timeout_s)
             if line is None:

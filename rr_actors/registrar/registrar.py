@@ -24,7 +24,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
-from rr_actors.base.names import ServerId, check_name, new_id, parse_server
+from rr_actors.base.names import ServerId, check_name, new_id, parse_server, parsed_server
 from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode
@@ -285,7 +285,7 @@ class Consumer(abc.ABC):
             self._warn_in_event_loop("load", "load_async")
         wanted = checked("load", options, response_type) if options or response_type is not None else DEFAULTS
         owner, parent = self._holder(wanted.parent)
-        target = parse_server(server) if type(server) is str and "/" in server else self._target(server)
+        target = parsed_server(server) if type(server) is str and "/" in server else self._target(server)
         loads = owner._load_ways
         return (loads.wait if block else loads.begin)(target, self._encode(request), parent, wanted)
 

@@ -20,7 +20,7 @@ from rr_actors.base.reporting import tracebacks
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import trace_of
 from rr_actors.runtime import event_loop
-from rr_actors.runtime.user_loop import closing, is_coroutine
+from rr_actors.runtime.user_loop import COROUTINE, closing
 from rr_actors.runtime.workers import is_async
 
 _PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
@@ -77,7 +77,7 @@ def described(
             answer = fn(*args)
         except BaseException as error:
             raise Raised(error, describe) from None
-        if is_coroutine(answer):  # `fn` is a wrapper of an async function
+        if type(answer) is COROUTINE:  # `fn` is a wrapper of an async function
             return closing(answer, run_async(begin=lambda: answer))
         return answer
 

@@ -1,4 +1,4 @@
-"""The interpreter's shared parts: its lock, its signal handlers, its exit handlers, and patches of its modules."""
+"""The interpreter's shared parts: its lock, its exit handlers, and patches of its modules."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ import contextlib
 import os
 import queue
 import select
-import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable
 from types import ModuleType
-from typing import TypeVar
 
 from rr_actors.base.errors import UsageError
 
@@ -27,25 +23,32 @@ from rr_actors.base.errors import UsageError
 # as the loop had the lock just before. Python's interval is that of the whole process, so nothing is changed in a
 # process of the user's.
 
-A = TypeVar("A")
-
 _SWITCH_S = 0.0003  # Python's own 5 ms would slow each load; a shorter one would slow the callback's computing
-_AGAIN_S = 0.00001
+HURRIED_S = 0.00001
+"""The switch interval of a commit (CommitLog)."""
 
 
-class _Process:
+class Turns:
+    """The switch intervals of this process.
+
+    Attributes:
+        interval_s: the interval outside of commits: a callback may have set another.
+        hurried_s: HURRIED_S as Python rounds it; 0 in a process of the user's.
+    """
+
     def __init__(self) -> None:
-        self.interval_s = _SWITCH_S  # the interval outside of hurried(): a callback may have set another
-        self.hurried_s = 0.0  # _AGAIN_S as Python rounds it; 0 in a process of the user's
+        self.interval_s = _SWITCH_S
+        self.hurried_s = 0.0
 
 
-_process = _Process()
+turns = Turns()
+"""Those of this process."""
 
 
 def begin() -> None:
     """Make the switch interval short in this process, which this package has started."""
-    sys.setswitchinterval(_AGAIN_S)
-    _process.hurried_s = sys.getswitchinterval()
+    sys.setswitchinterval(HURRIED_S)
+    turns.hurried_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
 
 
@@ -73,62 +76,6 @@ def name_process(name: str) -> None:
             os.write(comm, name.encode()[:15])
         finally:
             os.close(comm)
-
-
-def hurried(work: Callable[[A], object], argument: A) -> None:
-    """Call work(argument), which releases Python's lock for a moment, and get the lock back soon. From any thread."""
-    if not _process.hurried_s:
-        work(argument)
-        return
-    interval_s = sys.getswitchinterval()
-    if interval_s != _process.hurried_s:  # otherwise another thread is in hurried(), too
-        _process.interval_s = interval_s
-    try:
-        sys.setswitchinterval(_AGAIN_S)
-        work(argument)
-    finally:
-        sys.setswitchinterval(_process.interval_s)
-
-
-# Interruptions: whether a Python signal handler may run in this thread between any two of its instructions.
-#
-# A handler may stop the system, or make another call that waits for the loop. The thread must then hold no lock that
-# the loop needs. Only the main thread runs handlers, and by default the only one is that of Ctrl-C, which raises.
-
-_SIGNALS = tuple(signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP})
-_LOOK_AGAIN_S = 0.05  # asking for all handlers takes some 40 us
-
-
-class _Interruptions:
-    def __init__(self) -> None:
-        self.main = threading.main_thread().ident
-        self.look_at = 0.0
-        self.found = False
-
-
-_interruptions = _Interruptions()
-
-
-def possible() -> bool:
-    """Return whether a handler other than that of Ctrl-C may interrupt the calling thread; up to 50 ms old."""
-    if threading.get_ident() != _interruptions.main:
-        return False
-    now = time.monotonic()
-    if now >= _interruptions.look_at:
-        _interruptions.found = any(_waits(signal.getsignal(number)) for number in _SIGNALS)
-        _interruptions.look_at = now + _LOOK_AGAIN_S
-    return _interruptions.found
-
-
-def _waits(handler: object) -> bool:
-    return callable(handler) and handler is not signal.default_int_handler
-
-
-def _look_who_is_main() -> None:
-    _interruptions.main = threading.main_thread().ident  # in a forked child it is the thread that forked
-
-
-os.register_at_fork(after_in_child=_look_who_is_main)
 
 
 # Exit handlers: a process that a fork server makes leaves the inherited handlers to the server. Those that this package

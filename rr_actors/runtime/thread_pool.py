@@ -26,7 +26,7 @@ import msgspec
 from rr_actors.base.errors import MailboxFull, Unavailable
 from rr_actors.base.scarcity import NO_THREAD
 from rr_actors.runtime.shielding import shielded
-from rr_actors.runtime.user_loop import Done, is_coroutine
+from rr_actors.runtime.user_loop import COROUTINE, Done
 
 _LIMIT = 4096  # the most threads at a time, if SystemConfig.workers_limit says nothing else
 _IDLE_S = 10.0  # a thread without work for that long ends
@@ -330,7 +330,7 @@ class Threads:
     def _run(self, worker: _Thread, task: Task) -> Task | None:
         """Run a task and return the next; without one the thread is idle."""
         result, error = task.call()
-        if task.key is None and not is_coroutine(result):
+        if task.key is None and type(result) is not COROUTINE:
             with self._lock:  # idle before `done` is called: a task that it submits finds this thread
                 following = self._next(worker)
             self._tell(task, result, error, following is None)

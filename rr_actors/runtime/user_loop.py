@@ -25,6 +25,9 @@ BLOCKED_S = 5.0
 _LOOK_AGAIN_S = 1.0  # a loop that is closed says nothing
 _NOT_USERS = ("rr_actors", "asyncio", "uvloop", "threading")  # packages of frames that are no user's
 
+COROUTINE: type[Any] = CoroutineType
+"""The type of what a call of an `async def` function returns; the code of each call compares with it directly."""
+
 Done = Callable[[Any, BaseException | None], object]
 """A function that is called at the end of a call, with (result, None) or (None, error)."""
 
@@ -45,7 +48,7 @@ def log_exception(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> 
 
 def is_coroutine(value: object) -> TypeGuard[Coroutine[Any, Any, Any]]:
     """Return whether `value` is the result of calling an `async def` function."""
-    return type(value) is CoroutineType
+    return type(value) is COROUTINE
 
 
 def closing(inner: Coroutine[Any, Any, Any], outer: Coroutine[Any, Any, Any]) -> Coroutine[Any, Any, Any]:

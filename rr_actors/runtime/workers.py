@@ -24,7 +24,7 @@ import msgspec
 from rr_actors.base.errors import Unavailable, text_of
 from rr_actors.base.reporting.log import Log
 from rr_actors.runtime.thread_pool import GETS_A_THREAD, REFUSED, WAITS, Task, Threads
-from rr_actors.runtime.user_loop import Done, UserLoop, is_coroutine, name_of
+from rr_actors.runtime.user_loop import COROUTINE, Done, UserLoop, name_of
 
 logger = Log("rr_actors")
 
@@ -214,7 +214,7 @@ class Workers:
             logger.error("%s raised in a worker", name_of(task.fn), exc_info=error)
 
     def _go_on(self, task: Task, result: Any, error: BaseException | None) -> Task | None:
-        if is_coroutine(result):  # returned by a plain function, such as a wrapper
+        if type(result) is COROUTINE:  # returned by a plain function, such as a wrapper
             try:
                 self._await_result(task, result)
                 return None

@@ -6,6 +6,7 @@ A thread that waits for its answer saves two hand-overs between threads. The oth
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import socket
@@ -14,7 +15,6 @@ from typing import Any
 
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.runtime.time_limits import left_until
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.handshake import DiallerHandshake
 from rr_actors.wire.segments import Segments
@@ -183,8 +183,7 @@ class BlockingLink:
 
 
 def _milliseconds_until(deadline: float) -> float | None:
-    left_s = left_until(deadline)
-    return None if left_s is None else left_s * 1e3
+    return None if deadline == math.inf else max(0.0, deadline - time.monotonic()) * 1e3
 
 
 # -- spin, then park ---------------------------------------------------------------------------------------------------

@@ -23,12 +23,12 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import loading, unloading
 from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.engine import direct_paths, registrar_state
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Fetch, Load, Loaded, Unload, Unloaded
 from rr_actors.registrar.model.rows import Drop, Phase, Put, ServedQuery
-from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, catalog_path, eventually, serve, wait_respawned
@@ -442,7 +442,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     heard: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
     try:
-        monkeypatch.setattr(interpreter._interruptions, "look_at", 0.0)
+        monkeypatch.setattr(registrar_state._interruptions, "look_at", 0.0)
         query = app.load("provider/thing", "x")
         assert len(app.queries()) == 2
         os.kill(os.getpid(), signal.SIGUSR1)
@@ -455,7 +455,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
         assert short_cuts == ["ServedQuery"]
     finally:
         signal.signal(signal.SIGUSR1, before)
-    monkeypatch.setattr(interpreter._interruptions, "look_at", 0.0)
+    monkeypatch.setattr(registrar_state._interruptions, "look_at", 0.0)
     app.load("provider/thing", "x")
     assert short_cuts == ["ServedQuery", "ServedQuery"]
 
@@ -470,7 +470,7 @@ def test_a_load_that_is_refused_leaves_nothing_whether_its_thread_or_the_loop_en
     serve(provider, "thing", load=fail)
     serve(provider, "other")
     app.load("provider/other", 0)  # the next goes by a connection of this thread's own
-    monkeypatch.setattr(interpreter, "possible", lambda: handled)
+    monkeypatch.setattr(direct_paths, "may_be_interrupted", lambda: handled)
     ended: list[str] = []
     post = actor_of(app).post
     monkeypatch.setattr(

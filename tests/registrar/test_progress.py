@@ -281,7 +281,7 @@ def test_the_last_report_is_sent_though_the_callback_returns_while_the_loop_wait
 
     @contextlib.contextmanager
     def lock() -> Iterator[None]:
-        assert reports.has_unsent("r")  # which a callback's thread asks: the loop ends this load, behind the report
+        assert not reports.forget_sent("r")  # a callback's thread asks: the loop ends this load, after the report
         yield
 
     registrar.lock = lock()
@@ -289,7 +289,7 @@ def test_the_last_report_is_sent_though_the_callback_returns_while_the_loop_wait
     turn, *arguments = planned.items[0]
     turn(*arguments)
     assert [(progressed.fraction, progressed.text) for progressed in sent] == [(1.0, "last")]
-    assert not reports.has_unsent("r")
+    assert reports.forget_sent("r")
 
 
 def test_one_that_listens_slowly_hears_the_newest_report(app: rr.Registrar, provider: rr.Registrar) -> None:
@@ -351,7 +351,7 @@ def test_nothing_is_kept_of_loads_that_have_ended(app: rr.Registrar, provider: r
     for current in served:
         current.progress(0.9)  # a thread that the callback has left behind
     reports, listeners = actor_of(provider).progress, actor_of(app).listeners
-    eventually(lambda: not reports._loads and not listeners._by_query and not listeners._heard)
+    eventually(lambda: not reports.loads and not listeners._by_query and not listeners._heard)
 
 
 # -- what goes wrong -----------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.runtime import interpreter
+from rr_actors.registrar.engine import registrar_state
 from rr_actors.storage import opening as catalogs
 from support import REPOSITORY, Workshop, eventually, serve
 from support_managers import Order, Shop
@@ -221,11 +221,11 @@ def test_in_a_forked_child_the_thread_that_forked_is_the_one_that_handlers_inter
     def fork() -> None:
         pid = os.fork()
         if pid == 0:
-            os._exit(0 if interpreter._interruptions.main == threading.get_ident() else 1)
+            os._exit(0 if registrar_state._interruptions.main == threading.get_ident() else 1)
         statuses.append(os.waitpid(pid, 0)[1])
 
     thread = threading.Thread(target=fork)
     thread.start()
     thread.join()
     assert statuses == [0]
-    assert interpreter._interruptions.main == threading.main_thread().ident
+    assert registrar_state._interruptions.main == threading.main_thread().ident

@@ -386,14 +386,14 @@ def test_figures_are_prometheus_text(shops: rr.System) -> None:
 
 def test_nobody_records_by_default_and_after_the_last_has_stopped(system: rr.System) -> None:
     watched = node_of(system).watched
-    assert not watched.recording
+    assert watched.level[0] <= 1
     with system.record() as one, system.record() as two:
-        assert watched.recording
+        assert watched.level[0] > 1
         one.stop()
-        assert watched.recording
+        assert watched.level[0] > 1
     two.stop()
 
-    assert not watched.recording
+    assert watched.level[0] <= 1
     assert not watched
 
 
@@ -660,13 +660,13 @@ def test_a_console_hears_what_is_recorded_and_only_while_it_listens(shops: rr.Sy
 
     thread = threading.Thread(target=read)
     thread.start()
-    eventually(lambda: watched.recording)
+    eventually(lambda: watched.level[0] > 1)
     query = app.load("robots/thing", Order("r2"))
     ends = {("app", "received", "Loaded"), ("robots", "ended", "load"), ("robots", "sent", "Loaded")}
     eventually(lambda: ends <= {(one.registrar, one.event, one.name) for one in heard})
     client.close()
     thread.join()
-    eventually(lambda: not watched.recording)
+    eventually(lambda: watched.level[0] <= 1)
     entries = list(heard)
 
     assert [one.seq for one in entries] == list(range(1, len(entries) + 1))

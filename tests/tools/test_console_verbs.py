@@ -1082,7 +1082,7 @@ def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Regis
     file = tmp_path / "one.jsonl"
     watched = node_of(shop).watched
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
-        eventually(lambda: watched.recording)
+        eventually(lambda: watched.level[0] > 1)
         query = app.load("shop/thing", Order("r2"))
         eventually(lambda: "Loaded" in file.read_text())
         recording.send_signal(signal.SIGINT)
@@ -1120,7 +1120,7 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
     watched, feed = node_of(shop).watched, console_of(shop).feed
     asked = command("sequence", query.id, "--seconds", 4)
     with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drawing:
-        eventually(lambda: watched.recording)
+        eventually(lambda: watched.level[0] > 1)
         (reader,) = feed._readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
@@ -1141,7 +1141,7 @@ def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so
     query = app.load("shop/thing", Order("chair"))
     watched, feed = node_of(shop).watched, console_of(shop).feed
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
-        eventually(lambda: watched.recording)
+        eventually(lambda: watched.level[0] > 1)
         (reader,) = feed._readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
@@ -1288,9 +1288,9 @@ def test_nothing_that_users_write_controls_the_terminal(app: rr.Registrar, shop:
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
     assert "recorded" in said("record", tmp_path / "one", "--seconds", "0.2")
     watched = node_of(shop).watched
-    eventually(lambda: not watched.recording)
+    eventually(lambda: watched.level[0] <= 1)
     with subprocess.Popen(command("record", tmp_path / "two"), stdout=subprocess.PIPE, text=True) as recording:
-        eventually(lambda: watched.recording)
+        eventually(lambda: watched.level[0] > 1)
         shop.stop()
         told, _ = recording.communicate(timeout=20)
 
@@ -1304,7 +1304,7 @@ def test_sequence_without_a_file_draws_what_happens_now(shop: rr.System, app: rr
     with subprocess.Popen(
         command("sequence", query.id, "--seconds", "3"), stdout=subprocess.PIPE, text=True
     ) as drawing:
-        eventually(lambda: watched.recording)
+        eventually(lambda: watched.level[0] > 1)
         query.unload()
         told, _ = drawing.communicate(timeout=20)
 

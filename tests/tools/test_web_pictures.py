@@ -285,7 +285,7 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> Gate:
 
 
 def is_recorded(system: rr.System) -> bool:
-    return node_of(system).watched.recording
+    return node_of(system).watched.level[0] > 1
 
 
 def test_two_clicks_on_record_leave_one_recording_and_stop_ends_it(

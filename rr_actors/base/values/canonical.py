@@ -51,7 +51,7 @@ from rr_actors.base.values.fitting import (
     restore_or_mark,
     write_tree,
 )
-from rr_actors.base.values.packing import LEAVES, field_names, packed
+from rr_actors.base.values.packing import LEAVES, encode_packed, field_names, packed
 from rr_actors.base.values.type_shapes import (
     PLAIN_DATA,
     Shape,
@@ -77,7 +77,7 @@ def encode(value: object, what: str = "request") -> bytes:
         NotSerializable: a part is not plain data; `.path` leads to it ("request.options[2].callback").
     """
     try:
-        return packed(value)
+        return encode_packed(value) if type(value) in LEAVES else packed(value)
     except Exception as error:
         _refuse_value(value, what, error)
 

@@ -41,7 +41,7 @@ LEAVES = frozenset({type(None), bool, int, float, str, bytes})
 
 def packed(value: Any) -> bytes:
     """Return the canonical bytes of a value."""
-    return _encode(value if type(value) in LEAVES else _pack(value))
+    return encode_packed(value if type(value) in LEAVES else _pack(value))
 
 
 def _pack(value: Any) -> Any:
@@ -61,7 +61,7 @@ def _pack(value: Any) -> Any:
     if kind in FLAT:
         return _pack_flat(value)
     if kind in NESTED:
-        return Ext(NESTED[kind].code, _encode(_pack(list(value)) if kind is tuple else _ordered(value)))
+        return Ext(NESTED[kind].code, encode_packed(_pack(list(value)) if kind is tuple else _ordered(value)))
     return _pack_foreign(value) or _pack_named(value, _layout_of(value))
 
 
@@ -73,7 +73,7 @@ def _pack_dict(value: dict[Any, Any]) -> Any:
     if {str}.issuperset(map(type, value)):
         return value if _all_leaves(value.values()) else {key: _pack(item) for key, item in value.items()}
     if all(map(_is_plain_key, value)):
-        pairs = [(_encode(key), packed(value[key])) for key in sorted(value)]
+        pairs = [(encode_packed(key), packed(value[key])) for key in sorted(value)]
     else:
         pairs = sorted((packed(key), packed(item)) for key, item in value.items())
     return msgspec.Raw(_header(len(pairs), 0x80, 0xDE) + b"".join(key + item for key, item in pairs))
@@ -104,7 +104,7 @@ def _pack_own(value: Any, codec: TypeCodec) -> Ext:
     try:
         data = codec.encode(value)
         done = "returned what cannot be sent:"
-        return Ext(CODEC, _encode(codec.name) + packed(data))
+        return Ext(CODEC, encode_packed(codec.name) + packed(data))
     except NoForm:
         raise
     except Exception as error:
@@ -115,17 +115,17 @@ def _pack_flat(value: Any) -> Any:
     if type(value) is datetime.datetime and value.tzinfo is not None:
         return value  # MessagePack has a form for an instant
     kind = FLAT[type(value)]
-    return Ext(kind.code, _encode(kind.plain(value)))
+    return Ext(kind.code, encode_packed(kind.plain(value)))
 
 
 def _pack_foreign(value: Any) -> Ext | None:
     """Return the extension for a value of numpy or pydantic; None for any other value."""
     form = numpy_form(value)
     if form is not None:
-        return Ext(form[0], _encode(form[1]))
+        return Ext(form[0], encode_packed(form[1]))
     cls = _class_of(value)
     if is_pydantic_model(cls):
-        return Ext(NAMED, _encode(cls.__name__) + packed(pydantic_form(value)))
+        return Ext(NAMED, encode_packed(cls.__name__) + packed(pydantic_form(value)))
     return None
 
 
@@ -141,7 +141,8 @@ def _pack_unknown(value: Any) -> Any:
     return made
 
 
-_encode = msgspec.msgpack.Encoder(order="sorted", enc_hook=_pack_unknown).encode
+encode_packed = msgspec.msgpack.Encoder(order="sorted", enc_hook=_pack_unknown).encode
+"""Return the canonical bytes of a value that is packed, as a leaf always is."""
 
 
 # -- records: dataclasses and similar classes ----------------------------------------------------------------------
@@ -162,7 +163,7 @@ def _layout_of(value: Any) -> _Layout:
     cls = _class_of(value)
     key = id(cls)
     layout = _Layout(
-        _encode(cls.__name__), tuple(_open_fields(value)), weakref.ref(cls, lambda _: _layouts.pop(key, None))
+        encode_packed(cls.__name__), tuple(_open_fields(value)), weakref.ref(cls, lambda _: _layouts.pop(key, None))
     )
     _layouts[key] = layout
     return layout
@@ -171,10 +172,10 @@ def _layout_of(value: Any) -> _Layout:
 def _pack_named(value: Any, layout: _Layout) -> Ext:
     if not layout.open:
         try:
-            return Ext(NAMED, layout.head + _encode(value))
+            return Ext(NAMED, layout.head + encode_packed(value))
         except TypeError:  # the value may differ from its annotations: a dict with other keys than strings
-            return Ext(NAMED, layout.head + _encode(_with_packed(value, field_names(value) or ())))
-    return Ext(NAMED, layout.head + _encode(_with_packed(value, layout.open)))
+            return Ext(NAMED, layout.head + encode_packed(_with_packed(value, field_names(value) or ())))
+    return Ext(NAMED, layout.head + encode_packed(_with_packed(value, layout.open)))
 
 
 def plain_form(value: Any) -> bytes:

@@ -213,12 +213,14 @@ def load_done(decision: Decision, done: LoadDone) -> None:
             if decision.forget(catalog.waiting, query_id) is not None:
                 decision.cause(Reply(catalog.queries[query_id].origin, loaded(catalog, query_id, resource)))
         # The owner may have unloaded it while it was loading; its present holders came after that.
-        decision.effects += answers_to_owners(decision, resource, None)
+        if catalog.owners:
+            decision.effects += answers_to_owners(decision, resource, None)
         if resource.id in catalog.ranked:
             balance(decision, resource.id)
     else:
         retire(decision, resource)
-    start_deferred(decision, resource.id)
+    if catalog.deferred or catalog.late:
+        start_deferred(decision, resource.id)
 
 
 def load_erred(decision: Decision, erred: LoadErred) -> None:

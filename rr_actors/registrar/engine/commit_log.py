@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
 import time
 from asyncio import AbstractEventLoop, TimerHandle
@@ -16,7 +17,7 @@ from rr_actors.hosting.run_files import Watched
 from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved
 from rr_actors.registrar.model.rows import PENDING, Change, Content, Drop, Held, Put, Row
 from rr_actors.registrar.model.store import Store
-from rr_actors.runtime import interpreter
+from rr_actors.runtime.interpreter import HURRIED_S, turns
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.workers import Workers
 
@@ -146,17 +147,30 @@ class CommitLog:
 
     @with_lock
     def _write(self, changes: Sequence[Change]) -> None:
-        if self.watched is not None and self.watched.level[0] > 1:
-            began = time.perf_counter()
-            interpreter.hurried(self.store.commit, changes)
+        began = time.perf_counter() if self.watched is not None and self.watched.level[0] > 1 else 0.0
+        if turns.hurried_s:
+            self._write_hurried(changes)
+        else:
+            self.store.commit(changes)
+        if began:
             self.timed_s += time.perf_counter() - began
             self.timed += 1
-        else:
-            interpreter.hurried(self.store.commit, changes)
         self.count += 1
         if not self._tidying and self.store.wants_tidying():
             self._tidying = True
             self._on_loop(self._tidy_when_quiet)
+
+    @with_lock
+    def _write_hurried(self, changes: Sequence[Change]) -> None:
+        """Write changes, which releases Python's lock for a moment, and get the lock back soon."""
+        interval_s = sys.getswitchinterval()
+        if interval_s != turns.hurried_s:  # otherwise another thread commits, too
+            turns.interval_s = interval_s
+        try:
+            sys.setswitchinterval(HURRIED_S)
+            self.store.commit(changes)
+        finally:
+            sys.setswitchinterval(turns.interval_s)
 
     @with_lock
     def save_soon(self) -> None:

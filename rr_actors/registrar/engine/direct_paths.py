@@ -7,12 +7,11 @@ from typing import Protocol
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.loading import join, loaded
 from rr_actors.registrar.core.unloading import leave
-from rr_actors.registrar.engine.registrar_state import LoadWaiter, RegistrarState, answered_by_line
+from rr_actors.registrar.engine.registrar_state import LoadWaiter, RegistrarState, answered_by_line, may_be_interrupted
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import ABSENT
 from rr_actors.registrar.model.messages import Load, Loaded, Unload, Unloaded
 from rr_actors.registrar.model.rows import OK, PENDING, Held
-from rr_actors.runtime import interpreter
 
 
 class Asked(Protocol):
@@ -82,7 +81,7 @@ class DirectPaths(RegistrarState):
             self.loads[id] = ended  # without the lock: the id is new, and each dict takes it in one step
             asked = Held(id, registrar, server, request, None, "", "", 0, seq, PENDING, OK, priority, own)
             self.catalog.in_flight[id] = asked
-        elif interpreter.possible():
+        elif may_be_interrupted():
             return None
         else:
             with self.enter():
@@ -99,7 +98,7 @@ class DirectPaths(RegistrarState):
 
     def hold(self, answer: Loaded | c.Got) -> bool:
         """Add the row of a query that a thread has loaded. Return False if the answer has to be decided, as Got."""
-        if self.closed or interpreter.possible():
+        if self.closed or may_be_interrupted():
             return False
         with self.lock:
             catalog = self.catalog
@@ -116,7 +115,7 @@ class DirectPaths(RegistrarState):
 
     def forget_refused(self, query_id: str) -> bool:
         """Forget a load that was refused to its thread. Return False if the loop may know of it, and has to end it."""
-        if interpreter.possible():
+        if may_be_interrupted():
             return False
         with self.lock:
             catalog = self.whole()
@@ -133,7 +132,7 @@ class DirectPaths(RegistrarState):
         says whether it is still held. After True the thread must tell the provider. It then passes the answer to
         forget_released(), or leaves the release to the registrar's actor.
         """
-        if self.closed or interpreter.possible():
+        if self.closed or may_be_interrupted():
             return False
         with self.lock:
             if self.waiting or self.closed or query_id in self.unloads:

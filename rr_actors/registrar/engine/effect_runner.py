@@ -101,7 +101,7 @@ class EffectRunner:
         for effect in effects:
             if type(effect) is e.Reply and answer is None:
                 answer = effect
-            elif type(effect) is not e.Happened or self._registrar.node.watched:
+            elif type(effect) is not e.Happened or self._registrar.node.watched.level[0]:
                 return None
         return _nothing if answer is None else self._consumers.by_line(answer.message)
 
@@ -266,7 +266,7 @@ class EffectRunner:
 
     def _happened(self, effect: e.Happened) -> None:
         registrar, resource = self._registrar, effect.resource
-        if not registrar.node.watched:
+        if not registrar.node.watched.level[0]:
             return
         facts: dict[str, Any] = {"request": text_of_value(resource.request), "detail": effect.detail}
         if effect.notice is not None:

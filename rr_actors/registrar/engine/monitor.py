@@ -29,13 +29,13 @@ from rr_actors.hosting.streams import Publishers
 from rr_actors.registrar.core.decide import Item, refuse_uncommitted
 from rr_actors.registrar.engine.direct_paths import DirectPaths
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
+from rr_actors.registrar.engine.registrar_state import may_be_interrupted
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, Message, Noticed
 from rr_actors.registrar.model.rows import Change, Held, Notice
 from rr_actors.registrar.model.store import Store
-from rr_actors.runtime import interpreter
 from rr_actors.runtime.thread_rules import any_thread, on_loop
 from rr_actors.wire.transport import Exchange, Hello
 
@@ -244,7 +244,7 @@ class RegistrarMonitor:
         in order.
         """
         registrar = self._registrar
-        if registrar.closed or self._gathers or interpreter.possible():  # in a fork nobody releases the lock
+        if registrar.closed or self._gathers or may_be_interrupted():  # in a fork nobody releases the lock
             return False
         with registrar.lock:
             if registrar.closed or self._waiting:

@@ -153,16 +153,20 @@ class Reporting(Protocol):
 
 @on_loop
 class ProgressReports:
-    """The reports of all loads of one registrar."""
+    """The reports of all loads of one registrar.
+
+    Attributes:
+        loads: by resource, the reports of each load callback that has made some, and has not returned.
+    """
 
     def __init__(self, registrar: Reporting) -> None:
         self._registrar = registrar
-        self._loads: dict[str, _Reports] = {}
+        self.loads: dict[str, _Reports] = {}
 
     @any_thread
     def report(self, resource_id: str, fraction: float, text: str) -> None:
         """Keep a report, and have it sent soon; does not wait."""
-        reports = self._loads.get(resource_id) or self._loads.setdefault(resource_id, _Reports())
+        reports = self.loads.get(resource_id) or self.loads.setdefault(resource_id, _Reports())
         reports.newest = (fraction, text)
         reports.unsent.append(reports.newest)
         self._want_turn(resource_id, reports)
@@ -170,13 +174,13 @@ class ProgressReports:
     @any_thread
     def newest(self, resource_id: str) -> tuple[float, str] | None:
         """Return the last report of a load that runs; None if it has made none."""
-        reports = self._loads.get(resource_id)
+        reports = self.loads.get(resource_id)
         return None if reports is None else reports.newest
 
     @any_thread
     def said(self) -> dict[str, str]:
         """Return the last reports of all loads that run, as texts, by the queries that wait for them."""
-        reports = {id: shown_progress(*one.newest) for id, one in self._loads.copy().items()}
+        reports = {id: shown_progress(*one.newest) for id, one in self.loads.copy().items()}
         if not reports:
             return {}
         with self._registrar.lock:
@@ -186,25 +190,23 @@ class ProgressReports:
 
     def greet(self, origin: str, query_id: str) -> None:
         """Send the newest report to a consumer that has just begun to wait for a load."""
-        if self._loads:
+        if self.loads:
             self._registrar.node.dispatcher.call(self._greet, origin, query_id)
 
     def end(self, resource_id: str) -> None:
         """Send the last report of a callback that has returned, and take no more of it."""
-        reports = self._loads.pop(resource_id, None)
+        reports = self.loads.pop(resource_id, None)
         if reports is not None and reports.unsent and not self._registrar.closed:
             self._send(resource_id, reports)
 
     @any_thread
-    def has_unsent(self, resource_id: str) -> bool:
-        """Return whether a report has to be sent before the load's answer."""
-        reports = self._loads.get(resource_id)
-        return reports is not None and bool(reports.unsent)
-
-    @any_thread
-    def forget(self, resource_id: str) -> None:
-        """Drop the reports of a callback that has returned, as none is unsent."""
-        self._loads.pop(resource_id, None)
+    def forget_sent(self, resource_id: str) -> bool:
+        """Drop the reports of a callback that has returned. Return False if one has to be sent before the answer."""
+        reports = self.loads.get(resource_id)
+        if reports is not None and reports.unsent:
+            return False
+        self.loads.pop(resource_id, None)
+        return True
 
     @any_thread
     def _want_turn(self, resource_id: str, reports: _Reports) -> None:
@@ -216,13 +218,13 @@ class ProgressReports:
             self._registrar.node.dispatcher.call(self._turn, resource_id, reports)
 
     def _turn(self, resource_id: str, reports: _Reports) -> None:
-        if self._registrar.closed or self._loads.get(resource_id) is not reports:
+        if self._registrar.closed or self.loads.get(resource_id) is not reports:
             return
         if reports.unsent:
             if self._send(resource_id, reports):
                 self._registrar.node.dispatcher.loop.call_later(INTERVAL_S, self._turn, resource_id, reports)
             else:  # a thread that outlived the callback has reported
-                self._loads.pop(resource_id, None)
+                self.loads.pop(resource_id, None)
             return
         reports.turn.append(None)
         if reports.unsent:  # a report came after the check above
@@ -236,7 +238,7 @@ class ProgressReports:
             catalog = registrar.whole()
             resource_id = catalog.waiting.get(query_id) or parked_on(catalog, query_id) or ""
             resource = catalog.resources.get(resource_id)
-        reports = self._loads.get(resource_id)
+        reports = self.loads.get(resource_id)
         if resource is not None and reports is not None and not reports.unsent:  # an unsent one will go to all
             registrar.consumers.hint(origin, Progressed([query_id], resource_id, resource.server, *reports.newest))
             registrar.consumers.flush()

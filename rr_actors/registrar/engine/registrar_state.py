@@ -15,7 +15,10 @@ whole().
 from __future__ import annotations
 
 import itertools
+import os
+import signal
 import threading
+import time
 from asyncio import AbstractEventLoop
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -256,3 +259,45 @@ class RegistrarState:
     def down(self) -> RegistrarDown:
         """Return the error that callers of a closed registrar get."""
         return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
+
+
+# -- interruptions -----------------------------------------------------------------------------------------------------
+#
+# A Python signal handler may run in the main thread between any two of its instructions. It may stop the system, or
+# make another call that waits for the loop. So the thread must not hold a lock then that the loop needs. By default the
+# only handler is that of Ctrl-C, which raises.
+
+_SIGNALS = tuple(signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP})
+_LOOK_AGAIN_S = 0.05  # asking for all handlers takes some 40 us
+
+
+class _Interruptions:
+    def __init__(self) -> None:
+        self.main = threading.main_thread().ident
+        self.look_at = 0.0
+        self.found = False
+
+
+_interruptions = _Interruptions()
+
+
+def may_be_interrupted() -> bool:
+    """Return whether a handler other than that of Ctrl-C may interrupt the calling thread; up to 50 ms old."""
+    if threading.get_ident() != _interruptions.main:
+        return False
+    now = time.monotonic()
+    if now >= _interruptions.look_at:
+        _interruptions.found = any(_waits(signal.getsignal(number)) for number in _SIGNALS)
+        _interruptions.look_at = now + _LOOK_AGAIN_S
+    return _interruptions.found
+
+
+def _waits(handler: object) -> bool:
+    return callable(handler) and handler is not signal.default_int_handler
+
+
+def _look_who_is_main() -> None:
+    _interruptions.main = threading.main_thread().ident  # in a forked child it is the thread that forked
+
+
+os.register_at_fork(after_in_child=_look_who_is_main)

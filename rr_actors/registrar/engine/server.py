@@ -74,7 +74,7 @@ from rr_actors.registrar.model.rows import (
 from rr_actors.runtime.callback_errors import Raised, described, log_raised, traceback_of
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.time_limits import Probes
-from rr_actors.runtime.user_loop import Done, closing, is_coroutine
+from rr_actors.runtime.user_loop import COROUTINE, Done, closing
 from rr_actors.runtime.workers import is_async
 from rr_actors.wire.name_service import LABELS_BYTES
 
@@ -245,7 +245,7 @@ def _role_of(current: Current) -> Role:
 def begin(current: Current) -> None:
     """Make current() return `current` in this context, which belongs to the callback."""
     _current.set(current)
-    if serving(current).node.watched.recording:
+    if serving(current).node.watched.level[0] > 1:
         _record("began", current)
 
 
@@ -495,10 +495,9 @@ class ServerActor:
 
     def _loaded(self, resource: Resource, began_s: float, response: bytes) -> bool:
         """Decide LoadDone in the thread that ran the callback; return False if the loop has to."""
-        progress = self.registrar.progress
-        if self.too_long(resource, response) is not None or progress.has_unsent(resource.id):
+        reports = self.registrar.progress
+        if self.too_long(resource, response) is not None or (reports.loads and not reports.forget_sent(resource.id)):
             return False
-        progress.forget(resource.id)
         self._let_in(resource)
         is_decided = self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
         if is_decided:
@@ -524,7 +523,7 @@ class ServerActor:
     def _tell(self, resource: Resource, news: StreamNews) -> None:
         """Tell the watchers of the system what has happened to a stream. From any thread."""
         node = self.registrar.node
-        if not node.watched:
+        if not node.watched.level[0]:
             return
         facts = {"registrar": self.registrar.name, "server": self.origin, "resource_id": resource.id}
         facts |= {"request": text_of_value(resource.request), "stream": news.stream.name, "detail": news.stream.name}
@@ -812,7 +811,7 @@ class ServerActor:
         current = Current(*facts)
         run = self._runs[role] if run is None else run
         workers = self.registrar.workers
-        if self.registrar.node.watched.recording:
+        if self.registrar.node.watched.level[0] > 1:
             done, at_once = _recorded(current, done, at_once)
         try:
             if role.in_order:
@@ -875,7 +874,7 @@ def _wrap(
             begin(current)
             try:
                 answer = callback(*arguments(resource), *more)
-                if is_coroutine(answer):  # the callback is a wrapper or a lambda around an async function
+                if type(answer) is COROUTINE:  # the callback is a wrapper or a lambda around an async function
                     return closing(answer, run_async(current, resource, *more, begun=answer))
                 answer = result(answer)
             except BaseException as error:

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.monitor import RegistrarBase
+from rr_actors.registrar.engine.registrar_state import may_be_interrupted
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
@@ -32,7 +33,6 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
     retired,
 )
-from rr_actors.runtime import interpreter
 from rr_actors.runtime.thread_rules import any_thread, on_loop
 from rr_actors.wire.transport import Hello, Link
 
@@ -237,7 +237,7 @@ class Consumers:
 
         An Unload is decided behind what the thread has asked of the loop before.
         """
-        if self._provider.closed or interpreter.possible() or not self.listens_to(hello):
+        if self._provider.closed or may_be_interrupted() or not self.listens_to(hello):
             return None
         if type(message) is Load:
             return self._provider.join(message)
