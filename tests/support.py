@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import rr_actors as rr
 from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.model.messages import Unload
-from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.thread_connections import BlockingLink
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = REPOSITORY / "tests"

@@ -1,20 +1,30 @@
-"""ThreadConnections: connections to one other process, each for one thread of this process at a time.
+"""Connections of threads: a thread that waits for an answer writes the question and reads the answer itself.
 
-A thread that waits for an answer writes the question and reads the answer itself, without this process's event loop.
-Asks of actors use this, and loads and unloads of registrars. A thread has its connection alone until it gives it back.
-If no connection is available, the question goes over the loop's link.
+It saves two hand-overs between threads, as this process's event loop has no part in it. The other end is an ordinary
+link. Asks of actors use these connections, and loads and unloads of registrars. A thread has its connection alone until
+it gives it back. If no connection is available, the question goes over the loop's link.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
+import os
+import select
+import socket
 import threading
 import time
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from rr_actors.base.errors import RrError
-from rr_actors.wire.transport import Exchange
+from rr_actors.base.errors import RrError, Unavailable
+from rr_actors.base.scarcity import wanted_by
+from rr_actors.wire.frames import FrameReader, framed
+from rr_actors.wire.handshake import DiallerHandshake
+from rr_actors.wire.segments import Segments
+from rr_actors.wire.transport import Exchange, Hello
+from rr_actors.wire.unix_link import Wire
+from rr_actors.wire.unix_sockets import SocketDir, pid_of
 
 _DIAL_S = 0.1  # a process with a slower handshake is busy, or hangs: then the loop waits for it
 _AGAIN_S = 1.0
@@ -126,3 +136,218 @@ class ThreadConnections(Generic[E]):
         while self._idle:
             with contextlib.suppress(IndexError):  # another thread was faster
                 self._idle.pop().close()
+
+
+# -- one connection ----------------------------------------------------------------------------------------------------
+
+_CHUNK_BYTES = 65536
+_DONT_WAIT = int(socket.MSG_DONTWAIT)  # a plain number: an enum's member is converted in each call
+
+
+class BlockingLink:
+    """An Exchange over a Unix socket.
+
+    Args:
+        sockets: the directory of the system's sockets. It stays open: an interrupted thread loses no descriptor.
+        key: the system's 32 secret bytes.
+        address: the address of the transport to connect to.
+        timeout_s: how long the handshake may take.
+
+    Attributes:
+        parcels: the large values of this connection.
+
+    Raises:
+        RrError: the error with which the other side refused. Unavailable: no transport listens at the address.
+    """
+
+    def __init__(
+        self,
+        sockets: SocketDir,
+        key: bytes,
+        address: str,
+        hello: Hello,
+        wire: Wire,
+        timeout_s: float,
+        segments: Segments,
+    ) -> None:
+        self._limit = wire.frame_limit_bytes
+        self._reader: FrameReader[Any] = FrameReader(wire.decoder, self._limit)
+        self._spin = AdaptiveSpin()
+        self.parcels = segments.parcels(pid_of(address))
+        try:
+            self._socket = sockets.connect(address)
+        except (OSError, ValueError) as error:
+            why = wanted_by(error) or f"nobody listens at {address}: {error}"
+            raise Unavailable(f"cannot connect to {hello.to}: {why}") from error
+        try:
+            self._socket.setblocking(True)
+            poll = select.poll()
+            poll.register(self._socket, select.POLLIN)
+            self._readable = poll.poll
+            self._shake_hands(DiallerHandshake(key, hello), timeout_s)
+        except OSError as error:
+            self.close()
+            raise Unavailable(f"{hello.to}: the handshake failed: {error}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _shake_hands(self, handshake: DiallerHandshake, timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not handshake.done:
+            data = self._receive(max(deadline, time.monotonic() + 0.001))
+            answer = handshake.receive(data)
+            if answer:
+                self._socket.sendall(answer)
+        if handshake.refusal is not None:
+            raise handshake.refusal
+        assert handshake.welcome is not None
+        self.epoch = handshake.welcome.epoch
+
+    def exchange(self, message: Any, deadline: float) -> Any:
+        frame = framed(message, self._limit)
+        sent = self._send(frame)
+        if sent < len(frame):  # seldom: the buffer of the socket is empty before
+            self._send_rest(memoryview(frame)[sent:], deadline)
+        messages = self._reader.feed(self._receive_soon(deadline)) or self._rest(deadline)
+        return messages[0]
+
+    def _send(self, data: bytes | memoryview) -> int:
+        """Write as much as the kernel takes at once; return the number of bytes."""
+        try:
+            return self._socket.send(data, _DONT_WAIT)
+        except BlockingIOError:
+            return 0
+
+    def _send_rest(self, rest: memoryview, deadline: float) -> None:
+        """Write the rest as the other side reads it."""
+        poll = select.poll()
+        poll.register(self._socket, select.POLLOUT)
+        while rest:
+            if not poll.poll(_milliseconds_until(deadline)):
+                raise TimeoutError
+            rest = rest[self._send(rest) :]
+
+    def _rest(self, deadline: float) -> list[Any]:
+        """Read until a message is complete, and return all messages that are then complete."""
+        while True:
+            if self._reader.error is not None or self._reader.ended:
+                raise ConnectionResetError(f"the link has ended: {self._reader.error or 'closed'}")
+            if messages := self._reader.feed(self._receive(deadline)):
+                return messages
+
+    def _receive_soon(self, deadline: float) -> bytes:
+        """Wait for data as _receive() does, but spin first: a quick answer comes before a thread could wake up."""
+        began = time.monotonic()
+        if deadline - began < SPIN_LIMIT_S:
+            return self._receive(deadline)
+        spin = self._spin
+        if not spin.worthwhile:
+            data = self._receive(deadline)
+            spin.parked(time.monotonic() - began)
+            return data
+        while True:
+            os.sched_yield()  # for the thread that answers, if it waits for this core
+            try:
+                data = self._read(_DONT_WAIT)  # this call releases Python's lock for other threads
+            except BlockingIOError:
+                data = b""
+            took_s = time.monotonic() - began
+            if data or took_s >= SPIN_LIMIT_S:
+                break
+        spin.spun(took_s, bool(data))
+        return data or self._receive(deadline)
+
+    def _receive(self, deadline: float) -> bytes:
+        # not recv() alone: it also wakes up when the other side has read the question, which costs both sides time
+        if not self._readable(_milliseconds_until(deadline)):
+            raise TimeoutError
+        return self._read()
+
+    def _read(self, flags: int = 0) -> bytes:
+        data = self._socket.recv(_CHUNK_BYTES, flags)
+        if not data:
+            raise ConnectionResetError("closed by the other side")
+        return data
+
+    def fileno(self) -> int:
+        """Return the descriptor of the connection."""
+        return self._socket.fileno()
+
+    def leave(self) -> None:
+        """Write nothing any more. The other side ends the connection when it has read all that was written."""
+        with contextlib.suppress(OSError):  # the connection is lost
+            self._socket.shutdown(socket.SHUT_WR)
+
+    def has_ended(self) -> bool:
+        """Read and drop all data that has arrived; return whether the connection has ended."""
+        try:
+            while self._socket.recv(_CHUNK_BYTES, _DONT_WAIT):
+                pass
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        return True
+
+    def cut(self) -> None:
+        with contextlib.suppress(OSError):  # the connection is lost, or its thread has closed it
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+        self.parcels.close()
+
+
+def _milliseconds_until(deadline: float) -> float | None:
+    return None if deadline == math.inf else max(0.0, deadline - time.monotonic()) * 1e3
+
+
+# -- spin, then park ---------------------------------------------------------------------------------------------------
+#
+# Waking a thread takes longer than a quick answer. Spinning instead occupies a core, and is in vain if the answer takes
+# longer, or if other threads have the core or Python's lock. So the thread remembers how useful spinning was lately, as
+# adaptive mutexes do.
+
+SPIN_LIMIT_S = 200e-6
+
+_QUICK_S = 2 * SPIN_LIMIT_S  # a parked thread sees the answer only when it has been woken
+_EARNED_SPINNING_S = 50e-6  # two wake-ups are saved
+_EARNED_PARKED_S = 6e-6
+_BUDGET_MAX_S = 2 * SPIN_LIMIT_S
+_BUDGET_MIN_S = -20e-3
+
+
+class AdaptiveSpin:
+    """Decides for one thread at a time whether to spin for the next answer.
+
+    It keeps an account of time. Spinning in vain costs the time it took, including what other threads took meanwhile.
+    An answer that comes while spinning earns 50 µs, a quick one to a parked thread 6 µs, a slow one nothing. With
+    nothing left, a thread does not spin. So any number of slow answers cost SPIN_LIMIT_S twice in all. Answers that are
+    always a little late, or always wait for other threads during the spinning, cost 6 µs each.
+
+    Attributes:
+        worthwhile: whether to spin for the next answer, for SPIN_LIMIT_S at most.
+    """
+
+    __slots__ = ("_budget_s", "worthwhile")
+
+    def __init__(self) -> None:
+        self._budget_s = SPIN_LIMIT_S
+        self.worthwhile = True
+
+    def spun(self, took_s: float, answered: bool) -> None:
+        """Note that spinning has ended after `took_s` seconds, and whether the answer had come by then."""
+        if answered and took_s <= SPIN_LIMIT_S:
+            if self._budget_s < _BUDGET_MAX_S:
+                self._budget_s = min(_BUDGET_MAX_S, self._budget_s + _EARNED_SPINNING_S)
+        else:
+            self._budget_s = max(_BUDGET_MIN_S, self._budget_s - took_s)
+            self.worthwhile = self._budget_s > 0
+
+    def parked(self, took_s: float) -> None:
+        """Note that an answer has come after `took_s` seconds to a thread that did not spin."""
+        if took_s <= _QUICK_S:
+            self._budget_s += _EARNED_PARKED_S
+            self.worthwhile = self._budget_s > 0

@@ -18,10 +18,10 @@ from rr_actors.base.errors import RrError, Unavailable, UsageError
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
-from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES, decoder_of
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
 from rr_actors.wire.segments import Segments
+from rr_actors.wire.thread_connections import BlockingLink
 from rr_actors.wire.transport import Accept, Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_link import CLOSE_LIMIT_S, UnixLink, Wire
 from rr_actors.wire.unix_sockets import Refusals, SocketDir, new_name, peer_of

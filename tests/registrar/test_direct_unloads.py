@@ -26,8 +26,7 @@ from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Notice
 from rr_actors.registrar.model.rows import Held, Hold, Notice, State
 from rr_actors.runtime.time_limits import deadline_of, left_until
 from rr_actors.storage.opening import read_rows
-from rr_actors.wire.blocking_link import BlockingLink
-from rr_actors.wire.thread_connections import ThreadConnections
+from rr_actors.wire.thread_connections import BlockingLink, ThreadConnections
 from rr_actors.wire.transport import Hello
 from support import (
     Calls,

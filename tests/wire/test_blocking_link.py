@@ -15,8 +15,8 @@ import pytest
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import deadline_of, left_until
-from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.segments import Segments
+from rr_actors.wire.thread_connections import BlockingLink
 from rr_actors.wire.transport import Link, Welcome
 from rr_actors.wire.unix_link import Wire
 from rr_actors.wire.unix_sockets import SocketDir

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rr_actors.wire.blocking_link import SPIN_LIMIT_S, AdaptiveSpin
+from rr_actors.wire.thread_connections import SPIN_LIMIT_S, AdaptiveSpin
 
 QUICK_S = 50e-6
 LATE_S = SPIN_LIMIT_S * 1.5  # too late for who spins, but soon

@@ -42,9 +42,8 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import add_note
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import deadline_of
-from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.segments import Lie
-from rr_actors.wire.thread_connections import ThreadConnections
+from rr_actors.wire.thread_connections import BlockingLink, ThreadConnections
 from rr_actors.wire.transport import Hello, Link
 from rr_actors.wire.unix_sockets import pid_of
 from rr_actors.wire.unix_transport import UnixTransport
