@@ -355,7 +355,7 @@ def releases_later(patch: Patch) -> type[SimRegistrar]:
             original(decision, command)
             return
         decision.put_later(_replace(held, hold=Hold.OWED))
-        releasing.request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+        decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
     original: Any = holding.release
     _in_tables(patch, original, release)

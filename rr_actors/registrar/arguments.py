@@ -127,6 +127,8 @@ def target_id(target: object) -> str:
     Raises:
         UsageError: `target` is none of these.
     """
+    if type(target) is str:
+        return target
     if is_a(target, (Query, ResourceInfo)):
         return target.id
     if is_a(target, str):
@@ -136,7 +138,7 @@ def target_id(target: object) -> str:
 
 def resource_target(target: object) -> str:
     """Return an id as target_id() does; for a query its resource's, valid also when the holder has left."""
-    return target.resource_id if is_a(target, Query) else target_id(target)
+    return target.resource_id if type(target) is not str and is_a(target, Query) else target_id(target)
 
 
 # -- the options of a load ---------------------------------------------------------------------------------------

@@ -114,12 +114,23 @@ class Calls:
         return future
 
     def command(self, command: Callable[[Any], Any], what: str) -> None:
-        """Give the actor a command, and wait for its answer. `command` makes it of a function that takes the answer.
+        """Have a command decided, behind what the thread has asked for before, and wait for its answer.
+
+        This thread decides it if it can, else the loop.
+
+        Args:
+            command: makes the command of a function that takes the answer; or of None, if the decision is made here.
 
         Raises:
             RrError: the answer is this error.
         """
         self.check_open()
+        if not (is_deciding() or self.dispatcher.is_behind()) and self.dispatcher.may_block():
+            answer = self.actor.monitor.answer_here(command)
+            if answer is not None:
+                if answer.failure is not None:
+                    raise error_of(answer.failure)
+                return
         self.finish(self.start(lambda done: self.actor.post(command(done))), CALL_TIMEOUT_S, what)
 
     def finish(self, future: Reply[Any], timeout_s: float | None, what: str, grace_s: float = 0.0) -> Any:

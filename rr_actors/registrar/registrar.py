@@ -683,11 +683,11 @@ class Registrar(Consumer):
         Raises:
             UnknownQuery: this registrar serves no such resource.
         """
-        if not is_a(status, Status):
+        if type(status) is not Status and not is_a(status, Status):
             raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({shown(status)})")
         resource = resource_target(query_or_resource_id)
         state, text = State(status.state), message_text(status.message)
-        own = status_callback_of(self._actor)
+        own = "" if current_or_none() is None else status_callback_of(self._actor)
         what = f"status for {target_id(query_or_resource_id)}"
         self._calls.command(lambda ticket: c.SetStatus(resource, new_id(), state, text, ticket, own), what)
 

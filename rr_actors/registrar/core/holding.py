@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from rr_actors.base.errors import shortened
 from rr_actors.registrar.core import releasing
 from rr_actors.registrar.core.priorities import follow
-from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, request, withdraw
+from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, withdraw
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
 from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
@@ -51,7 +51,7 @@ def ask(decision: Decision, command: Ask) -> None:
     held = pending(command, attempt, priority)
     look_there(decision, command.registrar)
     decision.put_here(held)
-    request(decision, held.registrar, load_of(decision, held))
+    decision.request(held.registrar, load_of(decision, held))
 
 
 def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
@@ -111,12 +111,12 @@ def send_again(decision: Decision, command: SendAgain) -> None:
         failure = failures.taken_before_heard(command.query_id)
         decision.cause(LoadResolved(held or _unknown(command.query_id), failure))
     elif held.hold is PENDING:
-        request(decision, held.registrar, load_of(decision, held))
+        decision.request(held.registrar, load_of(decision, held))
     elif held.hold is HELD:
         decision.cause(LoadResolved(held, None))
     else:
         decision.put(held)  # the disk may not have it as owed yet
-        request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+        decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def _unknown(query_id: str) -> Held:
@@ -146,7 +146,7 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
     held = decision.catalog.held.get(message.query_id)
     another = held is not None and (held.hold is PENDING or held.resource_id != message.resource_id)
     if held is None or (another and held.id in decision.catalog.ending):
-        request(decision, provider, Unload(message.query_id, decision.catalog.name))
+        decision.request(provider, Unload(message.query_id, decision.catalog.name))
     elif held.hold is PENDING:
         if held.resource_id not in ("", message.resource_id):
             held = asked_anew(held)
@@ -214,7 +214,7 @@ def release(decision: Decision, command: Release) -> None:
         decision.cause(UnloadResolved(command.query_id, failures.unknown_query(decision.catalog, command.query_id)))
         return
     releasing.owe(decision, held, "unloaded while it was loading")
-    request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+    decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def owe(catalog: Catalog, unsaved: Unsaved, query_id: str, write: Callable[[Held], bool]) -> bool:

@@ -29,7 +29,7 @@ from rr_actors.registrar.core.callback_runs import (
 )
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
-from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, request, withdraw
+from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, withdraw
 from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, balance, retire, settle
@@ -287,4 +287,4 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     for held_id in parts_of(decision, resource.id):
         held = catalog.held[held_id]
         if held.hold is PENDING:
-            request(decision, held.registrar, Probe(held.id, message.waiter, message.blocked, ring))
+            decision.request(held.registrar, Probe(held.id, message.waiter, message.blocked, ring))

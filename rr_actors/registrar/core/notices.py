@@ -14,7 +14,6 @@ from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core.callback_runs import forget_runs
 from rr_actors.registrar.core.holding import end_direct
 from rr_actors.registrar.core.priorities import touch
-from rr_actors.registrar.core.releasing import request
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import FellBehind, LoadResolved, Reply, SetTimer
@@ -291,11 +290,11 @@ def end_query(decision: Decision, held_id: str, provider: str) -> None:
         decision.forget(catalog.unsent, held_id)
         if doubted:
             decision.put(replace(held, hold=Hold.OWED, resource_id=""))
-            request(decision, held.registrar, Unload(held_id, catalog.name))
+            decision.request(held.registrar, Unload(held_id, catalog.name))
         else:
             decision.drop(held)
             if not provider and held.registrar in catalog.up:
-                request(decision, held.registrar, Unload(held_id, catalog.name))
+                decision.request(held.registrar, Unload(held_id, catalog.name))
 
 
 def remember_heard(decision: Decision, place: Place) -> None:
@@ -317,4 +316,4 @@ def acknowledge(decision: Decision, provider: str, notice_id: str) -> None:
     """Say to a notice's provider that its receivers have dealt with it; this registrar's own has no provider."""
     if provider:
         decision.note(decision.catalog.acked, provider, True)
-        request(decision, provider, NoticesHandled([notice_id]))
+        decision.request(provider, NoticesHandled([notice_id]))

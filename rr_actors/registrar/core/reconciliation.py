@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from rr_actors.registrar.core.holding import asked_anew, end_release, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_notice, drop_parked, send_notices_to
 from rr_actors.registrar.core.priorities import follow, tell, tell_unsent
-from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, released, request
+from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, released
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import BeginClosing, ConsumerLost, EndClosing, LinkLost, PeerGone, Reconcile
@@ -66,10 +66,10 @@ def _send_open(decision: Decision, provider: str) -> None:
     for hold, rows in groupby(decision.catalog.unsettled_at(provider), attrgetter("hold")):
         if hold is Hold.PENDING:
             for held in rows:
-                request(decision, provider, load_of(decision, held))
+                decision.request(provider, load_of(decision, held))
         else:
             for held in sorted(rows, key=attrgetter("seq"), reverse=True):
-                request(decision, provider, Unload(held.id, decision.catalog.name))
+                decision.request(provider, Unload(held.id, decision.catalog.name))
 
 
 def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:

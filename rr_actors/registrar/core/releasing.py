@@ -18,7 +18,7 @@ from rr_actors.registrar.core.callback_runs import run_id
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Closing, Decision, after_epoch
 from rr_actors.registrar.model.effects import Connect, Effect, LoadResolved, Request
-from rr_actors.registrar.model.messages import Message, Unload
+from rr_actors.registrar.model.messages import Unload
 from rr_actors.registrar.model.rows import (
     LOADED,
     LOADING,
@@ -38,14 +38,6 @@ from rr_actors.registrar.model.rows import (
     Table,
     is_own,
 )
-
-
-def request(decision: Decision, registrar: str, message: Message) -> None:
-    """Send a message to a provider if its link is up; else have the link made, which sends all open messages again."""
-    if registrar in decision.catalog.up:
-        decision.cause(Request(registrar, message))
-    else:
-        decision.cause(Connect(registrar))
 
 
 def look_there(decision: Decision, provider: str) -> None:
@@ -96,7 +88,7 @@ def withdraw(decision: Decision, held: Held, failure: Failure) -> None:
     decision.forget(decision.catalog.direct, held.id)
     decision.cause(LoadResolved(held, failure))
     decision.put(replace(held, hold=Hold.OWED, resource_id=""))
-    request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+    decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def release_parts(

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import awaits_trial, is_given_up, note_begun
 from rr_actors.registrar.core.notices import drop_notice, drop_superseded, notify, own_notices
-from rr_actors.registrar.core.releasing import owe, request
+from rr_actors.registrar.core.releasing import owe
 from rr_actors.registrar.core.unloading import begin_unload, stay_lost
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
@@ -150,7 +150,7 @@ def let_go(decision: Decision, held: Held) -> None:
     """Release a query whose holder has heard that the resource is revoked. It is not held again."""
     owe(decision, held, "its resource is revoked")
     decision.put(replace(held, hold=Hold.OWED, resource_id=""))
-    request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+    decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
 
 # -- to the server of the resource ---------------------------------------------------------------------------------
@@ -289,7 +289,7 @@ def _release(decision: Decision, resource_id: str, ids: Iterable[str]) -> None:
     for id in ids:
         if (held := _part(decision.catalog, resource_id, id)) is not None:
             decision.put(replace(held, hold=Hold.OWED, resource_id=""))
-            request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+            decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def _say(

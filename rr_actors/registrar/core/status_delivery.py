@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from rr_actors.registrar.core.callback_runs import is_given_up, note_ended
 from rr_actors.registrar.core.holding import asked_anew, end_release, may_be_held_again
 from rr_actors.registrar.core.notices import acknowledge, dealt_with, end_query, remember_heard
-from rr_actors.registrar.core.releasing import add_in_flight, request
+from rr_actors.registrar.core.releasing import add_in_flight
 from rr_actors.registrar.core.status_changes import (
     is_busy,
     is_heard_by,
@@ -35,7 +35,8 @@ from rr_actors.registrar.model.rows import Held, Hold, Notice, Resource, State, 
 def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     """Decide about a status of one of this registrar's queries: pass it on, pass it over, or end the query."""
     catalog, notice = decision.catalog, message.notice
-    add_in_flight(decision, notice.query_id)
+    if notice.query_id in catalog.in_flight:
+        add_in_flight(decision, notice.query_id)
     held = catalog.held.get(notice.query_id)
     doubted = not provider and decision.forget(catalog.doubted, notice.query_id) is not None
     if held is None:
@@ -48,11 +49,11 @@ def noticed(decision: Decision, provider: str, message: Noticed) -> None:
             if held.resource_id:
                 end_release(decision, held)
             else:  # withdrawn: its Load may have been sent again since, so only the provider's answer can end it
-                request(decision, held.registrar, Unload(held.id, catalog.name))
+                decision.request(held.registrar, Unload(held.id, catalog.name))
             acknowledge(decision, provider, notice.id)
         elif not may_be_held_again(catalog, held):
             if is_revocation(notice):  # its unload has failed, and is to be tried again
-                request(decision, held.registrar, Unload(held.id, catalog.name))
+                decision.request(held.registrar, Unload(held.id, catalog.name))
             acknowledge(decision, provider, notice.id)
         # else the provider drops the notice with the query, or sends it again if the unload fails
     elif held.hold is Hold.PENDING and notice.released and held.id not in catalog.direct:

@@ -242,7 +242,8 @@ class EffectRunner:
         audience.hear(effect.held, effect.notice, functools.partial(self._heard, effect), repeated=effect.repeated)
 
     def _heard(self, effect: e.Hear, handled: bool) -> None:
-        self._registrar.post(c.Heard(effect.held.id, effect.notice.event, handled, is_revocation(effect.notice)))
+        revoked = effect.notice.reason != "" and is_revocation(effect.notice)
+        self._registrar.post(c.Heard(effect.held.id, effect.notice.event, handled, revoked))
 
     def _fell_behind(self, effect: e.FellBehind) -> None:
         if effect.dropped:

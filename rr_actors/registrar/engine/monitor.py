@@ -32,11 +32,11 @@ from rr_actors.registrar.engine.progress import ProgressListeners, ProgressRepor
 from rr_actors.registrar.engine.registrar_state import may_be_interrupted
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.effects import Effect
+from rr_actors.registrar.model.effects import Answer, Effect
 from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, Message, Noticed
 from rr_actors.registrar.model.rows import Change, Held, Notice
 from rr_actors.registrar.model.store import Store
-from rr_actors.runtime.thread_rules import any_thread, on_loop
+from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
 from rr_actors.wire.transport import Exchange, Hello
 
 logger = Log("rr_actors.registrar")
@@ -243,24 +243,51 @@ class RegistrarMonitor:
         If exactly one direct line waits, the calling thread sends the answer. The loop carries out all other effects,
         in order.
         """
-        registrar = self._registrar
-        if registrar.closed or self._gathers or may_be_interrupted():  # in a fork nobody releases the lock
+        if self._registrar.closed or self._gathers or may_be_interrupted():  # in a fork nobody releases the lock
             return False
-        with registrar.lock:
-            if registrar.closed or self._waiting:
+        with self._registrar.lock:
+            effects = self._committed_here(command)
+            if effects is None:
                 return False
-            try:
-                decision = registrar.commit(((command, None),))
-            except Exception:  # a full disk, or a defect: the loop will meet it again, and report it
-                return False
-            answer = self._runner.by_thread(decision.effects)
+            answer = self._runner.by_thread(effects)
             if answer is None:
-                self._effects.append(decision.effects)
+                self._effects.append(effects)
         if answer is None:
             self._dispatcher.hand_over(self.act)
         else:
             answer()
         return True
+
+    @any_thread
+    def answer_here(self, command: Callable[[object], c.Command]) -> Answer | None:
+        """Decide a command of the calling thread, and return its answer; None if the loop has to decide it.
+
+        The loop carries out all other effects, in order.
+
+        Args:
+            command: makes the command, without a ticket; called with the lock, so ids have the order of decisions.
+        """
+        if self._registrar.closed or self._gathers or may_be_interrupted():
+            return None
+        with self._registrar.lock:
+            effects = self._committed_here(command(None))
+            if effects is None:
+                return None
+            answer = next(effect for effect in effects if type(effect) is Answer and effect.ticket is None)
+            effects.remove(answer)
+            self._effects.append(effects)
+        self._dispatcher.hand_over(self.act)
+        return answer
+
+    @with_lock
+    def _committed_here(self, command: c.Command) -> list[Effect] | None:
+        """Decide a command in the calling thread, and return the effects; None if the loop has to decide it."""
+        if self._registrar.closed or self._waiting:
+            return None
+        try:
+            return self._registrar.commit(((command, None),)).effects
+        except Exception:  # a full disk, or a defect: the loop will meet it again, and report it
+            return None
 
     def run(self, command: c.Command) -> None:
         """Decide a command now, before all that waits, and act; raise CatalogError if it cannot be committed."""

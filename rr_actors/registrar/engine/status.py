@@ -8,6 +8,8 @@ from typing import Any
 from rr_actors.base.errors import UsageError, exact_text, is_a, readable, shown, text_of
 from rr_actors.registrar.model.rows import Notice, State
 
+_SHORT = 1000  # characters: readable() changes nothing in such a text of ASCII
+
 
 def state_of(state: object, what: str) -> State:
     """Return the State that is given as such, or by its name in upper or lower case.
@@ -15,7 +17,7 @@ def state_of(state: object, what: str) -> State:
     Raises:
         UsageError: `state` is no State; `what`, the name of the call, begins the text.
     """
-    if is_a(state, State):
+    if type(state) is State:
         return state
     found = State.__members__.get(exact_text(state).upper()) if is_a(state, str) else None
     if found is None:
@@ -131,6 +133,8 @@ def message_text(message: object) -> str:
     Raises:
         UsageError: str() of the message raises: it is nested too deeply, say.
     """
+    if type(message) is str and len(message) < _SHORT and message.isascii():
+        return message
     try:
         return readable(str(message))
     except Exception as error:

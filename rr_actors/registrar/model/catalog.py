@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.model.effects import Effect, StartStatus
+from rr_actors.registrar.model.effects import Connect, Effect, Request, StartStatus
+from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import (
     HELD,
     HIGHEST,
@@ -452,12 +453,12 @@ class Catalog:
                 add(self.parts, new.parent, new.id)
 
     def _index_notice(self, old: Notice | None, new: Notice | None) -> None:
-        if old is not None and is_own(old):
+        if old is not None and not old.origin:  # is_own(), without a call
             discard(self.own_notices, old.resource_id, old.id)
         elif old is not None:
             discard(self.notices_to, old.origin, old.id)
             discard(self.notices_on, old.query_id, old.id)
-        if new is not None and is_own(new):
+        if new is not None and not new.origin:
             add(self.own_notices, new.resource_id, new.id)
         elif new is not None:
             add(self.notices_to, new.origin, new.id)
@@ -602,6 +603,10 @@ class Decision:
     def cause(self, effect: Effect) -> None:
         """Have the effect carried out once the changes are on disk."""
         self.effects.append(effect)
+
+    def request(self, registrar: str, message: Message) -> None:
+        """Send a message to a provider if its link is up; else have one made, which sends all open messages again."""
+        self.cause(Request(registrar, message) if registrar in self.catalog.up else Connect(registrar))
 
     def close(self) -> None:
         """Keep the changes: they are on disk, or wait to be written."""
