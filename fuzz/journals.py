@@ -27,8 +27,8 @@ from rr_actors.registrar.model.rows import (
     content_of,
     rows_of,
 )
-from rr_actors.storage import checked_records, journaled_store
-from rr_actors.storage.checked_records import Damage
+from rr_actors.storage import journaled_store
+from rr_actors.storage.damage import Damage
 from rr_actors.storage.journaled_store import End, Segment
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sql_tables import Meta
@@ -140,7 +140,7 @@ def _forged(segments: _Segments, n: int, taken: _Taken) -> None:
             break
         at, checksum = at + _RECORD.size + length, expected
     body = taken.bytes(1 + taken.number(80))
-    segments[n] = old[:at] + checked_records.record(body, checksum)[0]
+    segments[n] = old[:at] + journaled_store.record(body, checksum)[0]
 
 
 _DAMAGES: list[Callable[[_Segments, int, _Taken], None]] = [_changed, _cut, _zeros, _missing, _swapped, _forged]

@@ -14,10 +14,10 @@ import struct
 import threading
 import time
 import zlib
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -26,8 +26,7 @@ from rr_actors.base.folder import Folder
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
-from rr_actors.storage import checked_records
-from rr_actors.storage.checked_records import Damage
+from rr_actors.storage.damage import Damage
 from rr_actors.storage.sql_tables import Meta, net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segments_among
 from rr_actors.storage.witness import segment_prefix
@@ -197,15 +196,18 @@ class JournaledStore:
 # one write at the end of the newest segment: bytes that the kernel has are not lost with the process. Full segments are
 # folded into the SQLite file, which has the number of the last one, and removed.
 #
-# A record's checksum continues that of the record before it. A segment's header names the catalog, its opening, and the
-# end of the segment before it. The catalog's lock has the number of the last segment that was begun (catalog_lock.py).
-# So a reader always gets the changes up to some commit. A record that is missing, damaged or another catalog's differs
-# from an unfinished one, which belongs to a commit that was never acknowledged.
+# A record begins with its length, and with its length XOR the checksum of the record before it. That value also starts
+# the record's own checksum. So a wrong length differs from an unfinished record, and no record can be left out. The
+# first record continues from the checksum of the segment's header, which names the catalog, its opening, and the end of
+# the segment before it. The catalog's lock has the number of the last segment that was begun (catalog_lock.py). So a
+# reader always gets the changes up to some commit. A record that is missing, damaged or another catalog's differs from
+# an unfinished one, which belongs to a commit that was never acknowledged.
 
 _MAGIC = b"RRACJ\0\0\2"
 _FIRST = b"RRACF\0\0\2"  # of segment 1 of a catalog whose SQLite file is made later: with it all is in the journal
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
 _CHECKSUM = struct.Struct("<I")
+_RECORD = struct.Struct("<III")  # the body's length, that XOR the checksum before, the checksum
 _UINT64 = b"\xcf"  # msgpack's first byte of an integer of eight bytes; a search for it alone is quicker
 _TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # an integer too large for SQLite, or other bytes by chance
 _ARRAY = 0x90  # msgpack's first byte of an array of up to fifteen items: a row
@@ -213,6 +215,60 @@ _LARGEST = 2**63 - 1
 _LONGEST = 10**9 - 1000  # bytes: about the longest row that SQLite takes
 
 _encode = msgspec.msgpack.Encoder().encode
+
+
+class Place(NamedTuple):
+    """The end of a file or of a record in it: the byte after it, and its checksum."""
+
+    at: int
+    checksum: int
+
+
+def record(body: bytes, before: int) -> tuple[bytes, int]:
+    """Return a record's bytes and its checksum. `before` is the checksum of the record before it."""
+    length = len(body)
+    first = before ^ length
+    checksum = zlib.crc32(body, first)
+    return _RECORD.pack(length, first, checksum) + body, checksum
+
+
+def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
+    """Yield the records after `begin`, each with its end, up to the first damaged or unfinished one."""
+    at, checksum = begin
+    while at + _RECORD.size <= len(data):
+        length, first, expected = _RECORD.unpack_from(data, at)
+        start = at + _RECORD.size
+        body = data[start : start + length]
+        if not length or first != checksum ^ length or len(body) < length or zlib.crc32(body, first) != expected:
+            return
+        at, checksum = start + length, expected
+        yield body, Place(at, checksum)
+
+
+def is_torn(data: bytes, end: Place) -> bool:
+    """Return whether the bytes after the last good record can be the beginning of an unfinished record."""
+    left = len(data) - end.at
+    if left < _RECORD.size:
+        return True
+    length, first, _ = _RECORD.unpack_from(data, end.at)
+    return length > 0 and first == end.checksum ^ length and left < _RECORD.size + length
+
+
+def write_whole(fd: int, data: bytes, begin: int) -> int:
+    """Write all of `data` at the file's end, which is at `begin`, or nothing and raise an OSError; return the new end.
+
+    The rest of a failed attempt is cut off. If that fails, the next record overwrites it, and readers ignore it.
+    """
+    end = begin + len(data)
+    try:
+        at = begin + os.pwrite(fd, data, begin)
+        while at < end:  # the disk became full at `at`
+            at += os.pwrite(fd, data[at - end :], at)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.ftruncate(fd, begin)
+        raise
+    return end
 
 
 class End(msgspec.Struct, frozen=True, gc=False):
@@ -252,7 +308,7 @@ class Segment:
         self._file = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
         self._fd = self._file.fileno()
         try:
-            self._size = checked_records.write_whole(self._fd, header + _CHECKSUM.pack(self._checksum), 0)
+            self._size = write_whole(self._fd, header + _CHECKSUM.pack(self._checksum), 0)
         except BaseException:
             self.remove()
             raise
@@ -269,8 +325,8 @@ class Segment:
             _check_lengths(changes)
         if _UINT64 in body and _TOO_LARGE.search(body):
             _check_numbers(changes)
-        record, checksum = checked_records.record(body, self._checksum)
-        self._size = checked_records.write_whole(self._fd, record, self._size)
+        data, checksum = record(body, self._checksum)
+        self._size = write_whole(self._fd, data, self._size)
         self._checksum = checksum
         self._records += 1
 
@@ -357,9 +413,9 @@ class Found(msgspec.Struct, frozen=True):
         return changes
 
 
-def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Place) -> None:
+def _tell_of_rest(catalog: Path, name: str, data: bytes, end: Place) -> None:
     left = len(data) - end.at
-    if checked_records.is_torn(data, end):
+    if is_torn(data, end):
         text = (
             f"its last record is not whole ({left} bytes from byte {end.at} on), and ignored: its process died while it"
             " wrote it, and nobody heard that it was written; or the file was cut off there later"
@@ -427,16 +483,16 @@ def _checked(name: str, number: int, data: bytes) -> bytes | None:
     return data
 
 
-def _read_records(data: bytes, changes: list[Change]) -> tuple[End, checked_records.Place]:
+def _read_records(data: bytes, changes: list[Change]) -> tuple[End, Place]:
     """Add the changes of a segment's whole records to `changes`; return the end and the place of the last."""
     checksum: int = _CHECKSUM.unpack_from(data, _HEADER.size - _CHECKSUM.size)[0]
-    end = checked_records.Place(_HEADER.size, checksum)
-    records = 0
-    for body, after in checked_records.records(data, end):
+    end = Place(_HEADER.size, checksum)
+    count = 0
+    for body, after in records(data, end):
         changes += _decoded(body)
-        records += 1
+        count += 1
         end = after
-    return End(records, end.checksum), end
+    return End(count, end.checksum), end
 
 
 def _decoded(body: bytes) -> list[Change]:

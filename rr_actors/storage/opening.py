@@ -25,7 +25,7 @@ from rr_actors.registrar.model.rows import Change, Content, Row, apply, content_
 from rr_actors.registrar.model.store import MemoryStore, Store, is_needed
 from rr_actors.storage import journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
-from rr_actors.storage.checked_records import Damage, damaged, errors_named
+from rr_actors.storage.damage import Damage, damaged, errors_named
 from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.witness import Known, Witness, is_missing, missing_text
 

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table
-from rr_actors.storage.checked_records import Damage
+from rr_actors.storage.damage import Damage
 
 
 class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):

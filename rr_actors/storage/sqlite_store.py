@@ -25,9 +25,9 @@ from rr_actors.base.errors import CatalogError, CatalogVersion
 from rr_actors.base.folder import Folder
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.model.rows import Change, Content, content_of
-from rr_actors.storage import checked_records, sql_tables
+from rr_actors.storage import sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
-from rr_actors.storage.checked_records import Damage, damaged, errors_named
+from rr_actors.storage.damage import Damage, damaged, errors_named
 from rr_actors.storage.witness import Known, Witness, segment_prefix
 
 APPLICATION_ID = 0x52524143  # "RRAC"
@@ -334,7 +334,9 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
     image = image[: _WAL_MODE_AT.start] + _WAL_MODE + image[_WAL_MODE_AT.stop :]
     try:
         with folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as file:
-            checked_records.write_whole(file.fileno(), image, 0)
+            at = 0
+            while at < len(image):
+                at += os.pwrite(file.fileno(), image[at:], at)
             os.fsync(file.fileno())
         folder.rename(new.name, path.name)
     except BaseException:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, apply, content_of, rows_of
 from rr_actors.storage import journaled_store
-from rr_actors.storage.checked_records import Damage
+from rr_actors.storage.damage import Damage
 from rr_actors.storage.journaled_store import End, Segment
 from rr_actors.storage.sql_tables import Meta
 from support_stores import CHANGES, folder_of, in_order, part, query, segments_of, states

@@ -30,7 +30,7 @@ from rr_actors.base.pickling import dumps, loads
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, ServedQuery, content_of, rows_of
 from rr_actors.registrar.model.store import MemoryStore, Store
-from rr_actors.storage.checked_records import errors_named
+from rr_actors.storage.damage import errors_named
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sql_tables import OLDEST_VERSION, SCHEMA_VERSION
 from support_stores import COMMITS, in_order, part, query, states

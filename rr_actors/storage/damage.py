@@ -1,9 +1,4 @@
-"""Files of checked records: each record that is read was written whole, directly after the record before it.
-
-A record begins with its length, and with its length XOR the checksum of the record before it. That value also starts
-the record's own checksum. So a wrong length differs from an unfinished record, and no record can be left out. The first
-record continues from the checksum of the file's header.
-"""
+"""Damage: the stored bytes of a catalog are not those that were written; and the errors of its files for users."""
 
 from __future__ import annotations
 
@@ -11,74 +6,13 @@ import contextlib
 import errno
 import os
 import sqlite3
-import struct
-import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked
 from rr_actors.base.folder import NotAFile, NotOurs
 from rr_actors.base.scarcity import wanted_by
-
-_RECORD = struct.Struct("<III")  # the body's length, that XOR the checksum before, the checksum
-
-
-class Place(NamedTuple):
-    """The end of a file or of a record in it: the byte after it, and its checksum."""
-
-    at: int
-    checksum: int
-
-
-def record(body: bytes, before: int) -> tuple[bytes, int]:
-    """Return a record's bytes and its checksum. `before` is the checksum of the record before it."""
-    length = len(body)
-    first = before ^ length
-    checksum = zlib.crc32(body, first)
-    return _RECORD.pack(length, first, checksum) + body, checksum
-
-
-def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
-    """Yield the records after `begin`, each with its end, up to the first damaged or unfinished one."""
-    at, checksum = begin
-    while at + _RECORD.size <= len(data):
-        length, first, expected = _RECORD.unpack_from(data, at)
-        start = at + _RECORD.size
-        body = data[start : start + length]
-        if not length or first != checksum ^ length or len(body) < length or zlib.crc32(body, first) != expected:
-            return
-        at, checksum = start + length, expected
-        yield body, Place(at, checksum)
-
-
-def is_torn(data: bytes, end: Place) -> bool:
-    """Return whether the bytes after the last good record can be the beginning of an unfinished record."""
-    left = len(data) - end.at
-    if left < _RECORD.size:
-        return True
-    length, first, _ = _RECORD.unpack_from(data, end.at)
-    return length > 0 and first == end.checksum ^ length and left < _RECORD.size + length
-
-
-def write_whole(fd: int, data: bytes, begin: int) -> int:
-    """Write all of `data` at the file's end, which is at `begin`, or nothing and raise an OSError; return the new end.
-
-    The rest of a failed attempt is cut off. If that fails, the next record overwrites it, and readers ignore it.
-    """
-    end = begin + len(data)
-    try:
-        at = begin + os.pwrite(fd, data, begin)
-        while at < end:  # the disk became full at `at`
-            at += os.pwrite(fd, data[at - end :], at)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.ftruncate(fd, begin)
-        raise
-    return end
-
-
-# Damage: the stored bytes are not those that were written; and the errors for users.
 
 _NOT_ITS_FAULT = {  # errors that do not come from the file's content
     sqlite3.SQLITE_IOERR,
