@@ -1,13 +1,17 @@
-"""Fields: a load callback of several parameters, or none, takes the fields of the request. Its server's request type is
+"""The types of a server's requests and responses, as the load callback is declared.
+
+Fields: a load callback of several parameters, or none, takes the fields of the request. Its server's request type is
 a dataclass that is made of these parameters, so defaults are filled in before requests are compared.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import functools
 import inspect
+import typing
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -29,6 +33,40 @@ def field_names(request_type: object) -> list[str] | None:
     if isinstance(request_type, type) and issubclass(request_type, Fields):
         return [field.name for field in dataclasses.fields(cast("Any", request_type))]
     return None
+
+
+def annotated_types(load: Callback, who: str) -> tuple[Any, Any]:
+    """Return the request and response type of a load callback: its annotations, or a type made of its parameters.
+
+    None for each one not found.
+    """
+    hints: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+    with contextlib.suppress(Exception):  # names that cannot be resolved, builtins without a signature: any plain value
+        parameters = list(inspect.signature(load).parameters.values())
+        hints = hints_of(load)
+    request = fields_type(load, hints, who) or (hints.get(parameters[0].name) if parameters else None)
+    return _plain(request), _plain(hints.get("return"))
+
+
+def hints_of(load: Callback) -> dict[str, Any]:
+    """Return annotations as types; look up names in text where the function is defined, and in the calling frames."""
+    function = load.func if isinstance(load, functools.partial) else load
+    if not inspect.isroutine(function):
+        function = type(function).__call__  # a callable object's annotations are its method's
+    try:
+        return typing.get_type_hints(function, include_extras=True)
+    except NameError:  # classes of a function's body: they are in the frames that led here
+        names: dict[str, Any] = {}
+        frame = inspect.currentframe()
+        while frame is not None:
+            names = {**frame.f_locals, **names}
+            frame = frame.f_back
+        return typing.get_type_hints(function, localns=names, include_extras=True)
+
+
+def _plain(hint: Any) -> Any:
+    return None if hint in (None, type(None), Any, object) else hint
 
 
 def fields_type(load: Callback, hints: dict[str, Any], who: str) -> type[Fields] | None:

@@ -1,4 +1,4 @@
-"""Progress: how far a load has come, and how long loads have taken.
+"""Progress: how far a load has come.
 
 A load's callback reports how far it has come, and the consumers that wait for the load hear it.
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from itertools import chain
@@ -32,7 +31,6 @@ INTERVAL_S = 0.1
 """The time between two reports of one load, at least."""
 TEXT_LIMIT = 500
 """The number of characters that the text of a report may have."""
-_NEWEST = 500  # load callbacks of a server, of which the times are kept
 
 
 class Progress(msgspec.Struct, frozen=True):
@@ -73,38 +71,6 @@ def checked(fraction: object, text: object) -> tuple[float, str]:
     if len(exact) > TEXT_LIMIT:
         raise UsageError(f"progress: text: expected at most {TEXT_LIMIT} characters, got {len(exact)}")
     return float(number), readable(exact)
-
-
-class LoadTimes:
-    """How many load callbacks of one server have ended since it was registered, and how long they took. Any thread.
-
-    Attributes:
-        loaded, failed: how many have returned, and raised.
-        seconds: how long they took together.
-        longest_s: how long the longest took.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._newest: deque[float] = deque(maxlen=_NEWEST)
-        self.loaded = self.failed = 0
-        self.seconds = self.longest_s = 0.0
-
-    def take(self, began_s: float, *, failed: bool) -> None:
-        """Count a callback that began at this time of the monotonic clock, and has ended now."""
-        took_s = time.monotonic() - began_s
-        with self._lock:
-            self.failed += failed
-            self.loaded += not failed
-            self.seconds += took_s
-            self.longest_s = max(self.longest_s, took_s)
-            self._newest.append(took_s)
-
-    def p95_s(self) -> float:
-        """Return the time within which 95 % of the newest 500 callbacks ended; 0.0 if none has ended."""
-        with self._lock:
-            newest = sorted(self._newest)
-        return newest[math.ceil(0.95 * len(newest)) - 1] if newest else 0.0
 
 
 class _Reports:

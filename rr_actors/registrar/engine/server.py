@@ -10,11 +10,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import inspect
+import math
 import threading
 import time
-import typing
 import zlib
+from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextvars import ContextVar
@@ -50,9 +50,9 @@ from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.hosting.streams import Publisher, StreamNews
 from rr_actors.registrar.core.callback_runs import running
 from rr_actors.registrar.core.decide import Item
-from rr_actors.registrar.engine.fields import by_fields, field_names, fields_type
+from rr_actors.registrar.engine.fields import annotated_types, by_fields, field_names, hints_of
 from rr_actors.registrar.engine.monitor import RegistrarBase
-from rr_actors.registrar.engine.progress import LoadTimes, checked
+from rr_actors.registrar.engine.progress import checked
 from rr_actors.registrar.engine.status import Status, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
@@ -302,6 +302,7 @@ logger = Log("rr_actors.server")
 Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
 _MOST_NUMBERS = 50
+_NEWEST = 500  # load callbacks of a server, of which the times are kept
 _TOO_GREAT = 2**63  # as a console's answer has room for
 RECOVER_S = 30.0
 """How long a recover callback may take, if its server says nothing else."""
@@ -359,6 +360,38 @@ class Usages(dict[str, dict[str, float]]):
 
 Measured = dict[str, float] | str | None
 """The usage of a resource, or why it is not known; None if the resource is not loaded any more."""
+
+
+class LoadTimes:
+    """How many load callbacks of one server have ended since it was registered, and how long they took. Any thread.
+
+    Attributes:
+        loaded, failed: how many have returned, and raised.
+        seconds: how long they took together.
+        longest_s: how long the longest took.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest: deque[float] = deque(maxlen=_NEWEST)
+        self.loaded = self.failed = 0
+        self.seconds = self.longest_s = 0.0
+
+    def take(self, began_s: float, *, failed: bool) -> None:
+        """Count a callback that began at this time of the monotonic clock, and has ended now."""
+        took_s = time.monotonic() - began_s
+        with self._lock:
+            self.failed += failed
+            self.loaded += not failed
+            self.seconds += took_s
+            self.longest_s = max(self.longest_s, took_s)
+            self._newest.append(took_s)
+
+    def p95_s(self) -> float:
+        """Return the time within which 95 % of the newest 500 callbacks ended; 0.0 if none has ended."""
+        with self._lock:
+            newest = sorted(self._newest)
+        return newest[math.ceil(0.95 * len(newest)) - 1] if newest else 0.0
 
 
 class ServerActor:
@@ -1082,7 +1115,7 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
     name = check_name(spec.name, "server name")
     who = f"server {name!r}"
     with examined(who):
-        request, response = _annotated(spec.load, who) if callable(spec.load) else (None, None)
+        request, response = annotated_types(spec.load, who) if callable(spec.load) else (None, None)
         request = request if spec.request_type is None else spec.request_type
         for field, role in ROLES.items():
             callback = getattr(spec, field)
@@ -1164,26 +1197,12 @@ def checked_whole(spec: ServerSpec) -> ServerSpec:
     return spec
 
 
-def _annotated(load: Callback, who: str) -> tuple[Any, Any]:
-    """Return the request and response type of a load callback: its annotations, or a type made of its parameters.
-
-    None for each one not found.
-    """
-    hints: dict[str, Any] = {}
-    parameters: list[inspect.Parameter] = []
-    with contextlib.suppress(Exception):  # names that cannot be resolved, builtins without a signature: any plain value
-        parameters = list(inspect.signature(load).parameters.values())
-        hints = _hints(load)
-    request = fields_type(load, hints, who) or (hints.get(parameters[0].name) if parameters else None)
-    return _plain(request), _plain(hints.get("return"))
-
-
 def log_unread_types(spec: ServerSpec, server: str) -> None:
     """Log a warning if an annotation names a type that cannot be found: the values are plain then, and not checked."""
     if spec.request_type is not None or spec.response_type is not None:
         return  # the types were read, or given
     try:
-        _hints(spec.load)
+        hints_of(spec.load)
     except NameError as error:
         logger.warning(
             "%s: the annotations of its load callback cannot be read (%s): requests and responses are plain values, "
@@ -1193,26 +1212,6 @@ def log_unread_types(spec: ServerSpec, server: str) -> None:
         )
     except Exception:  # no annotation was meant as a type: `load` is a builtin, say
         return
-
-
-def _hints(load: Callback) -> dict[str, Any]:
-    """Return annotations as types; look up names in text where the function is defined, and in the calling frames."""
-    function = load.func if isinstance(load, functools.partial) else load
-    if not inspect.isroutine(function):
-        function = type(function).__call__  # a callable object's annotations are its method's
-    try:
-        return typing.get_type_hints(function, include_extras=True)
-    except NameError:  # classes of a function's body: they are in the frames that led here
-        names: dict[str, Any] = {}
-        frame = inspect.currentframe()
-        while frame is not None:
-            names = {**frame.f_locals, **names}
-            frame = frame.f_back
-        return typing.get_type_hints(function, localns=names, include_extras=True)
-
-
-def _plain(hint: Any) -> Any:
-    return None if hint in (None, type(None), Any, object) else hint
 
 
 def _invalid(name: str, field: str, expected: str, got: object) -> NoReturn:
