@@ -38,6 +38,7 @@ from rr_actors.runtime.callback_errors import described
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until
 from rr_actors.wire.name_service import Presence
+from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Exchange
 from rr_actors.wire.unix_sockets import paused
 
@@ -67,6 +68,19 @@ class Calls:
         if is_deciding():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
+
+    def connections_to(self, client: ProviderLink) -> ThreadConnections[Exchange] | None:
+        """Return the connections of threads to a provider, beside the present link; None if the link is to be used.
+
+        There are none before the provider is reconciled over the present link. By then its Peer row is on disk, by
+        which it is found after a crash.
+        """
+        catalog, provider = self.actor.catalog, client.provider
+        if catalog.up.get(provider) != client.opened or provider not in catalog.peers:
+            return None
+        if self.actor.closed or self.dispatcher.closed:  # in a forked child, all of this belongs to the parent
+            return None
+        return client.connections
 
     def call(self, fn: Callable[..., T], *args: Any) -> T:
         """Run fn on the loop, behind the commands that threads have given it before, and return what it returns.
@@ -401,7 +415,7 @@ class Loads:
         """
         actor = self.actor
         client = actor.clients.get(query.registrar)
-        if client is None or (connections := client.connections) is None:
+        if client is None or (connections := self.calls.connections_to(client)) is None:
             return False
         line: Exchange | None = None
         over: list[RrError] = []  # with the error, once the loop has ended this load; at any moment
@@ -522,7 +536,7 @@ _DOING = {
 # -- unloads -----------------------------------------------------------------------------------------------------------
 #
 # The registrar's actor releases a query; or a thread that waits does so, on a connection of its own. The thread writes
-# that the release is owed, asks the provider, and forgets the query (engine/direct_paths.py). If the provider is down,
+# that the release is owed, asks the provider, and forgets the query (DirectPaths). If the provider is down,
 # the thread hears so when its time is up. The release stays owed, on disk, until the provider is back.
 
 
@@ -690,7 +704,7 @@ class Unloads:
         actor = self._actor
         held = actor.catalog.held.get(query_id)
         client = None if held is None else actor.clients.get(held.registrar)
-        connections = None if client is None else client.connections
+        connections = None if client is None else self.calls.connections_to(client)
         if client is None or connections is None or not self.calls.dispatcher.may_block():
             return False
         deadline = deadline_of(timeout_s)

@@ -19,7 +19,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.decide import Item
-from rr_actors.registrar.engine.direct_paths import DirectPaths
+from rr_actors.registrar.engine.registrar_state import DirectPaths
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.messages import Fetch, Load, Loaded, Noticed, Unload, Unloaded

@@ -23,7 +23,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import loading, unloading
 from rr_actors.registrar.core.decide import decide
-from rr_actors.registrar.engine import direct_paths, registrar_state
+from rr_actors.registrar.engine import registrar_state
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.effects import Reply
@@ -470,7 +470,7 @@ def test_a_load_that_is_refused_leaves_nothing_whether_its_thread_or_the_loop_en
     serve(provider, "thing", load=fail)
     serve(provider, "other")
     app.load("provider/other", 0)  # the next goes by a connection of this thread's own
-    monkeypatch.setattr(direct_paths, "may_be_interrupted", lambda: handled)
+    monkeypatch.setattr(registrar_state, "may_be_interrupted", lambda: handled)
     ended: list[str] = []
     post = actor_of(app).post
     monkeypatch.setattr(

@@ -27,9 +27,8 @@ from rr_actors.base.values.failure import failure_of
 from rr_actors.hosting.process_node import ProcessNode
 from rr_actors.hosting.streams import Publishers
 from rr_actors.registrar.core.decide import Item, refuse_uncommitted
-from rr_actors.registrar.engine.direct_paths import DirectPaths
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
-from rr_actors.registrar.engine.registrar_state import may_be_interrupted
+from rr_actors.registrar.engine.registrar_state import DirectPaths, may_be_interrupted
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.effects import Answer, Effect

@@ -67,6 +67,7 @@ class ProviderLink:
 
     Attributes:
         link: the present one; `opened` is the number of the Fetch that opened the last one.
+        connections: those of threads, beside the link; they may be used as Calls.connections_to() says.
         undescribed: the servers whose types have been asked for, or have to be, and have not come yet.
     """
 
@@ -89,28 +90,13 @@ class ProviderLink:
         self._described: set[str] = set()
         self.undescribed: set[str] = set()
         self.checksums: dict[str, int] = {}  # by server, those of the types that are known (Loaded.types)
-        self._connections: ThreadConnections[Exchange] = ThreadConnections(self._dial_for_thread)
+        self.connections: ThreadConnections[Exchange] = ThreadConnections(self._dial_for_thread)
         self._side: dict[type[Any], Callable[[Any], None]] = {  # messages of the provider that are not decided
             Described: self._take_types,
             Progressed: functools.partial(self._registrar.listeners.hear, provider),
         }
 
     # -- for threads ---------------------------------------------------------------------------------------------
-
-    @property
-    def connections(self) -> ThreadConnections[Exchange] | None:
-        """The connections of threads, beside the present link; None if the link is to be used. From any thread.
-
-        There are none before the provider is reconciled over the present link. By then its Peer row is on disk, by
-        which it is found after a crash.
-        """
-        registrar = self._registrar
-        catalog = registrar.catalog
-        if catalog.up.get(self.provider) != self.opened or self.provider not in catalog.peers:
-            return None
-        if registrar.closed or self._node.dispatcher.closed:  # in a forked child, all of this belongs to the parent
-            return None
-        return self._connections
 
     @any_thread
     def _dial_for_thread(self, timeout_s: float) -> Exchange | None:
@@ -144,7 +130,7 @@ class ProviderLink:
 
     def _drop_link(self) -> None:
         link, self.link = self.link, None
-        self._connections.close()
+        self.connections.close()
         if link is not None:
             link.close()
 
@@ -258,7 +244,7 @@ class ProviderLink:
         known = None if rows is None else digests.known(rows, self._known)
         self._known = None
         self.link = link
-        self._connections = ThreadConnections(self._dial_for_thread)
+        self.connections = ThreadConnections(self._dial_for_thread)
         self._asked = False
         self._reconciled = False
         self._described.clear()
@@ -364,7 +350,7 @@ class ProviderLink:
         if self.link is not link and self.link is not None:
             return
         self.link = None
-        self._connections.close()
+        self.connections.close()
         if closed:
             return
         self._registrar.post(c.LinkLost(self.provider))
