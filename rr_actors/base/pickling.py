@@ -223,7 +223,7 @@ def loads_large(blob: memoryview, buffers: Sequence[memoryview]) -> Any:
 def classes_with_codecs() -> list[bytes]:
     """Return the classes of `__main__` that have a codec, each as bytes, but for those that cannot be pickled."""
     blobs: list[bytes] = []
-    for cls in types_of_main():
+    for cls in list(types_of_main):
         with contextlib.suppress(NotSerializable):
             blobs.append(dumps(cls))
     return blobs

@@ -176,6 +176,7 @@ class Subscribers:
         self._backlogs: dict[int, Backlog[Facts]] = {}  # filled on the loop; other threads only remove from it
         self._listeners: dict[int, tuple[Callable[[Facts], None], bool]] = {}  # and whether it records
         self._numbers = itertools.count(1)
+        self.listened = False  # whether anybody listens
         self._node: Node | None = None
         self._saying = threading.Lock()  # held to say whether anybody listens
 
@@ -270,9 +271,10 @@ class Subscribers:
 
     def _say_whether_watched(self) -> None:
         with self._saying:
+            self.listened = bool(self._callbacks or self._listeners)
             if (node := self._node) is not None:
                 records = any(records for _, records in list(self._listeners.values()))
-                node.watched.set(bool(self._callbacks or self._listeners), records)
+                node.watched.set(self.listened, records)
 
 
 def _name_of(callback: Callable[..., Any]) -> str:

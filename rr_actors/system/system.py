@@ -793,7 +793,8 @@ class System:
             self._dead_letters.heard(event)
         elif "path" in event:
             self._log.take(event)
-        self._subscribers.tell(event)
+        if self._subscribers.listened:
+            self._subscribers.tell(event)
 
     def _take_log(self, workers: Workers, event: Facts) -> None:
         self._child_logs.take(event)

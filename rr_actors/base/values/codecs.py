@@ -97,9 +97,14 @@ codec_named: Callable[[str], TypeCodec | None] = _by_name.get
 """Return the codec for a name in bytes; None if this process has none."""
 
 
-def types_of_main() -> list[type]:
-    """Return the classes of `__main__` that have a codec."""
-    return [cls for cls in _by_type if cls.__module__ == "__main__"]
+types_of_main: dict[type, None] = {}
+"""The classes of `__main__` that have a codec."""
+
+
+def _put(cls: type, made: TypeCodec) -> None:
+    _by_type[cls] = made
+    if cls.__module__ == "__main__":
+        types_of_main[cls] = None
 
 
 def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T]) -> None:
@@ -125,13 +130,13 @@ def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T])
         if not callable(function):
             raise invalid("rr.codec", field, "a callable", function)
     made = TypeCodec(type, encode, decode)
-    _by_type[type] = made
+    _put(type, made)
     _by_name[made.name] = made
 
 
 def codec_of_subclass(subclass: type, cls: type) -> None:
     """Give a subclass the codec of its class `cls`: the same actor then has the same bytes."""
-    _by_type[subclass] = _by_type[cls]
+    _put(subclass, _by_type[cls])
 
 
 _CLASS = type

@@ -27,7 +27,8 @@ from rr_actors.registrar.model.rows import Held, Hold, State
 def reconcile(decision: Decision, command: Reconcile) -> None:
     """Agree with a provider, over a new link, on the queries held there; then send all open messages again."""
     catalog = decision.catalog
-    add_all_in_flight(decision, command.registrar)  # the provider may have dropped those sent before this link
+    if catalog.in_flight:
+        add_all_in_flight(decision, command.registrar)  # the provider may have dropped those sent before this link
     decision.note(catalog.up, command.registrar, command.link)
     decision.note(catalog.listed, command.registrar, command.run)
     theirs = {query.query_id for query in command.queries}
@@ -41,7 +42,10 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     decision.note(catalog.agreed, command.registrar, True)
     if command.notices:  # if this link is lost before them, they come over the next, and then the provider forgets them
         decision.note(catalog.acked, command.registrar, True)
-    look_there(decision, command.registrar)  # the list may have brought the first row there, or a thread's line does
+    if command.registrar not in catalog.peers:
+        look_there(
+            decision, command.registrar
+        )  # the list may have brought the first row there, or a thread's line does
     agreed, differing = digests.split(catalog, command.registrar, command.same)
     for held in agreed:
         decision.forget(catalog.kept, held.id)
@@ -130,7 +134,8 @@ def link_lost(decision: Decision, command: LinkLost) -> None:
     if len(kept) < len(decision.effects):
         decision.effects = [*kept, Connect(command.registrar)]
     decision.forget(catalog.up, command.registrar)
-    provider_lost(decision, command.registrar)
+    if catalog.closings:
+        provider_lost(decision, command.registrar)
     unsettled = catalog.unsettled_at(command.registrar)
     waited_for = any(held.hold is Hold.PENDING and held.id not in catalog.direct for held in unsettled)
     if command.registrar in catalog.outbound and not waited_for:

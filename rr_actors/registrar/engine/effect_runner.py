@@ -84,7 +84,8 @@ class EffectRunner:
         else:
             for effect in effects:
                 methods[type(effect)](effect)
-        self._consumers.flush()
+        if self._consumers.unflushed:
+            self._consumers.flush()
         if self._dirty:
             dirty, self._dirty = self._dirty, {}
             for link in dirty.values():

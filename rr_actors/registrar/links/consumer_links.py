@@ -50,7 +50,7 @@ class Consumers:
         self._provider = provider
         self._links: dict[str, Link] = {}
         self.routes = Routes()  # for each answer, the line or link by which it goes
-        self._dirty: dict[int, Any] = {}
+        self.unflushed: dict[int, Any] = {}  # the links that have unsent messages
         self._side: dict[type[Any], Callable[[str, Any], None]] = {}  # messages of consumers that are not decided
 
     def attach(self, link: Link) -> _Inlet:
@@ -99,11 +99,11 @@ class Consumers:
         if link is not None and not link.behind:
             with contextlib.suppress(RrError):  # very many queries wait, so it is too long: no reason to close the link
                 link.send(message)
-                self._dirty[id(link)] = link
+                self.unflushed[id(link)] = link
 
     def _send(self, link: Any, message: Message) -> None:
         if self._try(link.send, link, message):
-            self._dirty[id(link)] = link
+            self.unflushed[id(link)] = link
 
     @any_thread
     def _record(self, event: str, origin: str, message: Message, at: float | None = None) -> None:
@@ -156,8 +156,8 @@ class Consumers:
 
     def flush(self) -> None:
         """Flush every link that has unsent messages."""
-        if self._dirty:
-            dirty, self._dirty = self._dirty, {}
+        if self.unflushed:
+            dirty, self.unflushed = self.unflushed, {}
             for link in dirty.values():
                 link.flush()
 

@@ -103,7 +103,8 @@ def decide_started(tree: SupervisorState, id: str, run: int, now: float, *, igno
                     doubted=False,
                 )
             draft.reply(child.starters, id=None if ignored else id)
-            replay(draft, child.waiting)
+            if child.waiting:
+                replay(draft, child.waiting)
         case SupervisedChild(phase=Phase.CONDEMNED) if ignored:
             draft.put(child, phase=Phase.DUE)
         case SupervisedChild(phase=Phase.CONDEMNED):

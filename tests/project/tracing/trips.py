@@ -7,13 +7,14 @@ tests/project/package_figures.py runs this, with the sitecustomize.py that lies 
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
 
-import pykka
 import sitecustomize
 
 import rr_actors as rr
@@ -29,11 +30,6 @@ Each process folds its journal 0.1 s after its last commit. That is no part of a
 class Cameras(rr.Manager):
     """Serves one kind of resource, and sends a status when the shared byte says so."""
 
-    def start_sender(self) -> None:
-        resource_id = self.registrar.resources()[0].id
-        status = rr.Status(rr.State.WARNING, "blurred")
-        threading.Thread(target=self._send_status, args=(resource_id, status), daemon=True).start()
-
     def _send_status(self, resource_id: str, status: rr.Status) -> None:
         while not sitecustomize.shared[1]:
             time.sleep(0.002)
@@ -48,10 +44,14 @@ class Cameras(rr.Manager):
     def recover_camera(self, device: str, response: str) -> str:
         return f"{response} again"
 
-    def entered(self) -> set[tuple[str, str]]:
-        noted = set(sitecustomize.entered)
-        sitecustomize.entered.clear()
-        return noted
+    @rr.server("noted")
+    def noted(self, _number: int) -> list[list[str]]:
+        return [list(pair) for pair in _here()]
+
+    @rr.server("sender")
+    def start_sender(self, resource_id: str) -> None:
+        status = rr.Status(rr.State.WARNING, "blurred")
+        threading.Thread(target=self._send_status, args=(resource_id, status), daemon=True).start()
 
 
 def _below(noted: set[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -64,6 +64,12 @@ def _here() -> set[tuple[str, str]]:
     return noted
 
 
+def _noted_there(app: rr.Registrar) -> set[tuple[str, str]]:
+    """What the manager's process has noted. A load brings it: an ask would leave a link between the actors."""
+    with app.load("cameras/noted", 0) as query:
+        return {(file, caller) for file, caller in query.response}
+
+
 def main() -> None:
     trips: dict[str, list[tuple[str, str]]] = {}
     heard = threading.Event()
@@ -74,25 +80,24 @@ def main() -> None:
         app = system.open_registrar("app")
         for device in ("one", "two", "three"):  # the connection is made, and what each load needs once
             app.load("cameras/camera", device).unload()
-        cameras: pykka.ActorProxy[Cameras] = system.ref("cameras").proxy()
-        cameras.entered().get()
+        _noted_there(app)
 
         sitecustomize.shared[0] = 1
         query = app.load("cameras/camera", "/dev/video0", on_status=lambda _status: heard.set())
         sitecustomize.shared[0] = 0
-        trips["load"] = _below(_here() | cameras.entered().get())
+        trips["load"] = _below(_here() | _noted_there(app))
 
-        cameras.start_sender().get()
+        app.load("cameras/sender", query.resource_id).unload()
         sitecustomize.shared[0] = sitecustomize.shared[1] = 1
         assert heard.wait(10)
         time.sleep(ACKNOWLEDGED_S)
         sitecustomize.shared[0] = 0
-        trips["status"] = _below(_here() | cameras.entered().get())
+        trips["status"] = _below(_here() | _noted_there(app))
 
         heard.clear()
         child = system.supervisor().which_children()[0]
         sitecustomize.shared[0] = 1
-        child.ref.kill()
+        os.kill(child.pid or 0, signal.SIGKILL)
         assert heard.wait(10)
         sitecustomize.shared[0] = 0
         trips["restore"] = _below(_here())
