@@ -41,9 +41,9 @@ def test_functions_are_as_short_as_they_were() -> None:
 
 def test_a_load_a_status_and_a_restore_pass_no_more_files_than_they_did() -> None:
     assert len(monitor_entries("load")) <= 3
-    assert len(passed("load")) <= 40
-    assert len(passed("status")) <= 44
-    assert len(passed("restore")) <= 62
+    assert len(passed("load")) <= 24
+    assert len(passed("status")) <= 24
+    assert len(passed("restore")) <= 50
 
 
 def test_no_more_lines_of_tests_use_a_private_attribute() -> None:
