@@ -7,9 +7,8 @@ Each holder of the loop calls acquire() and then release(): the thread starts wi
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import contextlib
-import functools
+import contextvars
 import os
 import threading
 import weakref
@@ -22,7 +21,7 @@ from rr_actors.base.reporting import log
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime import interpreter
-from rr_actors.runtime.shielding import shielded
+from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.user_loop import log_exception, start_loop_thread
 from rr_actors.runtime.workers import Workers
 
@@ -122,9 +121,9 @@ class Dispatcher:
         """
         course = self.course(coroutine)
         try:
-            return shielded(functools.partial(course.wait, timeout_s), course.give_up)
+            return course.wait(timeout_s)
         except BaseException:
-            course.discard()
+            course.end()
             raise
 
     def course(self, coroutine: Coroutine[Any, Any, T]) -> Course[T]:
@@ -220,30 +219,34 @@ class Course(Generic[T]):
     def __init__(self, dispatcher: Dispatcher, coroutine: Coroutine[Any, Any, T]) -> None:
         self._dispatcher = dispatcher
         self._coroutine = coroutine
-        self._task: asyncio.Task[Any] | None = None
+        self._context = contextvars.copy_context()
+        self._task: asyncio.Task[T] | None = None
         self._begun = False
         self._given_up = False
+        self._ended = Flag()
 
     def wait(self, timeout_s: float | None = None) -> T:
-        """Run the coroutine and return its result."""
-        self._begun = True
-        running = self._run()
+        """Run the coroutine and return its result.
+
+        Raises:
+            TimeoutError: it was not done after `timeout_s` seconds, and is cancelled.
+            Unavailable: it was given up, or the loop has ended.
+        """
         try:
-            if self._dispatcher.closed:
-                raise RuntimeError("closed")
-            future = asyncio.run_coroutine_threadsafe(running, self._dispatcher.loop)
-        except RuntimeError as error:
-            running.close()
+            self._dispatcher.hand_over(self._begin)
+        except Unavailable:
             self._coroutine.close()
-            raise Unavailable(self._dispatcher.no_loop) from error
-        try:
-            return future.result(timeout_s)
-        except concurrent.futures.CancelledError as error:
-            raise Unavailable("it was given up, or the loop of rr_actors ended while this waited for it") from error
-        except TimeoutError:
-            if not future.done():
-                future.cancel()
             raise
+        if not self._ended.wait(timeout_s):
+            self.give_up()
+            raise TimeoutError
+        task, self._task = self._task, None
+        if task is None or task.cancelled():
+            raise Unavailable("it was given up, or the loop of rr_actors ended while this waited for it")
+        try:
+            return task.result()
+        finally:
+            del task  # it has the error, whose traceback has this frame
 
     def give_up(self) -> None:
         """Cancel the coroutine. The waiting thread gets an error when the coroutine has ended."""
@@ -251,24 +254,33 @@ class Course(Generic[T]):
         with contextlib.suppress(Unavailable):
             self._dispatcher.call(self._cancel)
 
-    def discard(self) -> None:
-        """Close the coroutine if wait() has not begun."""
-        if not self._begun:
+    def end(self) -> None:
+        """Give up the coroutine, unless it has ended or is given up, and wait until it has ended, if it has begun."""
+        if self._ended.is_set or self._given_up:
+            return
+        self.give_up()
+        if self._begun:  # after give_up(): if the loop begins it later, it sees that it is given up
+            self._ended.wait()
+        else:
             self._coroutine.close()
+
+    def _begin(self) -> None:
+        self._begun = True
+        if self._given_up:
+            self._coroutine.close()
+            self._ended.set()
+            return
+        self._task = task = self._context.run(self._dispatcher.loop.create_task, self._coroutine)
+        task.add_done_callback(self._say_ended)
+
+    def _say_ended(self, task: asyncio.Task[T]) -> None:
+        if not task.cancelled():
+            task.exception()  # its thread may not look at it any more: asyncio would log it
+        self._ended.set()
 
     def _cancel(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-
-    async def _run(self) -> T:
-        if self._given_up:  # before the loop began it
-            self._coroutine.close()
-            raise asyncio.CancelledError
-        self._task = asyncio.current_task()
-        try:
-            return await self._coroutine
-        finally:
-            self._task = None
+        if (task := self._task) is not None:
+            task.cancel()
 
 
 class _Process:

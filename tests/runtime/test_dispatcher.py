@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import importlib.util
 import logging
 import os
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -161,6 +163,29 @@ def test_run_returns_what_the_coroutine_returns_and_raises_what_it_raises(dispat
     assert dispatcher.run(answer(41)) == 42
     with pytest.raises(ValueError, match="negative"):
         dispatcher.run(answer(-1))
+
+
+def test_run_starts_no_thread_and_keeps_no_error(dispatcher: Dispatcher, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[object] = []
+    monkeypatch.setattr(threading.Thread, "start", started.append)
+
+    class Gone(Exception):
+        pass
+
+    async def fail() -> None:
+        raise Gone
+
+    gc.disable()
+    try:
+        with pytest.raises(Gone) as raised:
+            dispatcher.run(fail())
+        error = weakref.ref(raised.value)
+        del raised
+        dispatcher.run(asyncio.sleep(0))  # the loop has let the task go
+        assert error() is None
+    finally:
+        gc.enable()
+    assert started == []
 
 
 def test_run_gives_up_after_its_time_limit_and_cancels_the_coroutine(dispatcher: Dispatcher) -> None:
