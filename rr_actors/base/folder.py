@@ -34,6 +34,11 @@ def make_directories(path: str | os.PathLike[str], *, synced: bool = False) -> N
     """Make a directory and its missing parents, each with mode 0700. `synced`: a power cut does not lose them."""
     missing: list[Path] = []
     at = Path(path)
+    with contextlib.suppress(OSError):  # it is there, or its parent is not
+        os.mkdir(at, 0o700)
+        if synced:
+            _sync(at.parent)
+        return
     while not at.is_dir():
         if at.exists():
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(at))

@@ -107,8 +107,7 @@ def _open_in_directory(
     with contextlib.ExitStack() as if_not:
         if_not.enter_context(folder)
         _make_private(folder)
-        files = [file.name for file in (path.with_suffix(".lock"), *sqlite_store.files_of(path))]
-        _make_files_private(folder, [*files, *sqlite_store.segments_among(folder.names(), path)])
+        _make_files_private(folder, [path.with_suffix(".lock").name, *sqlite_store.files_among(folder.names(), path)])
         lock = CatalogLock(folder, path)
         if_not.callback(lock.release)
         store = _open_locked(folder, path, lock, durability, on_damage, witness)
@@ -231,7 +230,7 @@ def _open_locked(
     folder: Folder, path: Path, lock: CatalogLock, durability: Durability, on_damage: str, witness: Witness | None
 ) -> Store:
     registrar = "" if witness is None else witness.registrar
-    known = None if witness is None else witness.known()
+    known, spent = (None, 0) if witness is None else witness.known_or_spent()
     try:
         with errors_named(path):
             meta, content, left = _read(folder, path, lock.reached, witness)
@@ -245,9 +244,7 @@ def _open_locked(
     else:
         if known is not None:
             _compare(path, meta, known, registrar)
-    spent = max(meta.epoch, left.epoch, 0 if known is None else known.epoch)
-    if witness is not None and not spent:
-        spent = witness.spent()
+    spent = max(meta.epoch, left.epoch, 0 if known is None else known.epoch) or spent
     changes: sql_tables.Net | None = sql_tables.net_of(left.changes)
     place = (spent + 1, max(meta.folded, left.last), registrar or meta.registrar)
     if meta.id:
@@ -287,6 +284,8 @@ def _read(
         reached: the catalog's progress, if it was not closed.
         witness: has the name of the catalog's registrar, if that is known.
     """
+    if reached is None and not sqlite_store.files_among(folder.names(), path):
+        return sqlite_store.NONE, content_of(()), _Left()
     found = journaled_store.read(folder, path)  # first: the file then has the segments that are folded meanwhile
     first, is_new = None, reached is not None and not reached.is_made
     if not sqlite_store.has_file(folder, path):

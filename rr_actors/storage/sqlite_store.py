@@ -305,6 +305,12 @@ def files_of(path: Path) -> list[Path]:
     return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
 
 
+def files_among(names: Sequence[str], path: Path) -> list[str]:
+    """Return the names that belong to files_of() this catalog, or to its journal."""
+    own = path.name, f"{path.name}-wal", f"{path.name}-shm"
+    return [name for name in own if name in names] + segments_among(names, path)
+
+
 def has_file(folder: Folder, path: Path) -> bool:
     """Return whether the catalog has its SQLite file. A tool that looks before it is made leaves an empty one."""
     found = folder.look(path.name)

@@ -64,14 +64,12 @@ class Witness:
             if synced:
                 os.fsync(state.fd)
 
-    def spent(self) -> int:
-        """Return the highest epoch of all catalogs of this state directory that were erased; 0 if none was."""
+    def known_or_spent(self) -> tuple[Known | None, int]:
+        """Return what known() does; and if that is None, the highest epoch of all catalogs here that were erased."""
         with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
-            if place.has(_EPOCHS):
-                with place.open(_EPOCHS) as file:
-                    fcntl.flock(file, fcntl.LOCK_SH)
-                    return _number_in(file)
-        return 0
+            known = _read(place, self.registrar)
+            return known, 0 if known is not None else _spent(place)
+        return None, 0
 
     def forget(self, epoch: int) -> bool:
         """Remove the record, because the catalog is about to be erased; return whether its epoch is noted as spent."""
@@ -130,6 +128,14 @@ def missing_text(registrar: str, known: Known) -> str:
         " the registrar held and served is lost, and it starts empty; put a copy in its place before it is opened, if"
         " there is one"
     )
+
+
+def _spent(place: Folder) -> int:
+    if not place.has(_EPOCHS):
+        return 0
+    with place.open(_EPOCHS) as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        return _number_in(file)
 
 
 def _number_in(file: io.FileIO) -> int:
