@@ -17,6 +17,7 @@ from rr_actors.registrar.model.commands import BeginClosing, ConsumerLost, EndCl
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request, UnloadResolved
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
 from rr_actors.registrar.model.rows import Held, Hold, State
+from rr_actors.registrar.model.store import is_needed
 
 # -- as a consumer -------------------------------------------------------------------------------------------------
 #
@@ -197,7 +198,7 @@ def begin_closing(decision: Decision, command: BeginClosing) -> None:
 
 
 def end_closing(decision: Decision, _command: EndClosing) -> None:
-    """Owe all releases that are left, and forget the providers that have nothing of this registrar.
+    """Owe all releases that are left. Forget the providers that have nothing of this registrar, and unneeded types.
 
     A provider that was away since this registrar was opened may have queries that are unknown here; one that is away
     now may not have got an acknowledgement. The Peer row stays, and says that all is released. A consumer with a link
@@ -218,6 +219,9 @@ def end_closing(decision: Decision, _command: EndClosing) -> None:
         for notice in [catalog.notices[id] for id in catalog.notices_to.get(origin, ())]:
             if notice.query_id not in catalog.queries:
                 drop_notice(decision, notice)
+    if not is_needed(catalog.tables):  # so nothing is left, and the store makes no file for it
+        for types in list(catalog.server_types.values()):
+            decision.drop(types)
 
 
 # -- as a provider -------------------------------------------------------------------------------------------------
