@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,9 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers.programs import Program, Programs, RunProgram
-from support import Workshop, catalog_path, eventually, serve
+from rr_actors.registrar.engine import node as node_module
+from support import LIMIT_S, Workshop, catalog_path, eventually, serve
+from support_inside import actor_of
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -38,6 +41,34 @@ def test_registrars_that_are_closed_leave_no_directory(
         session.close()
     eventually(lambda: directories(state_dir) == {"provider"})
     assert records(state_dir) <= {"provider"}
+
+
+def test_the_catalog_of_a_session_that_is_over_never_has_an_sqlite_file(
+    system: rr.System, provider: rr.Registrar, state_dir: Path
+) -> None:
+    serve(provider, "thing")
+    session = system.open_registrar("session")
+    session.load("provider/thing", "x").unload()
+    session.close()
+    assert not catalog_path(state_dir, "session").exists(), "to make it, the loop waits for the disk"
+
+
+def test_nothing_is_removed_any_more_when_stop_has_returned(
+    system: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, ended, never = threading.Event(), threading.Event(), threading.Event()
+
+    def remove(_names: Sequence[str], _state_dir: str) -> None:
+        begun.set()
+        never.wait(1.5)  # a stop waits less for other work
+        ended.set()
+
+    monkeypatch.setattr(node_module, "_REMOVE_S", 0.0)
+    monkeypatch.setattr(actor_of(system.open_registrar("kept")).node, "_remove_catalogs", remove)
+    system.open_registrar("session").close()
+    assert begun.wait(LIMIT_S)
+    system.stop()
+    assert ended.is_set()
 
 
 def test_a_registrar_that_is_opened_again_goes_on_whether_its_directory_was_removed_or_not(

@@ -48,6 +48,7 @@ _RECONCILE_S = 1.0
 _RECOVER_S = 2.0
 """How long on_start and the other servers of a registrar wait for its recover callbacks."""
 _REMOVE_S = 2.0
+_REMOVED_AT_ONCE = 16
 _HEARD_S = 1.0
 _TELL_S = 5.0  # how long a provider may take to write that a registrar is gone
 _LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile sends nothing
@@ -80,6 +81,8 @@ class Node(ProcessNode):
         self._remove_catalogs = remove_unneeded
         self._opening: set[str] = set()  # names of registrars whose catalogs are being read
         self._left: set[str] = set()  # names of registrars that are gone for good, with catalogs to be looked at
+        self._removing: asyncio.Task[None] | None = None
+        self._closing = False
         self._handles: dict[str, HandleLine] = {}
 
     async def _close(self, steps: Steps) -> None:
@@ -88,6 +91,9 @@ class Node(ProcessNode):
             steps.take(f"closing registrar {name!r}", self.close_registrar, name, Presence.STOPPED)
         for line in list(self._handles.values()):
             steps.take("closing the line of a handle", line.close)
+        self._closing = True
+        if self._removing is not None:  # from now on the state directory may be another system's
+            await asyncio.wait((self._removing,))
         await super()._close(steps)
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
@@ -359,17 +365,27 @@ class Node(ProcessNode):
         """
         if config.location is not None or config.durability == "none":  # a directory that the user chose is the user's
             return
-        if not self._left:
-            self.dispatcher.loop.call_later(_REMOVE_S, self._remove_unneeded)
+        if not self._left and self._removing is None:
+            self._remove_later()
         self._left.add(config.name)
 
-    def _remove_unneeded(self) -> None:
-        left, self._left = self._left, set()
-        gone = [name for name in left if name not in self._opening and self.status_of(name) is _GONE]
-        with contextlib.suppress(Unavailable):  # the process is stopping
-            self.dispatcher.workers.submit(
-                functools.partial(self._remove_catalogs, gone, self.info.state_dir), patient=True
-            )
+    def _remove_later(self) -> None:
+        self.dispatcher.loop.call_later(_REMOVE_S, self._begin_to_remove)
+
+    def _begin_to_remove(self) -> None:
+        if not self._closing:
+            self._removing = self.dispatcher.loop.create_task(self._remove_unneeded())
+
+    async def _remove_unneeded(self) -> None:
+        left, self._left = list(self._left), set()
+        while left and not self._closing:
+            some, left = left[:_REMOVED_AT_ONCE], left[_REMOVED_AT_ONCE:]
+            gone = [name for name in some if name not in self._opening and self.status_of(name) is _GONE]
+            with contextlib.suppress(Unavailable):  # no worker is free: the next start of the system removes them
+                await self.dispatcher.workers.run(self._remove_catalogs, gone, self.info.state_dir)
+        self._removing = None
+        if self._left:
+            self._remove_later()
 
     async def _tell_gone(self, provider: str, address: str, name: str) -> bool:
         try:
