@@ -7,6 +7,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any, TypeVar
 
+from rr_actors.runtime import event_loop
+
 T = TypeVar("T")
 
 
@@ -27,3 +29,26 @@ def steps_of(work: Callable[[], T]) -> tuple[int, T]:
     finally:
         sys.settrace(before)
     return steps, result
+
+
+def steps_on_loop(work: Callable[[], object]) -> int:
+    """Return how many bytecodes of Python the event loop takes, while `work` runs in this thread."""
+    steps = 0
+
+    def count(frame: FrameType, event: str, _: Any) -> Any:
+        nonlocal steps
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        steps += event == "opcode"
+        return count
+
+    async def trace(function: Any) -> None:
+        sys.settrace(function)
+
+    dispatcher = event_loop.acquire()
+    try:
+        dispatcher.run(trace(count))
+        work()
+        dispatcher.run(trace(None))
+    finally:
+        event_loop.release()
+    return steps

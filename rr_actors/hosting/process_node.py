@@ -126,7 +126,7 @@ class ProcessNode(abc.ABC):
         )
         self.keeper = RunKeeper(self.directory, self.transport, self.watched, info.place)
         self.stopping = ""  # why all registrars here are being closed
-        self.owner: object | None = None  # kept alive while a registrar is open that the application uses
+        self.owners: dict[str, object] = {}  # kept alive, by the name of a registrar that is open for the application
         self.on_event = on_event
         self.on_death_in_callback: Callable[[str], None] = _unheard
         """Called with the callbacks that ran when the process died that a registrar of this one had before."""
@@ -163,7 +163,7 @@ class ProcessNode(abc.ABC):
             steps.take("closing the way to other processes' actors", self.hub.close)
             if remove_hub(self.hub) and hub() is None:
                 dead_letters.office.listener = None
-            self.owner = None
+            self.owners.clear()
             await self._close(steps)
         steps.end(f"{self.path}: not closed altogether")
 

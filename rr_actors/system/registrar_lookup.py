@@ -66,7 +66,7 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
         text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
         raise ConfigError(text, file=None, key="config", expected=expected, got=got)
     registrar = node.dispatcher.run(_open_in(node, name, called(config, name)))
-    node.owner = owner
+    node.owners[name] = owner
     return registrar
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.engine.registrar_state import is_deciding
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.effects import Request
@@ -16,7 +17,8 @@ from rr_actors.registrar.model.messages import Unload, Unloaded
 from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Resource, Row, ServedQuery, State, content_of
 from rr_actors.runtime import event_loop
 from support import LIMIT_S, serve
-from support_steps import steps_of
+from support_inside import actor_of
+from support_steps import steps_of, steps_on_loop
 
 
 def whole_of(parts: int) -> tuple[Catalog, list[Any]]:
@@ -76,3 +78,34 @@ def test_a_look_at_one_of_many_queries_takes_as_many_steps_as_at_one_of_few(
     few = steps()
     newest = app.load_all([("provider/thing", n) for n in range(10, 1_000)])[-1].id
     assert steps() <= few * 1.1
+
+
+def test_to_open_and_close_one_of_many_registrars_takes_as_many_steps_as_one_of_few(system: rr.System) -> None:
+    config = rr.RegistrarConfig(durability="none")
+
+    def session() -> None:
+        system.open_registrar("session", config).close()
+
+    def steps() -> tuple[int, int]:
+        return min(steps_on_loop(session) for _ in range(5)), steps_of(is_deciding)[0]
+
+    for number in range(20):
+        system.open_registrar(f"few-{number}", config)
+    few = steps()
+    for number in range(500):
+        system.open_registrar(f"many-{number}", config)
+    many = steps()
+    assert many[0] <= few[0] * 1.1
+    assert many[1] == few[1], "each load and unload asks whether this thread is deciding"
+
+
+def test_of_many_registrars_that_share_locks_each_says_that_its_thread_is_deciding(system: rr.System) -> None:
+    registrars = [system.open_registrar(f"r{number}", rr.RegistrarConfig(durability="none")) for number in range(100)]
+    for registrar in registrars:
+        assert not is_deciding()
+        with actor_of(registrar).lock:
+            assert is_deciding()
+    for registrar in registrars[:-1]:
+        registrar.close()
+    with actor_of(registrars[-1]).lock:
+        assert is_deciding(), "the lock of one that is open is asked, whoever else had it"

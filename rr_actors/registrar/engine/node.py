@@ -231,8 +231,7 @@ class Node(ProcessNode):
         steps.take("closing it", self.close_registrar, name, _GONE)
         if config is not None:
             self._look_whether_needed(config)
-        if all(actor.on_failure is not None for actor in self.registrars.values()):  # only those of managers are left
-            self.owner = None
+        self.owners.pop(name, None)
         steps.end(f"registrar {name!r}: not closed as it should be")
 
     async def wind_down(self, name: str, timeout_s: float | None) -> None:

@@ -93,7 +93,6 @@ class RegistrarActor(RegistrarBase):
     def leave_to_parent(self) -> None:
         """Stop using this registrar in a forked child: its links and its catalog belong to the parent process."""
         self.closed = True
-        self.lock_in_use(in_use=False)
         self._why_down = FORKED
 
     def down(self) -> RegistrarDown:

@@ -14,6 +14,7 @@ whole().
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import signal
@@ -46,17 +47,45 @@ LoadWaiter = Callable[[Held | None, RrError | None], None]
 UnloadWaiter = Callable[[RrError | None], None]
 
 
-class _OpenLocks:
-    """The locks of this process's registrars: for each, a function that says whether the calling thread has it.
+_LOCKS = 16
+"""The most locks of the registrars of one process. More registrars share them, so that is_deciding() looks at few."""
 
-    The tuple is replaced as a whole, on the loop.
+
+class _Locks:
+    """The locks of this process's open registrars. Used on the loop, except for `owned`.
+
+    Attributes:
+        owned: for each, a function that says whether the calling thread has it. The tuple is replaced as a whole.
     """
 
     def __init__(self) -> None:
         self.owned: tuple[Callable[[], bool], ...] = ()
+        self._users: dict[threading.RLock, int] = {}
+        self._turn = itertools.count()
+
+    def choose(self) -> threading.RLock:
+        """Return a lock for one registrar more: a new one, or one that some share."""
+        if len(self._users) < _LOCKS:
+            return threading.RLock()
+        return list(self._users)[next(self._turn) % _LOCKS]
+
+    def count(self, lock: threading.RLock, change: int) -> None:
+        """Note that so many registrars more use a lock."""
+        users = self._users.get(lock, 0) + change
+        if users:
+            self._users[lock] = users
+        else:
+            del self._users[lock]
+        if users in (0, change):  # the last has gone, or the first has come
+            self.owned = tuple(_owned_of(lock) for lock in self._users)
 
 
-_open_locks = _OpenLocks()
+def _owned_of(lock: threading.RLock) -> Callable[[], bool]:
+    return lock._is_owned  # type: ignore[attr-defined]  # as in threading
+
+
+_locks = _Locks()
+os.register_at_fork(after_in_child=_locks.__init__)  # another thread may have had one of them, and is not in the child
 
 
 def is_deciding() -> bool:
@@ -64,7 +93,7 @@ def is_deciding() -> bool:
 
     A finalizer (__del__) must not wait if so: the garbage collector runs it anywhere, also in the middle of a decision.
     """
-    for is_owned in _open_locks.owned:  # noqa: SIM110 - any() takes longer
+    for is_owned in _locks.owned:  # noqa: SIM110 - any() takes longer
         if is_owned():
             return True
     return False
@@ -100,7 +129,8 @@ class RegistrarState:
     """The catalog of one registrar, in memory and on disk.
 
     Attributes:
-        lock: held by the thread that decides, or that reads more than one entry. enter() returns it.
+        lock: held by the thread that decides, or that reads more than one entry. enter() returns it. Registrars of one
+            process share locks if there are many.
         is_inside: whether the calling thread has the lock; is_deciding() asks it.
         closed: whether the registrar is closed; then nothing is decided any more.
         waiting: the messages and commands that are not decided yet (monitor.py). One of a thread waits behind them.
@@ -115,9 +145,11 @@ class RegistrarState:
     ) -> None:
         self.name = name
         self.config = config
-        self.lock = threading.RLock()
+        self.lock = _locks.choose()
+        self._count_users = functools.partial(_locks.count, self.lock)
+        self._is_user = False
         self.commits = CommitLog(name, config, store, loop, workers, self.lock)
-        self.is_inside: Callable[[], bool] = self.lock._is_owned  # type: ignore[attr-defined]  # as in threading
+        self.is_inside = _owned_of(self.lock)
         self.epoch = store.epoch
         self.catalog = self.stored_catalog()
         self.waiting: deque[Item] = deque()
@@ -142,8 +174,9 @@ class RegistrarState:
     @on_loop
     def lock_in_use(self, *, in_use: bool) -> None:
         """Have is_deciding() ask this lock from now on, or no longer."""
-        others = tuple(owned for owned in _open_locks.owned if owned != self.is_inside)
-        _open_locks.owned = (*others, self.is_inside) if in_use else others
+        if in_use != self._is_user:
+            self._is_user = in_use
+            self._count_users(1 if in_use else -1)
 
     def enter(self) -> AbstractContextManager[object]:
         """Return the lock, for a `with` statement.
