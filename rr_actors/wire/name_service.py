@@ -217,11 +217,17 @@ class Directory:
                 self._write(name, content)
 
     def _write(self, name: str, content: str) -> None:
-        draft = f"{self._draft}{next(self._numbers)}"
         names = self._names
-        with contextlib.suppress(OSError):  # there is none yet
+        try:
             if os.readlink(name, dir_fd=names.fd) == content:  # a new link costs a hundred times as much as this look
                 return
+        except FileNotFoundError:
+            with contextlib.suppress(FileExistsError):  # another process has written it meanwhile
+                os.symlink(content, name, dir_fd=names.fd)
+                return
+        except OSError:  # something else has the name: it is replaced
+            pass
+        draft = f"{self._draft}{next(self._numbers)}"
         os.symlink(content, draft, dir_fd=names.fd)
         try:
             names.rename(draft, name)

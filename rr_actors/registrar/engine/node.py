@@ -140,7 +140,7 @@ class Node(ProcessNode):
         deaths = ""
         if entry is not None and entry.status is Presence.STARTING:
             deaths = entry.why
-            self.directory.announce(registrar_key(name), self.transport.address)
+            self._announce(config, had_process=bool(deaths))
         if self.info.place is not None:
             self.info.place.check()
         self._opening.add(name)
@@ -154,6 +154,11 @@ class Node(ProcessNode):
         finally:
             self._opening.discard(name)
         return registrar
+
+    def _announce(self, config: RegistrarConfig, *, had_process: bool) -> None:
+        """Write where a starting registrar will be, for its consumers to prepare while a catalog is read."""
+        if had_process or os.path.exists(config.catalog_path(self.info.state_dir)):
+            self.directory.announce(registrar_key(config.name), self.transport.address)
 
     async def _open_store(self, config: RegistrarConfig) -> Store:
         """Open a catalog. If that is cancelled, as by Ctrl-C, close the catalog."""
