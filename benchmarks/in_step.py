@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Literal
 import pykka
 
 import rr_actors as rr
+from benchmarks.measure import time_each
 from benchmarks.table import Row
 from benchmarks.workload import Empty
 
@@ -28,6 +30,8 @@ Seconds = dict[str, float]
 
 _AIM = 1.1
 _LIMIT_S = 600.0
+_SESSIONS = 1_000
+"""Sessions in a second, one after another: open a registrar, load, unload, close."""
 
 
 def in_step(scale: int, times: int) -> list[Row]:
@@ -38,13 +42,19 @@ def in_step(scale: int, times: int) -> list[Row]:
     """
     few, some, many = (10 * scale, 100 * scale, 1_000 * scale)
     dear = (scale, 3 * scale, 10 * scale)
+    registrars = (scale, 10 * scale, 100 * scale)
+    managers = (scale, 10 * scale, 30 * scale)
     return [
         *_rows("children in threads", (few, some, many), times, lambda count: _children(count, "thread")),
         *_rows("children in processes", dear, times, lambda count: _children(count, "process")),
-        *_rows("managers in threads", dear, times, _managers),
+        *_rows("managers in threads", managers, times, _managers),
+        *_rows("managers that are added as threads", managers, times, _added),
         *_rows("actors", (few, some, many), times, _actors),
-        *_rows("registrars", dear, times, _registrars),
+        *_rows("registrars", registrars, times, _registrars),
+        *_sessions(10 * scale, times),
         *_rows("registrars in a chain", dear, times, _chain),
+        *_beside_one("thread", 10 * scale, times),
+        *_beside_one("process", 4 * scale, times),
         *_rows("parts of a resource", (few, some, many), times, _parts),
         *_rows("clients", dear, times, _clients),
         *_rows("resources", (some, many, 3 * many), times, _inspected),
@@ -111,6 +121,67 @@ def _managers(count: int) -> Seconds:
         system.snapshot()
         clock.step("snapshot")
     return clock.taken
+
+
+def _added(count: int) -> Seconds:
+    with _system() as (system, clock):
+        clock.step("")
+        for number in range(count):
+            system.start_child(rr.ChildSpec(_Shop, id=f"shop{number}", placement="thread"))
+        clock.step("opening")
+    del clock.taken[""]
+    return clock.taken
+
+
+def _sessions(count: int, times: int) -> list[Row]:
+    """Sessions with a manager in a process, one after another, in one thread."""
+    with _system(rr.ChildSpec(_Shop, id="shop")) as (system, _):
+        taken = [time_each(lambda: _session(system), count) for _ in range(times)]
+    a_second = count / min(map(sum, taken))
+    return [Row("sessions of an application in a second", a_second, "a second", at_least=_SESSIONS)]
+
+
+def _session(system: rr.System) -> None:
+    registrar = system.open_registrar(f"session-{uuid.uuid4().hex}")
+    registrar.load("shop/thing", 1).unload()
+    registrar.close()
+
+
+class _Link(rr.Manager):
+    """Its callback loads from the next manager, the last one's from none."""
+
+    def __init__(self, below: str) -> None:
+        self._below = below
+
+    @rr.server("link")
+    def load_link(self, request: int) -> None:
+        if self._below:
+            self.registrar.load(self._below, request)
+
+
+def _beside_one(placement: Literal["process", "thread"], count: int, times: int) -> list[Row]:
+    """A load through so many managers that depend on one another, for each of them, beside a chain of one."""
+    one, many = _through(1, placement, 20 * times), _through(count, placement, 4 * times)
+    name = f"a load through a chain of {count:,} managers, each a {placement}, for each"
+    return [Row(name, 1e3 * many / count, "ms", ratio=many / count / one, against="a chain of one", at_most=1.0)]
+
+
+def _through(count: int, placement: Literal["process", "thread"], times: int) -> float:
+    belows = [*(f"link{number}/link" for number in range(1, count)), ""]
+    specs = [
+        rr.ChildSpec(_Link, id=f"link{number}", args=(below,), placement=placement)
+        for number, below in enumerate(belows)
+    ]
+    with _system(*specs) as (system, _):
+        app = system.open_registrar("app")
+        app.load("link0/link", 0, timeout_s=_LIMIT_S).unload(timeout_s=_LIMIT_S)  # connects
+        seconds: list[float] = []
+        for number in range(1, times + 1):
+            start = time.perf_counter()
+            query = app.load("link0/link", number, timeout_s=_LIMIT_S)
+            seconds.append(time.perf_counter() - start)
+            query.unload(timeout_s=_LIMIT_S)
+    return min(seconds)
 
 
 def _actors(count: int) -> Seconds:
