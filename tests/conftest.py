@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -90,7 +91,8 @@ def _processes() -> set[tuple[int, float]]:
 
     This is asked before and after each test, so a process that is known not to be ours is not looked at again.
     """
-    subprocess._cleanup()  # type: ignore[attr-defined]  # reap those whose Popen is gone, as the next Popen would
+    with contextlib.suppress(IndexError):  # without a command nothing is started
+        subprocess.Popen([])  # but first each Popen reaps the processes whose Popen is gone
     running = {int(name) for name in os.listdir("/proc") if name.isdigit()}
     _others.intersection_update(running)
     mark = f"{_MARK}={os.environ[_MARK]}".encode()
@@ -152,8 +154,8 @@ def _describe(pid: int) -> str:
 @pytest.fixture(autouse=True)
 def short_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The handler of pytest-timeout raises, and waits for nothing: with it the main thread may take short cuts."""
-    handlers = tuple(number for number in registrar_state._SIGNALS if number is not signal.SIGALRM)
-    monkeypatch.setattr(registrar_state, "_SIGNALS", handlers)
+    handlers = tuple(number for number in registrar_state.CATCHABLE_SIGNALS if number is not signal.SIGALRM)
+    monkeypatch.setattr(registrar_state, "CATCHABLE_SIGNALS", handlers)
 
 
 _handler: Any = pytest.LogCaptureFixture.handler

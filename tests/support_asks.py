@@ -53,13 +53,13 @@ def make_actor(cls: str) -> ActorRef[Any]:
 
 def line_of(home: Home) -> Line:
     """The only one there is."""
-    (line,) = home.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
+    (line,) = home.hub.lines()
     return line
 
 
 def idle(line: Line) -> list[Any]:
     """The connections that no thread has now."""
-    return line._asks._idle  # pyright: ignore[reportPrivateUsage]
+    return line.connections.idle
 
 
 def warm(ref: ActorRef[Any]) -> None:

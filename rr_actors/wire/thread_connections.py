@@ -52,6 +52,16 @@ class ThreadConnections(Generic[E]):
         self._dial_after = 0.0
         self.closed = False
 
+    @property
+    def idle(self) -> list[E]:
+        """The connections that no thread uses now."""
+        return list(self._idle)
+
+    @property
+    def in_use(self) -> list[E]:
+        """The connections that threads use now."""
+        return list(self._in_use)
+
     def take(self, timeout_s: float | None) -> E | None:
         """Return a connection for the calling thread alone, which must give it back or take it out; None: none is free.
 
@@ -128,7 +138,7 @@ class ThreadConnections(Generic[E]):
         """Close all connections; for threads that wait on them, they are lost."""
         with self._lock:
             self.closed = True
-        for line in list(self._in_use):
+        for line in self.in_use:
             line.cut()
         self._close_idle()
 

@@ -724,22 +724,21 @@ def test_a_loop_actor_handles_its_messages_on_the_loop_without_a_worker(dispatch
 def test_an_async_handler_of_a_loop_actor_holds_up_only_that_actor() -> None:
     class Waiting(LoopActor):
         def __init__(self) -> None:
-            self.gate = asyncio.Event()
             self.seen: list[Any] = []
 
         async def on_receive(self, message: Any) -> Any:
             if message == "wait":
-                await self.gate.wait()
+                await gate.wait()
             self.seen.append(message)
             return list(self.seen)
 
+    gate = asyncio.Event()
     slow, quick = Waiting.start(), LoopEcho.start()
-    actor: Any = slow._actor_weakref()  # pyright: ignore[reportPrivateUsage]
     waiting = slow.ask("wait", block=False)
     behind = slow.ask("behind", block=False)
     assert quick.ask("quick") == "quick"
     assert not waiting.done()
-    quick.tell(lambda _: actor.gate.set())
+    quick.tell(lambda _: gate.set())
     assert waiting.get(timeout=10) == ["wait"]
     assert behind.get(timeout=10) == ["wait", "behind"]
 

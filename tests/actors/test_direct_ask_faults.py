@@ -22,8 +22,10 @@ from rr_actors.actors.refs import ref_to
 from rr_actors.actors.remote.hub import hub, set_hub
 from rr_actors.base.errors import ActorUnavailable, RrError, Unavailable
 from rr_actors.wire import thread_connections
+from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.name_service import Presence
-from support import Calls, Workshop, child, eventually, hang, kill, pid_of, wait_gone, wait_respawned
+from rr_actors.wire.transport import Hello
+from support import Workshop, child, eventually, hang, kill, pid_of, wait_gone, wait_respawned
 from support_asks import Background, Puts, idle, in_threads, line_of, warm
 from support_managers import Order, Shop
 from support_refs import Home, Remote, open_home
@@ -62,7 +64,20 @@ def workers_of_ours() -> int:
 
 def is_in_use(home: Home) -> bool:
     """Whether a thread waits by a connection of its own."""
-    return bool(line_of(home)._asks._in_use)  # pyright: ignore[reportPrivateUsage]
+    return bool(line_of(home).connections.in_use)
+
+
+def limits_of_dialling(home: Home, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time limits, in seconds, of the connections that threads open from now on."""
+    limits: list[float] = []
+    dial = home.transport.dial
+
+    def note(address: str, hello: Hello, timeout_s: float) -> BlockingLink:
+        limits.append(timeout_s)
+        return dial(address, hello, timeout_s)
+
+    monkeypatch.setattr(home.transport, "dial", note)
+    return limits
 
 
 # -- a process that hangs ----------------------------------------------------------------------------------------------
@@ -109,15 +124,7 @@ def test_a_process_too_busy_to_shake_hands_is_asked_by_the_link_and_not_dialled_
     other = home.start_other(a="Remote", b="Remote")
     ref = ref_to("root/a")
     assert ref.ask("by the link") == "by the link"
-    line = line_of(home)
-    dial = line._asks._dial  # pyright: ignore[reportPrivateUsage]
-    dialled = Calls()
-
-    def note(limit: float) -> Any:
-        dialled(limit)
-        return dial(limit)
-
-    monkeypatch.setattr(line._asks, "_dial", note)  # pyright: ignore[reportPrivateUsage]
+    dialled = limits_of_dialling(home, monkeypatch)
     now = time.monotonic()
 
     class Clock:
@@ -140,14 +147,13 @@ def test_a_process_too_busy_to_shake_hands_is_asked_by_the_link_and_not_dialled_
     assert puts.asks() == 6
 
 
-def test_dialling_a_process_that_hangs_does_not_go_beyond_a_short_time_limit(home: Home) -> None:
+def test_dialling_a_process_that_hangs_does_not_go_beyond_a_short_time_limit(
+    home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
     other = home.start_other(a="Remote")
     ref = ref_to("root/a")
     assert ref.ask("by the link") == "by the link"
-    line = line_of(home)
-    dial = line._asks._dial  # pyright: ignore[reportPrivateUsage]
-    limits: list[float] = []
-    line._asks._dial = lambda limit: limits.append(limit) or dial(limit)  # pyright: ignore[reportPrivateUsage]
+    limits = limits_of_dialling(home, monkeypatch)
     hang(other.pid)
     with pytest.raises(pykka.Timeout, match=r"no reply after 0\.02 seconds"):
         ref.ask("while it hangs", timeout=0.02)
@@ -239,7 +245,7 @@ def test_no_descriptor_and_no_thread_is_left_of_a_process_that_died(home: Home) 
         ask_at_once()
         home.kill(other)
         other.communicate()
-        eventually(lambda: not home.hub._lines)  # pyright: ignore[reportPrivateUsage]
+        eventually(lambda: not home.hub.lines())
         eventually(lambda: not counts or descriptors() <= counts[0], what="descriptors")
         counts.append(descriptors())
     home.others.clear()
@@ -257,7 +263,7 @@ def test_the_other_process_keeps_nothing_of_who_has_left(home: Home) -> None:
     assert descriptors_of(other.pid) <= before + 2 * len(idle(line_of(home))) + 2
     line = line_of(home)
     home.dispatcher.call(line.close)
-    eventually(lambda: not home.hub._lines)  # pyright: ignore[reportPrivateUsage]
+    eventually(lambda: not home.hub.lines())
     eventually(lambda: descriptors_of(other.pid) <= before - 2, what="descriptors")
 
 

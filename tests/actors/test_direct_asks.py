@@ -138,14 +138,16 @@ def test_threads_that_ask_at_once_each_get_their_own_answers(ours: ActorRef[Any]
     assert len(idle(line_of(home))) <= 16
 
 
-def test_many_threads_that_wait_take_few_file_descriptors(ours: ActorRef[Any], home: Home, tmp_path: Path) -> None:
+def test_many_threads_that_wait_take_few_file_descriptors(
+    ours: ActorRef[Any], home: Home, puts: Puts, tmp_path: Path
+) -> None:
     shop = Workshop(tmp_path / "shop")
     shop.shut("step")
     line = line_of(home)
+    by_link = puts.asks()
     before = len(os.listdir("/proc/self/fd"))
     waiting = [Background(lambda: ours.ask(lambda _: shop.step("step"))) for _ in range(60)]
-    in_use = line._asks._in_use  # pyright: ignore[reportPrivateUsage]
-    eventually(lambda: len(in_use) + len(line._calls) == 60)  # pyright: ignore[reportPrivateUsage]
+    eventually(lambda: len(line.connections.in_use) + puts.asks() - by_link == 60)
     assert len(os.listdir("/proc/self/fd")) <= before + 16
     shop.open("step")
     for each in waiting:
@@ -288,7 +290,7 @@ def test_a_late_answer_reaches_nobody(ours: ActorRef[Any], home: Home, tmp_path:
     shop = Workshop(tmp_path / "shop")
     for number in range(10):
         warm(ours)
-        connections = list(idle(line_of(home)))
+        connections = idle(line_of(home))
         shop.shut(f"late{number}")
         with pytest.raises(pykka.Timeout):
             ours.ask(lambda _, number=number: (shop.step(f"late{number}"), "late")[1], timeout=0.05)
@@ -432,7 +434,7 @@ def test_an_async_handler_and_the_loop_are_refused_as_before(ours: ActorRef[Any]
 
     with pytest.raises(UsageError, match="async def"):
         Impatient.start().ask("go")
-    before = idle(line_of(home))[:]
+    before = idle(line_of(home))
 
     async def on_loop() -> None:
         with pytest.raises(UsageError, match="loop"):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -133,7 +135,7 @@ class Bench:
         self.on_loop(lambda: self.line.lost(link, reason))
 
     def close(self) -> None:
-        assert not self.line._asks._in_use  # pyright: ignore[reportPrivateUsage]
+        assert not self.line.connections.in_use
         if not self.dispatcher.closed:
             self.lose()
             self.dispatcher.close()
@@ -310,28 +312,22 @@ def test_what_is_left_when_the_link_is_lost_is_let_go(bench: Bench) -> None:
 
 
 def test_what_is_left_just_after_the_link_was_lost_holds_nothing_up(bench: Bench) -> None:
-    def exchange(_letter: Any, _limit: float | None) -> Any:
-        bench.lose()
-        raise TimeoutError
-
-    bench.transport.exchange = exchange
     left_and_put = threading.Event()
+    late = Tell(URN, b"late")
 
     def hold_up() -> None:
         assert left_and_put.wait(10)
 
-    original = bench.line._leave  # pyright: ignore[reportPrivateUsage]
-
-    def leave(line: BlockingLink) -> None:
+    def exchange(_letter: Any, _limit: float | None) -> Any:
+        bench.lose()
         bench.dispatcher.call(hold_up)
         bench.line.put(late)  # by a thread that had the line before it was forgotten; looked at before the other
-        original(line)
-        left_and_put.set()
+        raise TimeoutError
 
-    late = Tell(URN, b"late")
-    bench.line._leave = leave  # pyright: ignore[reportPrivateUsage]
+    bench.transport.exchange = exchange
     with pytest.raises(TimeoutError):
         bench.ask()
+    left_and_put.set()
     eventually(lambda: late in bench.link.sent)
     assert bench.transport.made[0].is_closed
 
@@ -345,7 +341,9 @@ def test_what_is_left_when_the_loop_has_ended_is_closed(bench: Bench) -> None:
     with pytest.raises(TimeoutError):
         bench.ask()
     assert bench.transport.made[0].is_closed
-    assert not bench.line._left  # pyright: ignore[reportPrivateUsage]
+    left = weakref.ref(bench.transport.made.pop())
+    gc.collect()
+    assert left() is None  # nor does the line keep it
 
 
 # -- answers -----------------------------------------------------------------------------------------------------------

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import gc
 import itertools
 import os
 import signal
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -184,24 +186,53 @@ def test_after_demonitor_nothing_is_heard_even_if_it_was_on_its_way(watcher: rr.
     busy.stop()
 
 
-def test_demonitor_leaves_nothing_behind() -> None:
+class Watches:
+    """Counts the watches of this process's actors that death_watch keeps."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._fires: list[weakref.ref[death_watch.Fire]] = []
+        watch = death_watch.watch
+
+        def note(ref: pykka.ActorRef[Any], fire: death_watch.Fire) -> Callable[[], None] | None:
+            self._fires.append(weakref.ref(fire))
+            return watch(ref, fire)
+
+        monkeypatch.setattr(death_watch, "watch", note)
+
+    def begun(self) -> int:
+        """How many were ever begun."""
+        return len(self._fires)
+
+    def kept(self) -> int:
+        """How many have not been forgotten."""
+        gc.collect()
+        return sum(fire() is not None for fire in self._fires)
+
+
+@pytest.fixture
+def watches(monkeypatch: pytest.MonkeyPatch) -> Watches:
+    return Watches(monkeypatch)
+
+
+def test_demonitor_leaves_nothing_behind(watches: Watches) -> None:
     watched = Worker.start()
     for _ in range(100):
         assert rr.monitor(watched, print).demonitor()
-    assert death_watch._watched[watched.actor_stopped] == {}  # pyright: ignore[reportPrivateUsage]
+    assert (watches.begun(), watches.kept()) == (100, 0)
 
     watched.stop()
 
     eventually(lambda: event_loop.current() is None)  # no monitor holds the loop
 
 
-def test_an_actor_that_ends_calls_its_monitors_off() -> None:
+def test_an_actor_that_ends_calls_its_monitors_off(watches: Watches) -> None:
     watched, watcher = Worker.start(), Watcher.start()
     watcher.ask(("watch", watched))
+    assert watches.kept() == 1
 
     watcher.stop()
 
-    assert death_watch._watched[watched.actor_stopped] == {}  # pyright: ignore[reportPrivateUsage]
+    assert watches.kept() == 0
     watched.stop()
 
 
@@ -474,21 +505,20 @@ def test_an_actor_of_this_process_is_watched_from_another(start: Start, watcher:
     assert downs_of(system.ref("watcher")) == [(str(mine), "normal")]
 
 
-def test_a_monitor_called_off_is_forgotten_in_the_other_process(start: Start) -> None:
+def test_a_monitor_called_off_is_forgotten_in_the_other_process(start: Start, watches: Watches) -> None:
     system = start(rr.ChildSpec(Watcher, id="watcher"))
     mine = Worker.start()
     watcher = system.ref("watcher")
     watcher.ask(("watch", mine))
-    watches = death_watch._watched[mine.actor_stopped]  # pyright: ignore[reportPrivateUsage]
-    eventually(lambda: len(watches) == 1)
+    eventually(lambda: watches.kept() == 1)
 
     assert watcher.ask("demonitor") == [True]
-    eventually(lambda: watches == {})
+    eventually(lambda: watches.kept() == 0)
 
     watcher.ask(("watch", mine))
-    eventually(lambda: len(watches) == 1)
+    eventually(lambda: watches.kept() == 1)
     os.kill(running_pid(system, "watcher") or 0, signal.SIGKILL)  # a watcher that dies leaves none behind either
-    eventually(lambda: watches == {})
+    eventually(lambda: watches.kept() == 0)
     mine.stop()
 
 
@@ -528,7 +558,7 @@ def test_a_process_that_lives_but_cannot_be_reached_is_told_from_a_dead_one(star
     rr.monitor(watched, calls)
     watched.ask("pid")
     node = node_of(system)
-    (line,) = node.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
+    (line,) = node.hub.lines()
 
     node.dispatcher.call(line.close)
 

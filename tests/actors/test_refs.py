@@ -299,7 +299,7 @@ def test_ask_times_out_and_a_late_reply_is_nobodys(ref: ActorRef[Any], home: Hom
     with pytest.raises(pykka.Timeout, match=str(ref.path)):
         ref.ask(lambda _: time.sleep(0.5), timeout=0.01)
     assert ref.ask("alive") == "alive"
-    (line,) = home.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
+    (line,) = home.hub.lines()
     eventually(lambda: not line._calls)  # pyright: ignore[reportPrivateUsage]
 
 

@@ -401,13 +401,19 @@ def opened(name: str) -> Iterator[Any]:
             case "pykka._ref.ActorRef" | "test_pickling.Plain":
                 ref = Plain.start()
                 stack.callback(ref.stop)
-                yield ref if "Ref" in name else ref._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+                yield ref if "Ref" in name else Plain.started
             case _:
                 yield IMMOVABLE[name]()
 
 
 class Plain(pykka.ThreadingActor):
-    """An actor of Pykka's."""
+    """An actor of Pykka's; `started` is the newest."""
+
+    started: Plain
+
+    def __init__(self) -> None:
+        super().__init__()
+        Plain.started = self
 
 
 IMMOVABLE: dict[str, Callable[[], Any]] = {

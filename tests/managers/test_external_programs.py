@@ -5,18 +5,21 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import psutil
 import pytest
 
-from rr_actors.managers import shim
+from rr_actors.managers import external_programs, shim
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
 from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
@@ -30,9 +33,19 @@ from support_slow import few_now
 KEY = os.environ["RR_ACTORS_TESTS"]  # of this run of the tests alone, and of what its processes start
 
 
-def output(programs: ExternalPrograms, key: str) -> tuple[str, ...]:
+def output(tmp_path: Path, key: str = KEY) -> tuple[str, ...]:
     """The last lines that a program has printed, running or ended."""
-    return programs._home(key).output(TAIL_LINES)
+    return Home(tmp_path / "programs" / key).output(TAIL_LINES)
+
+
+def start_shim(home: Home, order: Order, allocation: str) -> subprocess.Popen[bytes]:
+    """Start a shim as ExternalPrograms does, and leave it, as a manager that is killed then."""
+    started = subprocess.Popen([sys.executable, "-I", "-S", shim.__file__, str(home.path)], stdin=subprocess.PIPE)
+    assert started.stdin is not None
+    with started.stdin as order_file:
+        environment = {**order.environment, VARIABLE: allocation}
+        order_file.write(msgspec.json.encode({**asdict(order), "environment": environment, "group": None}))
+    return started
 
 
 class Exits:
@@ -103,11 +116,11 @@ def is_running(pid: int) -> bool:
 SLEEP = "import time; print('ready'); time.sleep(600)"
 
 
-def test_start_returns_once_the_line_was_printed(programs: ExternalPrograms) -> None:
+def test_start_returns_once_the_line_was_printed(programs: ExternalPrograms, tmp_path: Path) -> None:
     code = "import time; print('one'); print('now ready: 7'); time.sleep(600)"
     running = programs.start(KEY, python(code, ready=r"ready: \d"))
     assert is_running(running.pid)
-    assert output(programs, KEY) == ("one", "now ready: 7")
+    assert output(tmp_path) == ("one", "now ready: 7")
 
 
 def test_the_response_names_the_programs_own_process_and_its_start(programs: ExternalPrograms) -> None:
@@ -127,7 +140,7 @@ def test_the_program_has_a_session_of_its_own_and_its_allocation_in_its_environm
 def test_environment_arguments_and_directory_reach_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
     code = "import os, sys, time; print(os.environ['COLOUR'], sys.argv[1], os.getcwd(), flush=True); time.sleep(600)"
     programs.start(KEY, Order(sys.executable, ["-c", code, "x y"], {"COLOUR": "green"}, str(tmp_path), "green"))
-    assert output(programs, KEY) == (f"green x y {tmp_path}",)
+    assert output(tmp_path) == (f"green x y {tmp_path}",)
 
 
 def test_a_program_that_cannot_be_executed_says_so_and_leaves_nothing(
@@ -140,14 +153,12 @@ def test_a_program_that_cannot_be_executed_says_so_and_leaves_nothing(
 
 @pytest.mark.parametrize("free", [1, 2])  # descriptors
 def test_a_start_without_free_descriptors_leaves_no_descriptor_and_no_shim(
-    programs: ExternalPrograms, tmp_path: Path, free: int
+    programs: ExternalPrograms, free: int
 ) -> None:
-    home = Home(tmp_path / "programs" / KEY)
-    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
     gc.collect()  # what earlier tests have left closes its descriptors now
     before = sorted(os.listdir("/proc/self/fd"))
     with NoDescriptors(free), pytest.raises(OSError, match="Too many open files"):
-        programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
+        programs.start(KEY, python(SLEEP))
     assert sorted(os.listdir("/proc/self/fd")) == before
     assert not psutil.Process().children()
 
@@ -161,15 +172,17 @@ def test_a_program_that_ends_before_it_is_ready_fails_with_code_and_output(progr
 def test_a_program_that_is_not_ready_in_time_is_ended(
     programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spawn = programs._spawn  # pyright: ignore[reportPrivateUsage]
+    class Clock:
+        """Is first read when it has printed that, however long a busy machine takes to start it."""
 
-    def spawn_and_warm_up(*order: Any) -> Any:
-        """Its time begins when it has printed that, however long a busy machine takes to start it."""
-        spawned = spawn(*order)
-        eventually(lambda: output(programs, KEY) == ("warming up",))
-        return spawned
+        sleep = staticmethod(time.sleep)
 
-    monkeypatch.setattr(programs, "_spawn", spawn_and_warm_up)
+        @staticmethod
+        def monotonic() -> float:
+            eventually(lambda: output(tmp_path) == ("warming up",))
+            return time.monotonic()
+
+    monkeypatch.setattr(external_programs, "time", Clock)
     with pytest.raises(ProgramFailed, match=r"(?s)not ready within 0.3 s.*warming up"):
         programs.start(KEY, python("import time; print('warming up'); time.sleep(600)", ready="ready"), timeout_s=0.3)
     assert not find_processes(VARIABLE, KEY)
@@ -184,7 +197,7 @@ def test_ready_may_be_a_condition_checked_from_outside(programs: ExternalProgram
 
 
 def test_an_unexpected_end_is_heard_of_with_signal_and_output_within_50_ms(
-    programs: ExternalPrograms, exits: Exits
+    programs: ExternalPrograms, exits: Exits, tmp_path: Path
 ) -> None:
     took: list[float] = []
     for turn in range(5):  # the best of some: the machine may have other things to do
@@ -192,7 +205,7 @@ def test_an_unexpected_end_is_heard_of_with_signal_and_output_within_50_ms(
         running = programs.start(
             key, python("print('ready'); print('last words'); import time; time.sleep(600)", ready="ready")
         )
-        eventually(lambda key=key: "last words" in output(programs, key))
+        eventually(lambda key=key: "last words" in output(tmp_path, key))
         began = time.monotonic()
         os.kill(running.pid, signal.SIGKILL)
         assert exits.wait(turn + 1)[0] == key
@@ -343,20 +356,23 @@ def test_stopping_twice_or_what_never_ran_does_nothing(programs: ExternalProgram
 
 
 def test_a_process_that_ends_while_its_watcher_is_closed_disturbs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    watcher, program = ExitWatcher(), subprocess.Popen(["sleep", "600"])
-    watcher.watch(ProcessHandle(program.pid), lambda: None)
-    wake = watcher._wake  # pyright: ignore[reportPrivateUsage]
+    program = subprocess.Popen(["sleep", "600"])
+    wake, woken = socket.socketpair()
 
     class Slow:
         def send(self, data: bytes) -> int:
             program.kill()
-            watcher._thread.join(0.2)  # pyright: ignore[reportPrivateUsage]
+            (thread,) = (thread for thread in threading.enumerate() if thread.name == "exit-watcher")
+            thread.join(0.2)
             return wake.send(data)
 
         def close(self) -> None:
             wake.close()
 
-    monkeypatch.setattr(watcher, "_wake", Slow())
+    with monkeypatch.context() as patched:
+        patched.setattr(socket, "socketpair", lambda: (Slow(), woken))
+        watcher = ExitWatcher()
+    watcher.watch(ProcessHandle(program.pid), lambda: None)
     watcher.close()
     program.wait()
 
@@ -506,12 +522,14 @@ time.sleep(600)"""
 def test_of_two_shims_for_one_directory_one_runs_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
     order = python(SLEEP, ready="ready")
     home = Home(tmp_path / "programs" / KEY)
-    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
-    for attempt in (1, 2):
-        programs._spawn(home, order, f"{KEY}.{attempt}")  # pyright: ignore[reportPrivateUsage]
+    home.make()
+    started = [start_shim(home, order, f"{KEY}.{attempt}") for attempt in (1, 2)]
     running = programs.start(KEY, order, attempt=3)
     eventually(lambda: len(shims(tmp_path)) == 1)
     assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+    programs.stop(KEY)
+    for each in started:
+        each.wait(10)
 
 
 def test_a_reused_pid_is_not_taken_for_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
@@ -584,11 +602,12 @@ def test_a_program_whose_shim_cannot_write_its_state_can_be_ended(
 ) -> None:
     monkeypatch.setattr("rr_actors.managers.external_programs._SHIM_LIMIT_S", 0.5)
     home = Home(tmp_path / "programs" / KEY)
-    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
+    home.make()
     (home.path / "state.json.new").mkdir()  # as a full disk would
-    programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
+    started = start_shim(home, python(SLEEP), f"{KEY}.1")
     eventually(lambda: bool(find_processes(VARIABLE, KEY)))
     programs.stop(KEY)
+    started.wait(10)
     assert not home.exists()
     assert not find_processes(VARIABLE, KEY)
 

@@ -133,6 +133,11 @@ class ActorHub:
         """Return the line to the actor's process, or None if there is no line yet."""
         return self._lines.get(self._locate(where))
 
+    def lines(self) -> list[Line]:
+        """Return the lines to other processes whose links are not lost. From any thread."""
+        with self._lock:
+            return list(self._lines.values())
+
     def has(self, line: Line) -> bool:
         """Return whether the line belongs to this hub and its link is not lost."""
         return self._lines.get(line.address) is line
@@ -330,10 +335,8 @@ class ActorHub:
     def close(self) -> None:
         """Close all links of kind "actors"; open calls fail. On the loop."""
         self._closed = True
-        with self._lock:
-            lines = list(self._lines.values())
         steps = Steps()
-        for line in lines:
+        for line in self.lines():
             steps.take("closing a line", line.close)
         for link in list(self._visitors):
             steps.take("closing a visitor's link", link.close)

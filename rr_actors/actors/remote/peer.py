@@ -100,6 +100,7 @@ class Line:
 
     Attributes:
         parcels: the large values on the link.
+        connections: those by which threads ask and wait.
 
     Args:
         hello: the Hello with which the link is opened; its `to` is the address.
@@ -130,7 +131,7 @@ class Line:
         self._peer = hello.to
         self._connecting: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
-        self._asks = ThreadConnections(self._dial)
+        self.connections = ThreadConnections(self._dial)
         self._lock = threading.RLock()  # for _unsettled; a finalizer that tells may run in the thread that holds it
         self._unsettled: int | None = None  # the call number of the last letter, 0 if it has no answer
         self._left: set[BlockingLink] = set()  # with letters that may be unread; until then the link sends nothing
@@ -185,7 +186,7 @@ class Line:
             NotSerializable: the letter is too long for a frame.
         """
         deadline = deadline_of(timeout_s)
-        line = self._asks.take(timeout_s) if self.may_ask else None
+        line = self.connections.take(timeout_s) if self.may_ask else None
         if line is None:
             return None
         try:
@@ -195,24 +196,24 @@ class Line:
             if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
                 if type(answer) is Answered and not isinstance(answer.body, bytes):
                     answer = Arrived(line.parcels.claim(answer.body))
-                self._asks.give_back(line)
+                self.connections.give_back(line)
                 return answer
         except Lie as error:
-            self._asks.drop(line)
+            self.connections.drop(line)
             raise ConnectionResetError(f"the process at {self.address} is cut off: {error}") from error
         except (NotSerializable, Unavailable):
-            self._asks.give_back(line)
+            self.connections.give_back(line)
             raise
         except TimeoutError:
             self._leave(line)
             raise
         except OSError:
-            self._asks.drop(line)
+            self.connections.drop(line)
             raise
         except BaseException:  # such as KeyboardInterrupt
             self._leave(line)
             raise
-        self._asks.drop(line)
+        self.connections.drop(line)
         raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of the answer")
 
     def give_up(self, number: int) -> None:
@@ -345,7 +346,7 @@ class Line:
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
-        self._asks.close()
+        self.connections.close()
         for line in list(self._left):  # a copy: threads add to it
             self._close_line(line)
         calls = list(self._calls.values())
@@ -381,7 +382,7 @@ class Line:
     def _leave(self, line: BlockingLink) -> None:
         """Leave a connection with an answer to come; until the question on it has been read, send no later letters."""
         self._left.add(line)  # first: from now on no letter is sent
-        if not self._asks.take_out(line):
+        if not self.connections.take_out(line):
             self._left.discard(line)
             return
         try:
@@ -391,7 +392,7 @@ class Line:
             line.close()
 
     def _await_end(self, line: BlockingLink) -> None:
-        if self._asks.closed:
+        if self.connections.closed:
             self._close_line(line)
             self._pump()  # another thread may have used this line before it was forgotten
         else:

@@ -458,7 +458,7 @@ class DirectPaths(RegistrarState):
 # make another call that waits for the loop. So the thread must not hold a lock then that the loop needs. By default the
 # only handler is that of Ctrl-C, which raises.
 
-_SIGNALS = tuple(signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP})
+CATCHABLE_SIGNALS = tuple(signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP})
 _LOOK_AGAIN_S = 0.05  # asking for all handlers takes some 40 us
 
 
@@ -478,7 +478,7 @@ def may_be_interrupted() -> bool:
         return False
     now = time.monotonic()
     if now >= _interruptions.look_at:
-        _interruptions.found = any(_waits(signal.getsignal(number)) for number in _SIGNALS)
+        _interruptions.found = any(_waits(signal.getsignal(number)) for number in CATCHABLE_SIGNALS)
         _interruptions.look_at = now + _LOOK_AGAIN_S
     return _interruptions.found
 
