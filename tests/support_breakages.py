@@ -24,8 +24,8 @@ from rr_actors.managers.choices import choice_manager
 from rr_actors.managers.choices.trials import Trials
 from rr_actors.managers.keeper import comparing
 from rr_actors.registrar.core import holding, notices, reconciliation, recovery, releasing, status_delivery, unloading
-from rr_actors.registrar.model.catalog import Decision
-from rr_actors.registrar.model.commands import Reconcile
+from rr_actors.registrar.model.catalog import Decision, add, discard
+from rr_actors.registrar.model.commands import Reconcile, Register
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Unloaded
 from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Resource, ServedQuery
@@ -36,7 +36,7 @@ from rr_actors.supervision.child_runs import ProcessRun
 from rr_actors.supervision.core import restarts
 from rr_actors.system.system import System
 from rr_actors.testing import __main__ as chaos
-from rr_actors.testing import load_threads, victim_managers, victim_system
+from rr_actors.testing import load_threads, monkey, victim_managers, victim_system
 from rr_actors.testing import run as runs
 from rr_actors.testing.mission import mission_managers, mission_threads
 from rr_actors.testing.monkey import Monkey
@@ -166,12 +166,18 @@ def _same_attempt() -> None:
 
 def _not_taken_up(phase: Phase) -> Callable[[], None]:
     def apply() -> None:
-        to_recover = recovery._to_recover
+        register = recovery.register
 
-        def broken(catalog: Any, server: Any) -> list[Resource]:
-            return [resource for resource in to_recover(catalog, server) if resource.phase is not phase]
+        def broken(decision: Decision, command: Register) -> None:
+            catalog, name = decision.catalog, command.server.name
+            hidden = [id for id in catalog.by_server.get(name, ()) if catalog.resources[id].phase is phase]
+            for id in hidden:
+                discard(catalog.by_server, name, id)
+            register(decision, command)
+            for id in hidden:
+                add(catalog.by_server, name, id)
 
-        replace(to_recover, broken)
+        replace(register, broken)
         victim_managers.UNLOAD_S = 0.05  # so that kills meet it
 
     return apply
@@ -182,7 +188,13 @@ def _unheld_are_kept() -> None:
 
 
 def _not_taken_back() -> None:
-    replace(reconciliation._take_back, lambda decision, registrar, query: None)
+    reconcile: Any = reconciliation.reconcile
+
+    def broken(decision: Decision, command: Reconcile) -> None:
+        known = [query for query in command.queries if query.query_id in decision.catalog.held]
+        reconcile(decision, msgspec.structs.replace(command, queries=known))
+
+    replace(reconcile, broken)
 
 
 def _nothing_is_agreed() -> None:
@@ -258,7 +270,7 @@ def _never_restarted() -> None:
 
 
 def _planners_are_killed() -> None:
-    override(Monkey, "_kill_manager", lambda kill: Monkey._kill_planner)
+    monkey.MAKERS = monkey.PLANNERS
 
 
 def _ends_of_actions_are_not_written() -> None:
@@ -354,13 +366,13 @@ BREAKAGES = {
         "recovery", "begin_again does not count it", _same_attempt, ("without being told so", "standstill")
     ),
     "an interrupted load is not taken up": Breakage(
-        "recovery", "_to_recover leaves it out", _not_taken_up(Phase.LOADING), ("interrupted", *_LOST)
+        "recovery", "register leaves it out", _not_taken_up(Phase.LOADING), ("interrupted", *_LOST)
     ),
     "an interrupted unload is not taken up": Breakage(
-        "recovery", "_to_recover leaves it out", _not_taken_up(Phase.UNLOADING), ("interrupted", *_LOST)
+        "recovery", "register leaves it out", _not_taken_up(Phase.UNLOADING), ("interrupted", *_LOST)
     ),
     "what nobody holds is kept": Breakage("recovery", "retire does nothing", _unheld_are_kept, _LOST),
-    "what a provider has is not taken back": Breakage("recovery", "_take_back does nothing", _not_taken_back, _LOST),
+    "what a provider has is not taken back": Breakage("recovery", "reconcile leaves it out", _not_taken_back, _LOST),
     "what a provider lists is taken for nothing": Breakage(
         "recovery", "reconcile reads an empty list", _nothing_is_agreed, _LOST
     ),
@@ -429,8 +441,8 @@ def main(name: str, seed: str, state_dir: str, report: str) -> int:
     if name:
         BREAKAGES[name].apply()
     load_threads.PATIENCE_S = victim_managers.PATIENCE_S = mission_threads.LIMIT_S = 6.0
-    victim_system._SETTLE_S = 5.0
-    victim_system._ABANDON_S = runs._STALLED_S = 7.0
+    victim_system.SETTLE_S = 5.0
+    victim_system.ABANDON_S = runs.STALLED_S = 7.0
     config = SystemConfig(preload=("support_breakages",))
     victim_system.System = functools.partial(System, config=config)
     options = ["--kills", "25", "--seconds", "12", "--seed", seed, "--pace", "0.08", "--patience", "12"]

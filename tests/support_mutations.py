@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Container, Iterable
 from operator import attrgetter
 from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
     callback_runs,
@@ -25,6 +25,7 @@ from rr_actors.registrar.core import (
 )
 from rr_actors.registrar.core import decide as deciding
 from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved
 from rr_actors.registrar.model.commands import (
@@ -32,15 +33,16 @@ from rr_actors.registrar.model.commands import (
     EndClosing,
     Got,
     PeerGone,
+    Reconcile,
     Release,
     ReleaseOverdue,
     Revoke,
     SetPriority,
 )
 from rr_actors.registrar.model.effects import Request, UnloadResolved
-from rr_actors.registrar.model.messages import Load, Loaded, Unload
+from rr_actors.registrar.model.messages import FetchedQuery, Load, Loaded, Unload
 from rr_actors.registrar.model.rows import Change, Held, Hold, Notice, Phase, Put, Resource, is_own
-from simulation import sim_registrar
+from simulation import sim_process, sim_registrar
 from simulation.sim_links import TO_PROVIDER, SimLine, SimLink
 from simulation.sim_process import SimShell
 from simulation.sim_registrar import SimRegistrar
@@ -60,17 +62,6 @@ class AnswersFirst(SimRegistrar):
         later.effects = effects
         super().finish(later, "")
         super().finish(decision, fault)
-
-
-class NoUndo(SimRegistrar):
-    """What could not be committed stays in memory."""
-
-    def commit(self, decision: Decision, fault: str) -> None:
-        try:
-            super().commit(decision, fault)
-        except CatalogError:
-            decision._undo.clear()  # pyright: ignore[reportPrivateUsage]
-            raise
 
 
 class ForgetsWhatItOwes(SimRegistrar):
@@ -203,28 +194,6 @@ class TellsWhoHasGivenUp(SimRegistrar):
         super().load_ended(query_id, failure)
 
 
-class AnswersOnOneWay(SimRegistrar):
-    """A Load that has come by a direct line and by the link is answered by the line alone, which may be dead."""
-
-    def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
-        super().from_consumer(origin, link, message)
-        forget_links(self, {**self.routes._loads.lines, **self.routes._unloads.lines})
-
-
-class AnswersLinesAlone(SimRegistrar):
-    """What has come by the link is answered by the line that it comes by as well, and by that alone."""
-
-    def from_line(self, line: SimLine, message: Any, at_once: str | None = None, overtaking: str | None = None) -> None:
-        super().from_line(line, message, at_once, overtaking)
-        forget_links(self, [message.query_id])
-
-
-def forget_links(registrar: SimRegistrar, query_ids: Iterable[str]) -> None:
-    for query_id in query_ids:
-        registrar.routes._loads.links.pop(query_id, None)
-        registrar.routes._unloads.links.pop(query_id, None)
-
-
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
     return lambda patch: cls
 
@@ -237,6 +206,43 @@ def _in_tables(patch: Patch, function: Any, by: Any) -> None:
         found += function in table.values()
         patch(deciding, name, {kind: by if known is function else known for kind, known in table.items()})
     assert found, f"{function} is in no table"
+
+
+def no_undo(patch: Patch) -> type[SimRegistrar]:
+    """What could not be committed stays in memory."""
+
+    def keep(decision: Decision) -> None:
+        decision.close()
+        decision.changes.clear()
+        decision.later.clear()
+        decision.effects.clear()
+
+    patch(Decision, "undo", keep)
+    return SimRegistrar
+
+
+def answers_on_one_way(patch: Patch) -> type[SimRegistrar]:
+    """A Load that has come by a direct line and by the link is answered by the line alone, which may be dead."""
+
+    class OnOneWay(Routes):
+        def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
+            if self.line_of(question) is None:
+                super().asked_by_link(consumer, question)
+
+    patch(sim_process, "Routes", OnOneWay)
+    return SimRegistrar
+
+
+def answers_lines_alone(patch: Patch) -> type[SimRegistrar]:
+    """What has come by the link is answered by the line that it comes by as well, and by that alone."""
+
+    class LinesAlone(Routes):
+        def asked_by_line(self, line: Any, question: Load | Unload, released: Container[str] = ()) -> None:
+            self.way_of(question)  # which forgets the link's question
+            super().asked_by_line(line, question)
+
+    patch(sim_process, "Routes", LinesAlone)
+    return SimRegistrar
 
 
 def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
@@ -265,14 +271,25 @@ def no_dedupe(patch: Patch) -> type[SimRegistrar]:
 
 def no_stamp(patch: Patch) -> type[SimRegistrar]:
     """What an interrupted run had loaded is taken for the next one's."""
-    take_back: Any = reconciliation._take_back  # pyright: ignore[reportPrivateUsage]
 
-    def stampless(decision: Decision, registrar: str, query: Any) -> None:
+    def stampless(decision: Decision, query: FetchedQuery) -> FetchedQuery:
         parent = decision.catalog.resources.get(query.parent)
-        take_back(decision, registrar, query if parent is None else _replace(query, attempt=parent.attempt))
+        return query if parent is None else _replace(query, attempt=parent.attempt)
 
-    patch(reconciliation, "_take_back", stampless)
+    _in_tables(patch, reconciliation.reconcile, _taking_back(stampless))
     return SimRegistrar
+
+
+def _taking_back(read: Callable[[Decision, FetchedQuery], FetchedQuery]) -> Callable[[Decision, Reconcile], None]:
+    """Return reconcile() that reads so what a provider has and its consumer does not know."""
+    plain = reconciliation.reconcile
+
+    def reconcile(decision: Decision, command: Reconcile) -> None:
+        known = decision.catalog.held
+        queries = [query if query.query_id in known else read(decision, query) for query in command.queries]
+        plain(decision, _replace(command, queries=queries))
+
+    return reconcile
 
 
 def first_to_leave(patch: Patch) -> type[SimRegistrar]:
@@ -334,15 +351,16 @@ def keeps_to_itself(patch: Patch) -> type[SimRegistrar]:
 
 def no_queue(patch: Patch) -> type[SimRegistrar]:
     """A load begins while what it replaces is still being unloaded."""
-    first: Any = loading._load_first  # pyright: ignore[reportPrivateUsage]
+    plain = loading.load
 
     def impatient(decision: Decision, message: Load) -> None:
         unloading_now = dict(decision.catalog.unloading)
         decision.catalog.unloading.clear()
-        first(decision, message)
+        plain(decision, message)
         decision.catalog.unloading.update(unloading_now)
 
-    patch(loading, "_load_first", impatient)
+    _in_tables(patch, plain, impatient)
+    patch(recovery, "load", impatient)
     return SimRegistrar
 
 
@@ -381,12 +399,11 @@ def keeps_parts(patch: Patch) -> type[SimRegistrar]:
 
 def takes_everything_back(patch: Patch) -> type[SimRegistrar]:
     """A query that was let go while its provider did not listen is taken for one lost in a crash."""
-    take_back: Any = reconciliation._take_back  # pyright: ignore[reportPrivateUsage]
 
-    def since_ever(decision: Decision, registrar: str, query: Any) -> None:
-        take_back(decision, registrar, _replace(query, seq=0, response=query.response or b""))
+    def since_ever(_decision: Decision, query: FetchedQuery) -> FetchedQuery:
+        return _replace(query, seq=0, response=query.response or b"")
 
-    patch(reconciliation, "_take_back", since_ever)
+    _in_tables(patch, reconciliation.reconcile, _taking_back(since_ever))
     return SimRegistrar
 
 
@@ -538,7 +555,8 @@ def tells_holders_first(patch: Patch) -> type[SimRegistrar]:
 
     def hasty(decision: Decision, start: Any) -> None:
         if is_own(start.notice):
-            status_changes._tell_holders(decision, start.resource, start.notice)  # pyright: ignore[reportPrivateUsage]
+            for query in decision.catalog.queries_of(start.resource.id):
+                notices.notify(decision, query, start.notice)
         start_status(decision, start)
 
     patch(status_changes, "start_status", hasty)
@@ -608,10 +626,12 @@ def sends_no_more(patch: Patch) -> type[SimRegistrar]:
 
 def sends_all_over_a_new_link(patch: Patch) -> type[SimRegistrar]:
     """A new link brings all statuses at once."""
+    plain = notices.send_notices_to
 
     def send_all(decision: Decision, origin: str) -> None:
-        for id in list(decision.catalog.notices_to.get(origin, ())):
-            notices._send_notice(decision, decision.catalog.notices[id])  # pyright: ignore[reportPrivateUsage]
+        window, decision.catalog.window = decision.catalog.window, sys.maxsize
+        plain(decision, origin)
+        decision.catalog.window = window
 
     patch(reconciliation, "send_notices_to", send_all)
     return SimRegistrar
@@ -739,7 +759,7 @@ def unloads_what_is_revoked(patch: Patch) -> type[SimRegistrar]:
         if resource is not None and resource.id in decision.catalog.revocations and resource.phase is Phase.LOADED:
             unloading.begin_unload(decision, resource)
 
-    patch(deciding, "_COMMANDS", {**deciding._COMMANDS, Revoke: revoke})  # pyright: ignore[reportPrivateUsage]
+    _in_tables(patch, plain, revoke)
     return SimRegistrar
 
 
@@ -781,7 +801,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "what is needed left paused": leaves_what_is_needed_paused,
     "what is on standby never paused": never_pauses_what_is_on_standby,
     "reply before commit": _in_place(AnswersFirst),
-    "no undo of what could not be committed": _in_place(NoUndo),
+    "no undo of what could not be committed": no_undo,
     "owed releases forgotten in a crash": _in_place(ForgetsWhatItOwes),
     "notices forgotten in a crash": _in_place(ForgetsNotices),
     "repetition not marked": _in_place(NeverRepeated),
@@ -843,12 +863,12 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "what was decided for a link sent over the next, to the same run": (sends_to_the_same_run, "links"),
     "a load told to be held that was given up": (_in_place(TellsWhoHasGivenUp), "acknowledged"),
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
-    "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
+    "what came by both ways answered by one": (answers_on_one_way, "memory"),
     "no dedupe of query ids": (no_dedupe, "disagree"),
     "an update that waits taken for the first row": (takes_unsaved_for_new, "false loss"),
     "answered by line while the link was down, and not remembered": (forgets_what_came_meanwhile, "false loss"),
-    "an unload answered by the line alone": (_in_place(AnswersLinesAlone), "stuck"),
-    "an unload refused, and done by a line that was left": (_in_place(AnswersLinesAlone), "check"),
+    "an unload answered by the line alone": (answers_lines_alone, "stuck"),
+    "an unload refused, and done by a line that was left": (answers_lines_alone, "check"),
     "what is from before a crash let go by line": (owes_what_it_had, "false loss"),
     "a priority given between two links lost": (forgets_priorities_between_links, "priorities"),
     "providers that were away forgotten at the closing": (forgets_who_was_away, "check"),

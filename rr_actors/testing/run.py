@@ -25,7 +25,7 @@ _SHOW_S = 1.0
 _SAMPLES = 200
 _SAMPLE_S = 5.0  # at most, between two
 _CHURN_LOOK_S = 0.2
-_STALLED_S = 60.0
+STALLED_S = 60.0
 _STALLED_DEEDS = 50  # a third of the deeds kill nothing
 
 
@@ -124,7 +124,7 @@ def _harm(plant: Plant, options: Options, tally: Tally, watch: Watch, show: Call
     monkey = Monkey(plant, tally, options.seed, options.pace_s)
     started = shown = time.monotonic()
     last = (0, started)
-    stalled_s = max(_STALLED_S, _STALLED_DEEDS * options.pace_s)
+    stalled_s = max(STALLED_S, _STALLED_DEEDS * options.pace_s)
     try:
         while tally.kills < options.kills and not tally.violations:
             now = time.monotonic()

@@ -58,8 +58,8 @@ _APP_NAMES = (*(f"app-{n}" for n in range(1, _APPS + 1)), *(f"home-{n}" for n in
 _GRACE_S = 60.0  # longer than any restart: what is revoked is unloaded, top first, and never by force
 _WATCH_S = 0.05
 _PROGRAMS = {"idle": "pause", "linger_s": 0.1, "paused_s": 2.0}
-_SETTLE_S = 30.0
-_ABANDON_S = 20.0
+SETTLE_S = 30.0
+ABANDON_S = 20.0
 
 
 class Plant:
@@ -165,7 +165,7 @@ class Plant:
         self.mark.remove()
         stopping = threading.Thread(target=self.system.stop, name="chaos: stopping", daemon=True)
         stopping.start()
-        deadline = time.monotonic() + _ABANDON_S
+        deadline = time.monotonic() + ABANDON_S
         while (living := self.mark.processes()) and time.monotonic() < deadline:
             for pid in living:
                 self.mark.signal(pid, signal.SIGKILL)
@@ -191,11 +191,11 @@ class Plant:
         begin("checking the house")
         self._settle_house()
         begin("checking the mission")
-        self.tally.violation(*self.mission.settle(self._look, _SETTLE_S))
+        self.tally.violation(*self.mission.settle(self._look, SETTLE_S))
         begin("checking what is held")
         told = self._told()
         look = self._look
-        self.tally.violation(*settled(lambda: [*check_at_rest(look()), *check_told(look(), told)], _SETTLE_S))
+        self.tally.violation(*settled(lambda: [*check_at_rest(look()), *check_told(look(), told)], SETTLE_S))
         self.tally.violation(*check_state(self.state_dir))
         self.tally.violation(
             *settled(lambda: [f"daemon {pid} outlives its manager" for pid in self.mark.strays()], 5.0)
@@ -209,12 +209,12 @@ class Plant:
         begin("releasing everything")
         for thread in self._threads():
             thread.release()
-        self.tally.violation(*self.mission.give_up(_SETTLE_S))
+        self.tally.violation(*self.mission.give_up(SETTLE_S))
         for crew in CREWS:
             watch.phase(f"releasing what {crew} holds")
             self._tell(crew, "release")
         watch.phase("checking that nothing is left")
-        self.tally.violation(*settled(lambda: [f"after release: {left}" for left in check_empty(look())], _SETTLE_S))
+        self.tally.violation(*settled(lambda: [f"after release: {left}" for left in check_empty(look())], SETTLE_S))
         self.tally.violation(*check_journal(read_journal(self.journal_dir), {}))
         return True
 
@@ -273,7 +273,7 @@ class Plant:
             found = check_house(devices, budgets, programs, stands)
             return [*found, *([f"{used} W are used"] if (used := used_by(devices)) > LESS + RESERVE else [])]
 
-        self.tally.violation(*settled(lower, _SETTLE_S), *settled(look, _SETTLE_S))
+        self.tally.violation(*settled(lower, SETTLE_S), *settled(look, SETTLE_S))
 
     def _tell(self, crew: str, what: str) -> None:
         """Send a crew a message, and repeat that while the crew is being restarted."""
@@ -289,7 +289,7 @@ class Plant:
                 return [f"{crew}: {what}: {error!r}"]
             return []
 
-        self.tally.violation(*settled(ask, _SETTLE_S))
+        self.tally.violation(*settled(ask, SETTLE_S))
 
     def _told(self) -> dict[str, set[str]]:
         told: dict[str, set[str]] = {f"app-{n}": set() for n in range(1, _APPS + 1)}

@@ -21,7 +21,7 @@ from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.rows import Phase, Resource, ServedQuery
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
-from support_inside import actor_of
+from support_inside import actor_of, on_loop
 
 Start = Callable[..., rr.System]
 
@@ -69,8 +69,7 @@ def on_disk(state_dir: Path, request: str) -> list[Phase]:
 
 def nothing_is_left_open(provider: rr.Registrar) -> bool:
     routes = actor_of(provider).consumers.routes
-    ways = routes._loads, routes._unloads
-    return not any(way.lines or way.links for way in ways)
+    return on_loop(provider, lambda: not routes.lines() and not routes.links())
 
 
 def in_thread(fn: Callable[[], object], outcome: Calls) -> threading.Thread:

@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.engine.effect_runner import EffectRunner
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.messages import Unload
+from rr_actors.registrar.model.messages import Fetched, Unload
 from support import LIMIT_S, eventually, serve
-from support_inside import actor_of
+from support_inside import HeldBack, actor_of
 
 
 def test_what_was_decided_for_a_link_does_not_go_over_the_next(
@@ -34,7 +35,9 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
         link.close()
 
     async def act_and_go_on() -> None:
-        actor.monitor._runner.do([e.Request("provider", Unload(query.id, "app"))])
+        EffectRunner(actor, actor.consumers, actor.servers, actor.clients).do(
+            [e.Request("provider", Unload(query.id, "app"))]
+        )
         for command in waiting:
             post(command)
 
@@ -51,21 +54,22 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
 def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answered(
     app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    held_back = HeldBack(monkeypatch, Fetched)
     serve(provider, "thing")
     first = app.load("provider/thing", "first")
     actor = actor_of(app)
     client, call = actor.client("provider"), actor.node.dispatcher.call
-    fetched, waiting, heard = client._fetched, list[Any](), list[list[str]]()
+    heard = list[list[str]]()
 
     def hear(queries: Any, _error: Any) -> None:
         heard.append(sorted(query.query_id for query in queries))
 
-    monkeypatch.setattr(client, "_fetched", lambda *answer: waiting.append(answer))
+    held_back.on = True
     call(client.fetch, hear)
-    eventually(lambda: waiting)
+    eventually(lambda: held_back.messages)
     second = app.load("provider/thing", "second")
-    monkeypatch.undo()
-    for what in ((client.fetch, hear), (client.fetch, hear), (fetched, *waiting[0])):
+    held_back.on = False
+    for what in ((client.fetch, hear), (client.fetch, hear), (held_back.messages[0],)):
         call(*what)
 
     eventually(lambda: len(heard) == 3)
@@ -76,20 +80,21 @@ def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answ
 def test_a_fetch_ends_when_its_registrar_is_closed(
     app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    held_back = HeldBack(monkeypatch, Fetched)
     serve(provider, "thing")
     app.load("provider/thing", "x")
     client = actor_of(app).client("provider")
-    monkeypatch.setattr(client, "_fetched", lambda *_: None)  # as though the provider were slow
+    held_back.on = True
     with ThreadPoolExecutor(1) as thread:
         fetching = thread.submit(app.fetch_queries, "provider", timeout_s=None)
-        eventually(lambda: client._fetching)
+        eventually(lambda: held_back.messages)
         app.close()
         try:
             with pytest.raises(rr.RegistrarDown, match="'app': closed"):
                 fetching.result(LIMIT_S)
         finally:
-            for done in client._fetching:
-                done([], None)
+            for read in held_back.messages:
+                actor_of(app).node.dispatcher.call(read)
     heard: list[Any] = []
 
     async def fetch() -> None:

@@ -263,9 +263,8 @@ def test_a_provider_that_hangs_is_waited_for_in_time_and_the_release_stays_owed(
 class Giving:
     """A line that, while it is being closed, sees another thread give back one."""
 
-    def __init__(self, connections: ThreadConnections[Any], others: list[Giving]) -> None:
-        self.connections, self.others, self.closed, self.epoch = connections, others, False, 1
-        connections._in_use[self] = threading.get_ident()
+    def __init__(self, connections: ThreadConnections[Any], epoch: int, others: list[Giving]) -> None:
+        self.connections, self.epoch, self.others, self.closed = connections, epoch, others, False
 
     def exchange(self, message: Any, deadline: float) -> Any:
         raise AssertionError("not used")
@@ -280,14 +279,21 @@ class Giving:
 
 
 def test_lines_that_threads_give_back_while_their_registrar_closes_are_closed_with_the_others(
-    app: rr.Registrar, provider: rr.Registrar
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     serve(provider, "thing")
     app.load("provider/thing", "x").unload()
-    connections = actor_of(app).clients["provider"].connections
+    client = actor_of(app).clients["provider"]
+    link, connections = client.link, client.connections
+    assert link is not None
     assert connections is not None
-    late, last = Giving(connections, []), Giving(connections, [])
-    connections.give_back(Giving(connections, [late]))
+    late, last = (Giving(connections, link.welcome.epoch, []) for _ in range(2))
+    first = Giving(connections, link.welcome.epoch, [late])
+    dialled = iter((first, late, last))
+    monkeypatch.setattr(actor_of(provider), "line", lambda _hello: next(dialled))
+    taken = [connections.take(None) for _ in range(len(connections.idle) + 3)]
+    assert taken[-3:] == [first, late, last]
+    connections.give_back(first)
     app.close()
     connections.give_back(last)
     assert late.closed
@@ -741,22 +747,18 @@ def test_an_unload_by_a_line_that_the_link_has_asked_for_and_that_was_refused_is
     assert routes.way_of(Unloaded("q")) == ("line", True)
 
 
-def open_by_link(routes: Routes) -> int:
-    return len(routes._loads.links) + len(routes._unloads.links)
-
-
 def test_what_a_link_has_asked_is_asked_no_more_when_it_is_answered_withdrawn_or_lost() -> None:
     routes = Routes()
     for query_id in ("answered", "withdrawn", "lost"):
         routes.asked_by_link("app", Load(query_id, "thing", b"", "app", "", 0, 1))
     routes.asked_by_link("app", Unload("withdrawn", "app"))
     routes.asked_by_link("other", Unload("others", "other"))
-    assert open_by_link(routes) == 5
+    assert len(routes.links()) == 5
     assert routes.way_of(Loaded("answered", "r", b"")) == (None, True)
     assert routes.way_of(Unloaded("withdrawn")) == (None, True)
-    assert open_by_link(routes) == 2
+    assert len(routes.links()) == 2
     routes.link_lost("app")
-    assert open_by_link(routes) == 1
+    assert len(routes.links()) == 1
 
 
 def test_a_refused_unload_goes_by_the_link_as_well() -> None:
@@ -779,17 +781,20 @@ def test_a_question_may_be_answered_while_its_line_or_link_is_lost() -> None:
     """A worker answers, and the loop notes the loss."""
     routes = Routes()
 
-    class Questions(dict[str, Any]):
-        def items(self) -> Any:
-            found = list(super().items())
-            routes.answered(Unloaded("q"))
-            return found
+    class Answering(str):
+        """A line, or a consumer; the worker answers while it is looked for."""
 
-    routes._loads.links, routes._unloads.lines = Questions(), Questions()
-    routes.asked_by_link("app", Load("q", "thing", b"", "app", "", 0, 1))
-    routes.asked_by_line("line", Unload("q", "app"))
+        __slots__ = ()
+        __hash__ = str.__hash__
+
+        def __eq__(self, other: object) -> bool:
+            routes.answered(Unloaded("q"))
+            return super().__eq__(other)
+
+    routes.asked_by_link(Answering("app"), Load("q", "thing", b"", "app", "", 0, 1))
+    routes.asked_by_line(Answering("line"), Unload("q", "app"))
     routes.line_lost("line")
     assert routes.lines() == []
-    routes.asked_by_link("app", Load("q", "thing", b"", "app", "", 0, 1))
+    routes.asked_by_link(Answering("app"), Load("q", "thing", b"", "app", "", 0, 1))
     routes.link_lost("app")
-    assert open_by_link(routes) == 0
+    assert len(routes.links()) == 0

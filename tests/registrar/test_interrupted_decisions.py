@@ -111,7 +111,7 @@ class Stage:
 
     def picture(self) -> dict[str, Any]:
         """What is known, in memory and on disk."""
-        self.state.commits._save()
+        self.state.commits.save()
         catalog = self.state.catalog
         seen = {name: dict(getattr(catalog, name)) for name in (*TABLES, *MEMORY)}
         return {**seen, "disk": self.store.load()}
@@ -242,7 +242,7 @@ def holds(state: DirectPaths) -> None:
 
 
 def saves(state: DirectPaths) -> None:
-    state.commits._save()
+    state.commits.save()
 
 
 def owes(state: DirectPaths) -> None:

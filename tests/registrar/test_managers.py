@@ -22,9 +22,9 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.links import remote_calls
-from rr_actors.registrar.model.messages import Loaded
+from rr_actors.registrar.model.messages import Described, Loaded
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, child, eventually, hang, kill, pid_of, wait_respawned
-from support_inside import actor_of, node_of
+from support_inside import HeldBack, actor_of, node_of
 from support_managers import Made, Order, Shop
 
 Start = Callable[..., rr.System]
@@ -889,6 +889,7 @@ def test_a_server_that_is_registered_again_may_have_other_types(start: Start, wo
 def test_a_response_is_read_with_its_own_types_though_a_thread_has_it_before_these_types(
     start: Start, workshop: Workshop, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    types = HeldBack(monkeypatch, Described)
     system = start(*shops(workshop, "there"))
     app = system.open_registrar("app")
     provider = system.open_registrar("here") if where == "here" else system.registrar("there")
@@ -897,16 +898,16 @@ def test_a_response_is_read_with_its_own_types_though_a_thread_has_it_before_the
     assert (first.request, first.response) == (OpenCamera("a"), Feed("b", 1))
     provider.unregister_server("again")
     actor = actor_of(app)
-    client, receive = actor.clients[where], actor.monitor.receive
-    late: list[Any] = []
+    receive = actor.monitor.receive
 
-    def receive_behind_types(message: Any, sender: str, *, more: bool) -> None:
+    def receive_behind_types(message: Any, sender: str, *, more: bool = False) -> None:
         if type(message) is Loaded:
-            monkeypatch.undo()
-            client._take_types(*late)  # pyright: ignore[reportPrivateUsage]
+            types.on = False
+            for read in types.messages:
+                read()
         receive(message, sender, more=more)
 
-    monkeypatch.setattr(client, "_take_types", late.append)  # as though the loop had not read what the link has brought
+    types.on = True
     monkeypatch.setattr(actor.monitor, "receive", receive_behind_types)
     provider.register_server("again", lambda _: Made("d", "e", 2), request_type=Order, response_type=Made)
     query = app.load(f"{where}/again", Order("c"))

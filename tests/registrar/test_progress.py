@@ -24,6 +24,7 @@ from rr_actors.registrar.model.messages import Progressed
 from rr_actors.registrar.model.rows import Phase
 from rr_actors.registrar.pages import Wanted
 from rr_actors.registrar.progress_hearers import HearsHere
+from rr_actors.registrar.registrar import page
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, eventually, kill, serve, wait_respawned
 from support_inside import actor_of
 
@@ -351,7 +352,7 @@ def test_nothing_is_kept_of_loads_that_have_ended(app: rr.Registrar, provider: r
     for current in served:
         current.progress(0.9)  # a thread that the callback has left behind
     reports, listeners = actor_of(provider).progress, actor_of(app).listeners
-    eventually(lambda: not reports.loads and not listeners._by_query and not listeners._heard)
+    eventually(lambda: not any(reports.newest(current.resource_id) for current in served) and not listeners.queries())
 
 
 # -- what goes wrong -----------------------------------------------------------------------------------------------
@@ -454,11 +455,11 @@ def test_who_looks_at_a_resource_that_loads_sees_it(app: rr.Registrar, provider:
     serve(provider, "camera", reporting(gate, (0.5, "opening")))
     thread = in_thread(lambda: app.load("provider/camera", "front"))
     gate.wait_arrived()
-    (row,) = provider._page(Wanted("resources")).resources
+    (row,) = page(provider, Wanted("resources")).resources
     assert (row.phase, row.message) == ("loading", "50% opening")
     gate.open()
     thread.join(LIMIT_S)
-    (row,) = provider._page(Wanted("resources")).resources
+    (row,) = page(provider, Wanted("resources")).resources
     assert (row.phase, row.message) == ("loaded", "")
 
 

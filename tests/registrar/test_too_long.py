@@ -11,7 +11,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.engine.server import ServerActor
 from support import Workshop, eventually, serve
-from support_inside import actor_of
+from support_inside import actor_of, on_loop
 from support_managers import Shop
 
 Start = Callable[..., rr.System]
@@ -34,7 +34,7 @@ class Pair:
 
     @property
     def link(self) -> Any:
-        return actor_of(self.provider).consumers._links.get("shop")
+        return on_loop(self.provider, lambda: actor_of(self.provider).consumers.link_of("shop"))
 
     def lives(self) -> bool:
         """Whether the link is the one there was, and others are served by it."""

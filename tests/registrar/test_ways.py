@@ -163,9 +163,13 @@ class Holds:
 class Looks(Holds):
     """The same, which asks what is held."""
 
+    def __init__(self, holder: rr.Registrar, ended: Calls) -> None:
+        super().__init__(holder.load("provider/thing", "x"), ended)
+        self.holder = holder
+
     def __del__(self) -> None:
         try:
-            self.ended(self.query._holder.queries())  # type: ignore[union-attr]
+            self.ended(self.holder.queries())
         except rr.RrError as error:
             self.ended(error)
 
@@ -181,14 +185,14 @@ def collected_in_decisions_only() -> Iterator[None]:
 def collecting(registrar: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> None:
     """The garbage collector runs each time that something is written, under the lock."""
     ledger = actor_of(registrar).commits
-    write = ledger._write
+    commit = ledger.store.commit
 
     def written(changes: Any) -> None:
         assert actor_of(registrar).is_inside()
         gc.collect()
-        write(changes)
+        commit(changes)
 
-    monkeypatch.setattr(ledger, "_write", written)
+    monkeypatch.setattr(ledger.store, "commit", written)
 
 
 @pytest.mark.slow
@@ -214,9 +218,8 @@ def test_a_finalizer_that_would_wait_in_the_middle_of_a_decision_is_refused(
     app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
     load, request = LOADS[way]
-    own = provider.load("provider/thing", "x")
     ended = Calls()
-    Looks(own, ended)
+    Looks(provider, ended)
     collecting(provider, monkeypatch)
     query = load(app, request)
     (error,) = ended.wait(1)

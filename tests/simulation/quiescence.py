@@ -218,8 +218,8 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
     if registrar.waiters or registrar.runs or registrar.inbox or registrar.held_back:
         waiting = (registrar.waiters, registrar.runs)
         _fail("stuck", registrar, f"at rest, and somebody waits: {waiting}")
-    if asked := {**registrar.routes._loads.links, **registrar.routes._unloads.links}:
-        _fail("stuck", registrar, f"at rest, and these questions are unanswered: {asked}")
+    if asked := registrar.routes.links():
+        _fail("stuck", registrar, f"at rest, and questions by the links of these are unanswered: {asked}")
     stuck = [id for id, name in world.letting.items() if name == registrar.name]
     if stuck:
         _fail("stuck", registrar, f"at rest, and unloads are unanswered: {stuck}")

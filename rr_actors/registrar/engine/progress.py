@@ -265,6 +265,10 @@ class ProgressListeners:
         self._by_query.pop(query_id, None)
         self._heard.pop(query_id, None)
 
+    def queries(self) -> set[str]:
+        """Return the queries whose loads are listened to."""
+        return {*self._by_query, *self._heard}
+
     @on_loop
     def hear(self, provider: str, message: Progressed) -> None:
         """Call the listeners for a report that has arrived."""

@@ -353,6 +353,10 @@ class Routes:
         """Return the lines that wait for an answer."""
         return [*self._loads.lines.values(), *self._unloads.lines.values()]
 
+    def links(self) -> list[str]:
+        """Return the consumers whose links wait for an answer, each as often as it has asked."""
+        return [*self._loads.links.values(), *self._unloads.links.values()]
+
     def link_lost(self, consumer: str) -> None:
         """Forget the questions of a consumer's link that is down: the next link asks again."""
         for ways in (self._loads, self._unloads):
