@@ -23,6 +23,7 @@ import asyncio
 import ctypes
 import dis
 import faulthandler
+import functools
 import gc
 import json
 import linecache
@@ -35,8 +36,8 @@ import tempfile
 import threading
 import time
 import traceback
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -415,20 +416,29 @@ def _nothing_of(_: object) -> None:
     return None
 
 
-def _cancel_for_a_moment(loop: asyncio.AbstractEventLoop) -> None:
-    """As asyncio.run() cancels what is left, but for a second at most.
+def _run(coroutine: Coroutine[Any, Any, None]) -> None:
+    """As asyncio.run(), but it waits a second at most for what is left.
 
     An interrupt within asyncio may lose the wake-up of a task, which then never ends, and asyncio.run() with it. The
     task's coroutine ends here all the same, as it would with the loop of an application that gives up.
     """
-    left = asyncio.all_tasks(loop)
-    for task in left:
-        task.cancel()
-    if left:
-        loop.run_until_complete(asyncio.wait(left, timeout=1.0))
+    runner = asyncio.Runner()
+    try:
+        runner.run(coroutine)
+    finally:
+        loop = runner.get_loop()
+        left = asyncio.all_tasks(loop)
         for task in left:
-            if not task.done():
-                task.get_coro().close()
+            task.cancel()
+        if left:
+            loop.run_until_complete(asyncio.wait(left, timeout=1.0))
+            for task in left:
+                if not task.done():
+                    task.get_coro().close()
+        loop.run_until_complete(loop.shutdown_asyncgens())
+        loop.run_until_complete(loop.shutdown_default_executor())
+        asyncio.set_event_loop(None)
+        loop.close()
 
 
 async def _load_async(world: World) -> None:
@@ -509,7 +519,7 @@ def scenes() -> Iterator[Scene]:
     yield Scene("load_all, of which one fails", _load_two_and_fail, holds_nothing=True)
     yield Scene("unload_all", lambda world: world.app.unload_all(), _three)
     yield Scene("unload_all as a future", lambda world: world.app.unload_all(block=False).get(timeout=5), _three)
-    yield Scene("load_async", lambda world: asyncio.run(_load_async(world)))
+    yield Scene("load_async", lambda world: _run(_load_async(world)))
     yield Scene("queries", lambda world: [query.request for query in world.app.queries()], _three)
     yield Scene("listings", lambda world: (world.app.clients(), world.app.servers(), world.app.owed()))
     yield Scene("save_catalog", lambda world: world.app.save_catalog(), _three)
@@ -727,7 +737,6 @@ def system_scenes() -> Iterator[SystemScene]:
 def _child(options: argparse.Namespace) -> int:
     raising, handler = HANDLERS[options.raising]
     signal.signal(signal.SIGINT, handler)
-    asyncio.runners._cancel_all_tasks = _cancel_for_a_moment  # type: ignore[attr-defined]
     out = sys.stdout
 
     def tell(**facts: Any) -> None:
@@ -753,25 +762,26 @@ def _child(options: argparse.Namespace) -> int:
 
 
 def _flag_before_the_act() -> None:
-    def planted_call(self: Any, fn: Callable[..., object], *args: Any) -> None:
-        self._calls.append((fn, args))
-        if self._planted:
+    waiting: dict[Dispatcher, deque[Callable[[], object]]] = {}
+    planned: set[Dispatcher] = set()
+
+    def planted_call(self: Dispatcher, fn: Callable[..., object], *args: Any) -> None:
+        waiting.setdefault(self, deque()).append(functools.partial(fn, *args))
+        if self in planned:
             return
-        self._planted = True
-        if threading.get_ident() == self._ident:
-            self.loop.call_soon(self._drain)
+        planned.add(self)
+        if self.is_loop_thread():
+            self.loop.call_soon(drain, self)
         else:
-            self.loop.call_soon_threadsafe(self._drain)
+            self.loop.call_soon_threadsafe(drain, self)
 
-    drain = Dispatcher._drain  # pyright: ignore[reportPrivateUsage]
-
-    def drained(self: Any) -> None:
-        self._planted = False
-        drain(self)
+    def drain(self: Dispatcher) -> None:
+        planned.discard(self)
+        while calls := waiting[self]:
+            calls.popleft()()
 
     planted: Any = Dispatcher
-    planted._planted = False
-    planted.call, planted.hand_over, planted._drain = planted_call, planted_call, drained
+    planted.call = planted.hand_over = planted_call
 
 
 PLANTS: dict[str, Callable[[], None]] = {"flag before the act": _flag_before_the_act}

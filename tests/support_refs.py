@@ -212,8 +212,10 @@ class Home:
 
 def forget_hubs() -> None:
     """Have no system in this process, as if there had never been one."""
-    hub._hubs.clear()
-    hub._stopped.clear()
+    while (known := hub.hub()) is not None:
+        name, known.name = known.name, f"{known.name}/child"  # with the hub of a child no system has stopped
+        hub.remove_hub(known)
+        known.name = name
 
 
 def open_home(state_dir: Path, **transport_options: Any) -> tuple[Home, StateDir]:

@@ -182,8 +182,13 @@ def _read(file: io.FileIO) -> tuple[int | None, Reached | None]:
 _locks: weakref.WeakSet[CatalogLock] = weakref.WeakSet()  # weak: an interrupted caller may never get its lock
 
 
+def held() -> list[CatalogLock]:
+    """Return the locks that this process holds."""
+    return list(_locks)
+
+
 def _forget_locks() -> None:
-    for lock in list(_locks):
+    for lock in held():
         lock.forget()
 
 

@@ -187,8 +187,9 @@ STANDARD = {
     "_current_frames",
     "_MEIPASS",
     "_repr_mimebundle_",
+    "_repr_svg_",
 }
-"""Names of the standard library that begin with an underscore and are documented."""
+"""Names that begin with an underscore and are documented: the standard library's, and IPython's for rich display."""
 
 
 def main() -> None:

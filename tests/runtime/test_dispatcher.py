@@ -16,6 +16,7 @@ import pytest
 
 from rr_actors.base.errors import Unavailable, UsageError
 from rr_actors.runtime import event_loop as module
+from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import Dispatcher, acquire, current, release
 from rr_actors.runtime.shielding import Flag
 from support import Calls, Gate, eventually
@@ -377,7 +378,8 @@ def test_a_forked_child_does_not_use_its_parents_loop(dispatcher: Dispatcher) ->
 
 def test_at_exit_the_loop_ends_and_its_holders_may_still_release_it() -> None:
     dispatcher = acquire()
-    module._close_at_exit()  # pyright: ignore[reportPrivateUsage]
+    (close,) = (each for each in interpreter.of_each_process if each.__module__ == module.__name__)
+    close()
     assert not dispatcher.thread.is_alive()
     release()
     assert current() is None

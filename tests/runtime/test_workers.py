@@ -660,11 +660,19 @@ def test_a_call_that_fails_does_not_stop_those_behind_it(workers: Workers) -> No
 
 
 def test_keys_are_forgotten_when_their_calls_are_done(workers: Workers) -> None:
-    done = Outcomes()
-    for number in range(100):
-        workers.serial(number, lambda: None, done=done)
+    class Key:
+        """One that says when it is gone."""
+
+    done, kept = Outcomes(), weakref.WeakSet[Key]()
+
+    def call() -> None:
+        kept.add(key := Key())
+        workers.serial(key, lambda: None, done=done)
+
+    for _ in range(100):
+        call()
     done.wait(100)
-    eventually(lambda: not workers._queues)  # pyright: ignore[reportPrivateUsage]
+    eventually(lambda: gc.collect() >= 0 and not kept)
 
 
 def test_a_serial_call_over_the_limit_is_refused_and_its_key_is_free_again() -> None:

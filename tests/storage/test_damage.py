@@ -21,7 +21,6 @@ from rr_actors.base.errors import CatalogDamaged, CatalogLocked
 from rr_actors.base.folder import Folder
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, ServedQuery, rows_of
 from rr_actors.registrar.model.store import Store
-from rr_actors.storage import opening
 from rr_actors.storage.catalog_lock import Reached
 from rr_actors.storage.opening import Durability, open_store, read_rows, remove_unneeded
 from rr_actors.storage.witness import Known, Witness, tell_of_missing
@@ -427,19 +426,19 @@ def test_an_opening_waits_for_no_directory_that_is_being_removed_and_makes_it_ag
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "app" / "catalog.sqlite3"
-    make_private, times = opening._make_private, 0
+    check_owner, removed = Folder.check_owner, 0
 
-    def removed_meanwhile(folder: Folder) -> None:
-        nonlocal times
-        times += 1
-        if times < 3:
+    def removed_meanwhile(folder: Folder) -> os.stat_result:
+        nonlocal removed
+        if removed < 2:
+            removed += 1
             path.parent.rmdir()
-        make_private(folder)
+        return check_owner(folder)
 
-    monkeypatch.setattr(opening, "_make_private", removed_meanwhile)
+    monkeypatch.setattr(Folder, "check_owner", removed_meanwhile)
     with closing(open_store(path)) as store:
         store.commit([Put(Peer("hub"))])
-    assert times == 3
+    assert removed == 2
     assert read_rows(path) == [Peer("hub")]
 
 

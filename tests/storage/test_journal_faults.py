@@ -169,8 +169,8 @@ class Run:
         """Let go of everything, and remove it."""
         if self.store is not None:
             self.store.close()
-        for held in list(catalog_lock._locks):
-            held.release()
+        for lock in catalog_lock.held():
+            lock.release()
         shutil.rmtree(self.path.parent, ignore_errors=True)
 
 

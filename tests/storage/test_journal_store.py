@@ -523,15 +523,16 @@ def test_what_is_committed_and_not_folded_while_a_store_closes_is_there_at_the_n
     """Ctrl-C ends the folding at its beginning; or another thread commits just behind the folding."""
     store = journaled(path)
     store.commit([Put(query("a"))])
-    fold = store._fold
+    fold = SqliteStore.fold
 
-    def disturbed() -> None:
-        if interrupted:
-            raise KeyboardInterrupt
-        fold()
+    def disturbed(tables: SqliteStore, *folded: Any) -> None:
+        fold(tables, *folded)
         store.commit([Put(query("b"))])
 
-    monkeypatch.setattr(store, "_fold", disturbed)
+    if interrupted:
+        monkeypatch.setattr(journaled_store, "net_of", interrupt)
+    else:
+        monkeypatch.setattr(SqliteStore, "fold", disturbed)
     with pytest.raises(KeyboardInterrupt) if interrupted else contextlib.nullcontext():
         store.close()
     with contextlib.closing(open_store(path)) as again:

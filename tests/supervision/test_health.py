@@ -144,10 +144,13 @@ def test_a_manager_that_has_lost_what_it_needs_is_replaced(start: Start, what: s
     assert app.load("maker/thing", "nothing").response == new
 
 
-def test_what_a_new_process_would_suffer_from_as_well_is_no_trouble(tmp_path: Path) -> None:
+def test_what_a_new_process_would_suffer_from_as_well_is_no_trouble(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     missing = ProcessHealth(lambda: [tmp_path / "missing"])
     assert missing.trouble() == ""
-    missing._root = tmp_path.stat()
+    elsewhere = tmp_path.stat()
+    monkeypatch.setattr(os, "stat", lambda _path: elsewhere)
     assert "another root directory" in missing.trouble()
 
 

@@ -34,7 +34,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.base.values.canonical import encode
 from rr_actors.system.console import connected_client, console_client, console_server, console_view
-from rr_actors.system.console.console_client import ConsoleClient, NotRunning
+from rr_actors.system.console.console_client import Connections, ConsoleClient, NotRunning
 from rr_actors.system.console.console_commands import Hold
 from rr_actors.system.console.console_questions import Find
 from rr_actors.wire.unix_sockets import Peer
@@ -54,7 +54,20 @@ def camera(provider: rr.Registrar) -> Served:
 
 
 @pytest.fixture
-def client(camera: Served, state_dir: Path) -> Iterator[rr.Client]:
+def connections(monkeypatch: pytest.MonkeyPatch) -> list[Connections]:
+    """The connections of each client that is made."""
+    made: list[Connections] = []
+
+    def noted(*args: Any) -> Connections:
+        made.append(Connections(*args))
+        return made[-1]
+
+    monkeypatch.setattr(connected_client, "Connections", noted)
+    return made
+
+
+@pytest.fixture
+def client(connections: list[Connections], camera: Served, state_dir: Path) -> Iterator[rr.Client]:
     """A client of the running system."""
     with rr.connect(state_dir) as client:
         yield client
@@ -499,7 +512,7 @@ def test_a_load_that_is_cancelled_is_released_when_it_has_ended_also_after_its_l
 
 
 def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
-    client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+    client: rr.Client, connections: list[Connections], provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate, worker = Gate(), client.open_registrar("worker")
     hold = Hold.carry_out
@@ -510,7 +523,7 @@ def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
         return answer
 
     monkeypatch.setattr(Hold, "carry_out", held)
-    connection = client._connections.open()
+    connection = connections[0].open()
 
     def load() -> None:
         with pytest.raises(NotRunning):
@@ -536,8 +549,9 @@ def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
     def interrupted(connection: ConsoleClient, timeout_s: float | None) -> Any:
         if threading.current_thread() is not threading.main_thread():  # it waits for statuses
             return receive(connection, timeout_s)
-        assert select.select([connection._socket], [], [], LIMIT_S)[0]
-        copies.append(connection._socket.dup())  # as a child has one that was forked while the connection was made
+        assert select.select([connection], [], [], LIMIT_S)[0]
+        # as a child has one that was forked while the connection was made
+        copies.append(socket.socket(fileno=os.dup(connection.fileno())))
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -567,9 +581,9 @@ def test_a_load_that_is_interrupted_at_any_point_is_released(
 
 
 def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
-    client: rr.Client, provider: rr.Registrar
+    client: rr.Client, connections: list[Connections], provider: rr.Registrar
 ) -> None:
-    worker, connection = client.open_registrar("worker"), client._connections.open()
+    worker, connection = client.open_registrar("worker"), connections[0].open()
     held = connection.ask(Hold("client.worker", "provider/camera", encode("front")))
     connection.keep()
     connection.close()
@@ -580,9 +594,9 @@ def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
 
 
 def test_a_load_whose_connection_asks_for_something_else_before_its_keep_is_released(
-    client: rr.Client, provider: rr.Registrar
+    client: rr.Client, connections: list[Connections], provider: rr.Registrar
 ) -> None:
-    worker, connection = client.open_registrar("worker"), client._connections.open()
+    worker, connection = client.open_registrar("worker"), connections[0].open()
     for request in ("front", "rear"):
         held = connection.ask(Hold("client.worker", "provider/camera", encode(request)))
     connection.keep()

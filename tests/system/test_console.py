@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.base.errors import ConfigError, NotFound, RrError, Unavailable, UnknownQuery, UsageError
+from rr_actors.base.errors import ConfigError, NotFound, NotRunning, RrError, Unavailable, UnknownQuery, UsageError
 from rr_actors.registrar.pages import Page, ResourceRow, Wanted
 from rr_actors.system.console import console_feed, console_view
 from rr_actors.system.console.console_client import ConsoleClient, find_console
@@ -36,6 +36,7 @@ from rr_actors.system.console.console_messages import Entries, Events, Follow, L
 from rr_actors.system.console.console_questions import Find, ListDeadLetters, ListHistory, ListResources
 from rr_actors.system.console.running_systems import running_systems
 from support import Calls, Gate, Served, Workshop, eventually, hang, lives, pid_of, serve, wait_gone
+from support_asks import Background
 from support_inside import console_of, node_of
 from support_managers import Order, Shop
 
@@ -80,11 +81,9 @@ def follow(state_dir: Path) -> Iterator[Callable[[Follow], Calls]]:
 
     yield begin
     for client in clients:
-        client._socket.shutdown(2)
+        client.close()
     for thread in threads:
         thread.join(5.0)
-    for client in clients:
-        client.close()
 
 
 # -- where it is -----------------------------------------------------------------------------------------------------
@@ -438,9 +437,11 @@ def test_a_console_that_leaves_while_it_loads_holds_nothing(
 ) -> None:
     served = serve(provider, "slow", load=lambda request: gate(request))
     client = ConsoleClient(find_console(state_dir))
-    client._send(Load("provider/slow", "1", keep=True))
+    loading = Background(lambda: client.ask(Load("provider/slow", "1", keep=True)))
     gate.wait_arrived()
     client.close()
+    with pytest.raises(NotRunning):
+        loading.result()
     console = console_of(system)
     eventually(lambda: not console.connections)
 
@@ -658,7 +659,7 @@ def test_a_reader_hears_what_it_has_asked_for(
 def test_when_the_last_reader_has_gone_the_system_is_not_watched_any_more(system: rr.System, state_dir: Path) -> None:
     node = node_of(system)
     client = ConsoleClient(find_console(state_dir))
-    client._send(Follow())
+    client.follow(Follow())
     eventually(lambda: bool(node.watched))
     client.close()
 
@@ -672,10 +673,10 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
     console = console_of(shop)
     with ConsoleClient(find_console(state_dir)) as client:
         feed = client.follow(Follow())
-        eventually(lambda: bool(console.feed._readers))
+        eventually(lambda: bool(console.feed.readers))
         big, sent = "x" * 100_000, 0
-        while not next(iter(console.feed._readers)).missed:  # nobody reads: the connection fills, then the list
-            shop._running().dispatcher.run(_publish(shop, big))
+        while not next(iter(console.feed.readers)).missed:  # nobody reads: the connection fills, then the list
+            node_of(shop).dispatcher.run(_publish(shop, big))
             sent += 1
             assert sent < 10_000
 
@@ -706,9 +707,9 @@ def test_many_long_texts_at_once_reach_a_console_that_records(system: rr.System,
 
     thread = threading.Thread(target=read)
     thread.start()
-    eventually(lambda: bool(console.feed._readers))
+    eventually(lambda: bool(console.feed.readers))
     try:
-        system._running().dispatcher.run(_publish_statuses(system, "x" * 10_000))
+        node_of(system).dispatcher.run(_publish_statuses(system, "x" * 10_000))
         eventually(lambda: len(heard) == 500)
     finally:
         client.close()
@@ -731,7 +732,7 @@ def test_a_reader_that_never_reads_holds_up_nobody(
     node = node_of(system)
     client = ConsoleClient(find_console(state_dir))
     try:
-        client._send(Follow())
+        client.follow(Follow())
         eventually(lambda: bool(node.watched))
         began = time.monotonic()
         for number in range(2000):

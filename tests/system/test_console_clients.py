@@ -200,16 +200,17 @@ def test_a_client_that_asks_on_and_on_and_never_reads_has_one_answer_waiting_and
     peer.setblocking(False)
     request = framed(ListResources(), 1000)
     console = console_of(system)
-    connection: Any = eventually(lambda: next((one for one in console.connections if one._greeted), None))
+    eventually(lambda: console.connections and not console.clients[""])  # its Hello was read
+    (connection,) = console.connections
     with contextlib.suppress(ConnectionError):
         for _ in range(100_000):
             with contextlib.suppress(BlockingIOError):
                 peer.send(request)
-            if connection._ended:
+            if connection.is_gone:
                 break
-            assert connection._transport.get_write_buffer_size() < 2**20
+            assert connection.unread_bytes < 2**20
 
-    eventually(lambda: connection._ended)
+    eventually(lambda: connection.is_gone)
     assert_unharmed(state_dir)
 
 
@@ -268,9 +269,20 @@ def test_a_client_does_not_speak_to_another_users_system(
         ConsoleClient(place)
 
 
-def test_no_answer_has_a_key_of_the_system(system: rr.System, dialled: Callable[[], socket.socket]) -> None:
-    state = system._state
-    assert state is not None
+@pytest.fixture
+def secrets(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """The random bytes that this process makes from now on."""
+    secrets, urandom = list[bytes](), os.urandom
+
+    def noted(count: int) -> bytes:
+        secrets.append(made := urandom(count))
+        return made
+
+    monkeypatch.setattr(os, "urandom", noted)
+    return secrets
+
+
+def test_no_answer_has_a_key_of_the_system(secrets: list[bytes], dialled: Callable[[], socket.socket]) -> None:
     peer = dialled()
     peer.sendall(HELLO + framed(ListChildren(), 1000) + framed(ListResources(), 1000) + b"\xff" * 8)
     heard = b""
@@ -279,8 +291,12 @@ def test_no_answer_has_a_key_of_the_system(system: rr.System, dialled: Callable[
             heard += data
 
     assert len(heard) > 100
-    assert state.key not in heard
-    assert state.key.hex().encode() not in heard
+    keys = [secret for secret in secrets if len(secret) == 32]
+    assert keys
+    assert not any(key in heard or key.hex().encode() in heard for key in keys)
+
+
+WAITS_FROM_BYTES = 64 * 1024  # as asyncio's transports have it
 
 
 def leave_unread(system: rr.System, app: rr.Registrar, peer: socket.socket) -> Any:
@@ -294,19 +310,15 @@ def leave_unread(system: rr.System, app: rr.Registrar, peer: socket.socket) -> A
         length = len(framed(client.ask(ListResources()), ANSWER_LIMIT_BYTES))
     for number in range(1, 1000):
         peer.sendall(framed(ListResources(), 1000))
-        eventually(lambda number=number: _waiting(peer) + _unsent(connection) == number * length)
-        if _unsent(connection):
+        eventually(lambda number=number: _waiting(peer) + connection.unread_bytes == number * length)
+        if connection.unread_bytes:
             break
-    assert not connection._blocked
+    assert connection.unread_bytes < WAITS_FROM_BYTES
     return connection
 
 
 def _waiting(peer: socket.socket) -> int:
     return struct.unpack("i", fcntl.ioctl(peer, termios.FIONREAD, bytes(4)))[0]
-
-
-def _unsent(connection: Any) -> int:
-    return connection._transport.get_write_buffer_size()
 
 
 def break_the_rules(peer: socket.socket) -> None:
@@ -363,7 +375,7 @@ def test_a_load_that_its_client_cannot_hear_of_any_more_is_released_once(
         peer.sendall(framed(Hold(holder.name, "provider/slow", encode("1")), 1000))
         gate.wait_arrived()
         send_no_more(peer)
-        eventually(lambda: connection._ended)
+        eventually(lambda: connection.is_gone)
         gate.open()
         slow.unloads.wait(1)
 

@@ -20,10 +20,12 @@ from opentelemetry.trace import SpanKind, StatusCode
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError, LoadError, NotFound, UsageError
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.links import recorder
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import Entries
+from rr_actors.system.event_subscribers import Subscribers
 from rr_actors.system.recording import figures, recordings
 from rr_actors.system.recording.figures import Counters, Figure, prometheus_text
 from rr_actors.system.recording.otel_export import register_metrics
@@ -474,13 +476,24 @@ def test_a_recording_ends_with_its_system_and_a_restart_does_not_take_it_up(
 
 
 def test_what_records_or_listens_within_the_package_harms_nothing_by_raising(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+    start: Start, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    attend, attending = Subscribers.attend, list[Subscribers]()
+
+    def noted(subscribers: Subscribers, node: Node) -> None:
+        attending.append(subscribers)
+        attend(subscribers, node)
+
+    monkeypatch.setattr(Subscribers, "attend", noted)
+    system = start()
+    (subscribers,) = attending
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+
     def fail(_event: dict[str, Any]) -> None:
         raise ValueError("a defect")
 
     heard = Calls()
-    ends = [system._subscribers.listen(fail, records=True), system._subscribers.listen(fail), system.subscribe(heard)]
+    ends = [subscribers.listen(fail, records=True), subscribers.listen(fail), system.subscribe(heard)]
     serve(provider, "thing")
     app.load("provider/thing", "x")
 

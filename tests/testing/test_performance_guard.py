@@ -27,6 +27,7 @@ from benchmarks.stages import (
 from benchmarks.workload import SERVER, Ask
 from rr_actors.base.folder import Folder
 from rr_actors.base.values.canonical import encode
+from rr_actors.registrar.engine.effect_runner import EffectRunner
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import Held, Hold, Put, State
@@ -141,6 +142,7 @@ def test_the_loop_of_a_first_load_makes_few_calls(registrars: tuple[rr.Registrar
 
 def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(registrars: tuple[rr.Registrar, rr.Registrar]) -> None:
     actor = actor_of(registrars[0])
+    runner = EffectRunner(actor, actor.consumers, actor.servers, actor.clients)
     loads = list(itertools.islice(warm_loads(), LOADS))
 
     def handle() -> None:
@@ -149,7 +151,7 @@ def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(registrars: tup
             with actor.lock:
                 actor.commits.commit(decision)
             decision.close()
-            actor.monitor._runner.do(decision.effects)
+            runner.do(decision.effects)
 
     def counted() -> int:
         with framing_only(actor):

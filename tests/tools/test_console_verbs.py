@@ -23,6 +23,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_feed
+from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools import graphs
@@ -434,7 +435,7 @@ def test_events_of_a_child_are_those_of_all_below_it(start: Start) -> None:
 def test_following_ends_with_the_system_and_with_ctrl_c(shop: rr.System) -> None:
     both = [subprocess.Popen(command("events", "-f"), stdout=subprocess.PIPE, stderr=subprocess.PIPE) for _ in range(2)]
     console = console_of(shop)
-    eventually(lambda: len(console.feed._readers) == 2, timeout=30.0)
+    eventually(lambda: len(console.feed.readers) == 2, timeout=30.0)
 
     both[0].send_signal(signal.SIGINT)
     _, interrupted = both[0].communicate(timeout=10)
@@ -1105,9 +1106,13 @@ def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Regis
     assert "there is a file already" in refused(2, "record", file)
 
 
-def test_a_line_about_missed_events_says_how_many_rows_the_tree_has(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_line_about_missed_events_says_how_many_rows_the_tree_has(
+    start: Start, state_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = Children(501, [ChildRow("root", 0, "supervisor", "running")])
-    console_verbs._say_missed(Missed(3, 9, page), True)
+    monkeypatch.setattr(ConsoleClient, "follow", lambda *_: iter([Missed(3, 9, page)]))
+    start()
+    console_verbs.events(follow=True, state=state_dir, as_json=True)
     said = json.loads(capsys.readouterr().out)
     assert (said["missed"], said["seq"], said["total"], len(said["tree"])) == (3, 9, 501, 1)
 
@@ -1121,7 +1126,7 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
     asked = command("sequence", query.id, "--seconds", 4)
     with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drawing:
         eventually(lambda: watched.level[0] > 1)
-        (reader,) = feed._readers
+        (reader,) = feed.readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
         eventually(lambda: not reader._waiting)
@@ -1142,7 +1147,7 @@ def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so
     watched, feed = node_of(shop).watched, console_of(shop).feed
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
         eventually(lambda: watched.level[0] > 1)
-        (reader,) = feed._readers
+        (reader,) = feed.readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
         eventually(lambda: not reader._waiting)

@@ -7,7 +7,9 @@ and looked at in the difference before it is committed.
 from __future__ import annotations
 
 import asyncio
+import html
 import os
+import re
 import threading
 import time
 import types
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.cells import cell_len
 from textual.pilot import Pilot
 
 from rr_actors.hosting.streams import ReaderRow, StreamInfo, StreamRow
@@ -153,9 +156,17 @@ def _it_is_always_now(monkeypatch: pytest.MonkeyPatch) -> None:
 Look = Callable[[Terminal, Pilot[None]], Awaitable[None]]
 
 
+TEXT = re.compile(r'<text [^>]* x="([\d.]+)" [^>]*-line-(\d+)\)">([^<]*)</text>')
+COLUMN = 12.2  # the width of a character in a screenshot
+
+
 def screen_of(terminal: Terminal) -> str:
-    strips = terminal.screen._compositor.render_strips()
-    return "".join(f"{strip.text.rstrip()}\n" for strip in strips)
+    lines = [""] * terminal.screen.size.height
+    for x, line, text in TEXT.findall(terminal.export_screenshot()):
+        before = lines[int(line)]
+        gap = " " * (round(float(x) / COLUMN) - cell_len(before))
+        lines[int(line)] = before + gap + html.unescape(text).replace("\xa0", " ")
+    return "".join(f"{line.rstrip()}\n" for line in lines)
 
 
 async def goes_down_to(terminal: Terminal, pilot: Pilot[None], name: str) -> None:

@@ -22,7 +22,7 @@ from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.web import sequence_page
 from rr_actors.tools.web.graph_picture import Chart, around, chart, edges_in, neighbours_of, rows_of_server, travels
 from rr_actors.tools.web.sequence_page import Recorder
-from rr_actors.tools.web.watch import Moment, Watch
+from rr_actors.tools.web.watch import Moment, Moments, Watch
 from support import LIMIT_S, Gate, child, eventually, hang, kill, pid_of, serve, wait_respawned
 from support_inside import node_of
 
@@ -242,19 +242,15 @@ def test_a_watch_knows_the_children_while_a_registrar_does_not_answer(
         watch.stop()
 
 
-def test_a_watch_keeps_ten_minutes_and_a_bounded_number_of_moments(start: Start, state_dir: Path) -> None:
-    start()
-    watch = Watch(state_dir)
-    try:
-        for number in range(5000):
-            watch._add(Moment(1000.0 + number / 100, total=number, stale=""))
-        assert len(watch.moments) == 3000
-        watch._add(Moment(2000.0, total=1, stale=""))
-        assert [moment.at for moment in watch.moments] == [2000.0]
-        watch._add(Moment(2001.0, total=1, stale=""))  # nothing has changed
-        assert len(watch.moments) == 1
-    finally:
-        watch.stop()
+def test_a_watch_keeps_ten_minutes_and_a_bounded_number_of_moments() -> None:
+    moments = Moments([Moment(0.0)])
+    for number in range(5000):
+        assert moments.add(Moment(1000.0 + number / 100, total=number, stale=""))
+    assert len(moments) == 3000
+    assert moments.add(Moment(2000.0, total=1, stale=""))
+    assert [moment.at for moment in moments] == [2000.0]
+    assert not moments.add(Moment(2001.0, total=1, stale=""))  # nothing has changed
+    assert len(moments) == 1
 
 
 # -- a page's recording ----------------------------------------------------------------------------------------------

@@ -171,7 +171,7 @@ class ConsoleClient:
 
     def _fed(self, tick_s: float | None) -> Iterator[Any]:
         poll = select.poll()
-        poll.register(self._socket, select.POLLIN)
+        poll.register(self, select.POLLIN)
         while True:
             if tick_s is not None and not self._answers and not poll.poll(tick_s * 1000):
                 yield c.Events([])
@@ -192,6 +192,10 @@ class ConsoleClient:
             return True
         except OSError:  # closed here
             return False
+
+    def fileno(self) -> int:
+        """Return the descriptor of the connection, which is readable when an answer is there."""
+        return self._socket.fileno()
 
     def close(self) -> None:
         """Close the connection; a call that waits in another thread raises NotRunning. A second close does nothing."""

@@ -129,6 +129,11 @@ class Feed:
         self._unlisten: Callable[[], None] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
+    @property
+    def readers(self) -> list[Reader]:
+        """The consoles that follow or record now."""
+        return list(self._readers)
+
     def add(self, reader: Reader) -> None:
         """Send a reader what happens from now on."""
         self._readers[reader] = None
@@ -166,7 +171,7 @@ class Feed:
 
     def _flush(self) -> None:
         self._timer = None
-        for reader in list(self._readers):
+        for reader in self.readers:
             reader.flush()
 
     def close(self) -> None:
@@ -174,7 +179,7 @@ class Feed:
         if self._timer is not None:
             self._timer.cancel()
             self._flush()
-        for reader in list(self._readers):
+        for reader in self.readers:
             self.remove(reader)
 
 

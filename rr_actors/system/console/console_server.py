@@ -194,6 +194,11 @@ class Connection(asyncio.Protocol):
         """Whether the client has left, or is being left."""
         return self._ended
 
+    @property
+    def unread_bytes(self) -> int:
+        """How many bytes of answers wait here, because the client does not read."""
+        return self._transport.get_write_buffer_size()
+
     # -- called by asyncio -------------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

@@ -117,6 +117,23 @@ class _Looks:
             self.news.clear()
 
 
+class Moments(deque[Moment]):
+    """The moments of the last minutes, oldest first, never empty."""
+
+    def add(self, moment: Moment) -> bool:
+        """Add a moment that says something new, and drop those that are past; return whether it was added."""
+        if moment.says_the_same(self[-1]):
+            return False
+        self.append(moment)
+        while len(self) > 1 and self._is_past(self[0]):
+            self.popleft()
+        return True
+
+    def _is_past(self, oldest: Moment) -> bool:
+        is_whole = oldest.at and oldest.stale is not None  # not before the first answer, nor before the rows came
+        return not is_whole or len(self) > _KEPT or oldest.at < self[-1].at - KEPT_S
+
+
 @dataclass
 class Watch:
     """Watches the system in one state directory, also over its restarts. Its threads run from start() to stop().
@@ -131,7 +148,7 @@ class Watch:
     """
 
     state_dir: str | os.PathLike[str] | None
-    moments: deque[Moment] = field(default_factory=lambda: deque([Moment(0.0, problem="not asked yet")]))
+    moments: Moments = field(default_factory=lambda: Moments([Moment(0.0, problem="not asked yet")]))
     events: deque[c.Event] = field(default_factory=lambda: deque[c.Event](maxlen=_EVENTS_KEPT))
     heard: int = 0
     missed: int = 0
@@ -317,19 +334,8 @@ class Watch:
         """Add the moment that differs by `change`. While the system does not answer, its time is since when."""
         with self._changing:
             now, new = self.now, change(self.now)
-            self._add(replace(new, at=now.at if now.problem and new.problem else time.time()))
-
-    def _add(self, moment: Moment) -> None:
-        if moment.says_the_same(self.now):
-            return
-        self.moments.append(moment)
-        while len(self.moments) > 1 and self._is_past(self.moments[0]):
-            self.moments.popleft()
-        self.version = next(self._versions)
-
-    def _is_past(self, oldest: Moment) -> bool:
-        is_whole = oldest.at and oldest.stale is not None  # not before the first answer, nor before the rows came
-        return not is_whole or len(self.moments) > _KEPT or oldest.at < self.now.at - KEPT_S
+            if self.moments.add(replace(new, at=now.at if now.problem and new.problem else time.time())):
+                self.version = next(self._versions)
 
 
 def _shared(rows: Sequence[_Row], before: tuple[_Row, ...]) -> tuple[_Row, ...]:
