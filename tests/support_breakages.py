@@ -27,7 +27,7 @@ from rr_actors.registrar.core import holding, notices, reconciliation, recovery,
 from rr_actors.registrar.model.catalog import Decision, add, discard
 from rr_actors.registrar.model.commands import Reconcile, Register
 from rr_actors.registrar.model.effects import Reply
-from rr_actors.registrar.model.messages import Unloaded
+from rr_actors.registrar.model.messages import Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Resource, ServedQuery
 from rr_actors.runtime.processes import lifeline
 from rr_actors.storage.journaled_store import Found, JournaledStore, Segment
@@ -209,17 +209,31 @@ def _nothing_is_agreed() -> None:
 # -- the protocol ----------------------------------------------------------------------------------------------------
 
 
+def _released_by(release: Callable[[Decision, ServedQuery], None]) -> None:
+    """Have a query that its holder lets go released so."""
+    unload = unloading.unload
+
+    def broken(decision: Decision, message: Unload) -> None:
+        query = decision.catalog.queries.get(message.query_id)
+        if query is None or query.origin != message.origin or query.resource_id in decision.catalog.recovering:
+            unload(decision, message)
+        else:
+            release(decision, query)
+
+    replace(unload, broken)
+
+
 def _released_by_the_first() -> None:
-    def broken(decision: Decision, query: ServedQuery) -> None:
+    def release(decision: Decision, query: ServedQuery) -> None:
         resource = decision.catalog.resources[query.resource_id]
         if resource.phase is Phase.LOADED:
             unloading.begin_unload(decision, resource)
 
-    replace(unloading._release, broken)
+    _released_by(release)
 
 
 def _forgotten_without_its_callback() -> None:
-    def broken(decision: Decision, query: ServedQuery) -> None:
+    def release(decision: Decision, query: ServedQuery) -> None:
         resource = decision.catalog.resources[query.resource_id]
         last = len(decision.catalog.holders[resource.id]) == 1
         unloading.drop_query(decision, query)
@@ -227,7 +241,7 @@ def _forgotten_without_its_callback() -> None:
         if last:
             decision.drop(resource)
 
-    replace(unloading._release, broken)
+    _released_by(release)
 
 
 def _parts_are_kept() -> None:
@@ -239,10 +253,10 @@ def _parts_are_kept() -> None:
 
 
 def _statuses_are_swallowed() -> None:
-    def broken(decision: Decision, held: Any, notice: Any, provider: str, repeated: bool) -> None:
-        notices.acknowledge(decision, provider, notice.id)
+    def broken(decision: Decision, provider: str, message: Noticed) -> None:
+        notices.acknowledge(decision, provider, message.notice.id)
 
-    replace(status_delivery._hear, broken)
+    replace(status_delivery.noticed, broken)
 
 
 # -- processes -------------------------------------------------------------------------------------------------------

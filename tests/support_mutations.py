@@ -577,12 +577,12 @@ def forgets_its_own_server(patch: Patch) -> type[SimRegistrar]:
 
 def comes_back(patch: Patch) -> type[SimRegistrar]:
     """What a status callback says of its own resource comes back to it."""
-    say: Any = status_changes._say  # pyright: ignore[reportPrivateUsage]
 
-    def again(decision: Decision, resource: Any, command: Any, *more: Any) -> None:
-        say(decision, resource, _replace(command, callback_of=""), *more)
+    def of_nobody(plain: Callable[[Decision, Any], None]) -> Callable[[Decision, Any], None]:
+        return lambda decision, command: plain(decision, _replace(command, callback_of=""))
 
-    patch(status_changes, "_say", again)
+    for plain in (status_changes.set_status, status_changes.set_response):
+        _in_tables(patch, plain, of_nobody(plain))
     return SimRegistrar
 
 

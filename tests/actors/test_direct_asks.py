@@ -253,7 +253,7 @@ def test_what_is_sent_after_a_time_out_is_behind_what_was_asked(keeps: ActorRef[
 
 
 def test_a_time_out_of_a_long_message_lets_nothing_pass(
-    home: Home, neighbour: tuple[StateDir, subprocess.Popen[str]], ours: ActorRef[Any]
+    neighbour: tuple[StateDir, subprocess.Popen[str]], ours: ActorRef[Any], puts: Puts
 ) -> None:
     """The other process reads a long one in pieces: a short one on another connection would be there before it."""
     _, process = neighbour
@@ -263,8 +263,9 @@ def test_a_time_out_of_a_long_message_lets_nothing_pass(
         try:
             with pytest.raises(pykka.Timeout):
                 ours.ask((size, b"x" * size), timeout=0.3)
+            by_link = puts.asks()
             behind = Background(lambda size=size: ours.ask((size, b"behind")))
-            eventually(lambda: line_of(home)._waiting)  # pyright: ignore[reportPrivateUsage]
+            eventually(lambda by_link=by_link: puts.asks() > by_link)
         finally:
             process.send_signal(signal.SIGCONT)
         behind.result()

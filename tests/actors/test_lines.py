@@ -16,6 +16,7 @@ import pytest
 
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import Reply
+from rr_actors.actors.remote import peer
 from rr_actors.actors.remote.peer import Call, Line, Whereabouts
 from rr_actors.actors.remote.protocol import ASKS, Answered, Ask, Dead, Over, Raised, Tell, Watching
 from rr_actors.base import pickling
@@ -221,7 +222,7 @@ def test_nothing_is_asked_so_after_the_loop_has_ended(bench: Bench) -> None:
     assert not bench.transport.made
 
 
-def test_a_finalizer_that_tells_may_run_while_its_thread_puts(bench: Bench) -> None:
+def test_a_finalizer_that_tells_may_run_while_its_thread_puts(monkeypatch: pytest.MonkeyPatch) -> None:
     class Waiting(deque[Any]):
         def append(self, item: Any, /) -> None:
             if item[0] is first:
@@ -229,7 +230,8 @@ def test_a_finalizer_that_tells_may_run_while_its_thread_puts(bench: Bench) -> N
             super().append(item)
 
     first, second = Tell(URN, b"first"), Tell(URN, b"second")
-    bench.line._waiting = Waiting()  # pyright: ignore[reportPrivateUsage]
+    monkeypatch.setattr(peer, "deque", Waiting)
+    bench = Bench()
     putter = threading.Thread(target=lambda: bench.line.put(first), daemon=True)
     putter.start()
     putter.join(10)
@@ -237,6 +239,7 @@ def test_a_finalizer_that_tells_may_run_while_its_thread_puts(bench: Bench) -> N
     bench.turn()
     assert bench.link.sent[-2:] == [second, first]
     assert not bench.line.may_ask
+    bench.close()
 
 
 # -- what a thread leaves on its connection ----------------------------------------------------------------------------

@@ -300,7 +300,7 @@ def test_ask_times_out_and_a_late_reply_is_nobodys(ref: ActorRef[Any], home: Hom
         ref.ask(lambda _: time.sleep(0.5), timeout=0.01)
     assert ref.ask("alive") == "alive"
     (line,) = home.hub.lines()
-    eventually(lambda: not line._calls)  # pyright: ignore[reportPrivateUsage]
+    eventually(lambda: line.open_calls == 0)
 
 
 def test_ask_has_a_time_out_by_default(ours: ActorRef[Any], home: Home) -> None:

@@ -17,7 +17,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -117,20 +117,24 @@ def shared_class_names() -> dict[str, int]:
 
 
 def private_uses() -> list[str]:
-    """The lines of tests that use a private attribute of the package: one that no test defines."""
-    own: set[str] = set()
-    uses: list[tuple[str, str]] = []
+    """The lines of tests that use a private attribute: one that neither the test nor a support module defines."""
+    own: defaultdict[Path, set[str]] = defaultdict(set)
+    shared: set[str] = set()
+    uses: list[tuple[Path, str, str]] = []
     for path, tree in trees("tests"):
+        is_support = path.stem.startswith("support") or path.parent.name == "simulation"
+        defined = shared if is_support else own[path]
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                own.add(node.name)
+                defined.add(node.name)
             elif isinstance(node, ast.Attribute) and re.match(r"_(?!_)", node.attr):
                 of_self = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
                 if of_self and isinstance(node.ctx, ast.Store):
-                    own.add(node.attr)
+                    defined.add(node.attr)
                 if not of_self:
-                    uses.append((node.attr, f"{path.relative_to(REPOSITORY)}:{node.lineno}"))
-    return sorted({f"{where} {name}" for name, where in uses if name not in own and name not in STANDARD})
+                    uses.append((path, node.attr, f"{path.relative_to(REPOSITORY)}:{node.lineno}"))
+    known = shared | STANDARD
+    return sorted({f"{where} {name}" for path, name, where in uses if name not in known and name not in own[path]})
 
 
 _TRIPS = 4

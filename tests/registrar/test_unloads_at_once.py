@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -166,6 +167,16 @@ def test_who_tries_again_before_another_has_taken_in_the_refusal_is_told_as_well
     assert not actor_of(app).busy()
 
 
+def noted(calls: Calls, fn: Callable[..., None]) -> Callable[..., None]:
+    """The same function, which notes when it has been called."""
+
+    def call(*args: Any) -> None:
+        fn(*args)
+        calls(args)
+
+    return call
+
+
 def test_what_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
     app: rr.Registrar, provider: rr.Registrar, answered: Pause, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,9 +191,12 @@ def test_what_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
     turn = Pause()
     dispatcher.call(turn)
     assert turn.there.wait(10)
+    wanted = Calls()
+    for way in ("call", "hand_over"):
+        monkeypatch.setattr(dispatcher, way, noted(wanted, getattr(dispatcher, way)))
     late = app.unload(query, block=False, timeout_s=None)
     answered.go_on.set()
-    eventually(lambda: len(dispatcher._calls) >= 2)  # what both want is done in one turn of the loop
+    wanted.wait(2)  # what both want is done in one turn of the loop
     turn.go_on.set()
     with pytest.raises(rr.UnknownQuery, match=query.id):
         late.get(timeout=10)

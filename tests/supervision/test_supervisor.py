@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import random
@@ -12,6 +13,7 @@ import sys
 import textwrap
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -899,8 +901,8 @@ def test_a_manager_that_fails_after_it_was_abandoned_leaves_its_successors_regis
     tree.supervisor().start_child(ChildSpec(StuckManager, id="shop", placement="thread", shutdown_s=0.1))
     served = tree.node.registrars["shop"]
     let_go.set()
-    (abandoned,) = SlowToRegister.made
-    eventually(abandoned._started.done)  # pyright: ignore[reportPrivateUsage]
+    abandoned = weakref.ref(SlowToRegister.made.pop())
+    eventually(lambda: gc.collect() >= 0 and abandoned() is None, what="the end of the abandoned one")
     assert tree.ask("root/shop", "anything") == "served"
     assert tree.node.registrars["shop"] is served
     assert not served.closed

@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -53,13 +54,25 @@ def camera(provider: rr.Registrar) -> Served:
     return serve(provider, "camera")
 
 
-@pytest.fixture
-def connections(monkeypatch: pytest.MonkeyPatch) -> list[Connections]:
-    """The connections of each client that is made."""
-    made: list[Connections] = []
+class NotedConnections(Connections):
+    """`opened`: all that were opened."""
 
-    def noted(*args: Any) -> Connections:
-        made.append(Connections(*args))
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.opened: list[ConsoleClient] = []
+
+    def open(self) -> ConsoleClient:
+        self.opened.append(super().open())
+        return self.opened[-1]
+
+
+@pytest.fixture
+def connections(monkeypatch: pytest.MonkeyPatch) -> list[NotedConnections]:
+    """The connections of each client that is made."""
+    made: list[NotedConnections] = []
+
+    def noted(*args: Any) -> NotedConnections:
+        made.append(NotedConnections(*args))
         return made[-1]
 
     monkeypatch.setattr(connected_client, "Connections", noted)
@@ -67,7 +80,7 @@ def connections(monkeypatch: pytest.MonkeyPatch) -> list[Connections]:
 
 
 @pytest.fixture
-def client(connections: list[Connections], camera: Served, state_dir: Path) -> Iterator[rr.Client]:
+def client(connections: list[NotedConnections], camera: Served, state_dir: Path) -> Iterator[rr.Client]:
     """A client of the running system."""
     with rr.connect(state_dir) as client:
         yield client
@@ -512,7 +525,7 @@ def test_a_load_that_is_cancelled_is_released_when_it_has_ended_also_after_its_l
 
 
 def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
-    client: rr.Client, connections: list[Connections], provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+    client: rr.Client, connections: list[NotedConnections], provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate, worker = Gate(), client.open_registrar("worker")
     hold = Hold.carry_out
@@ -542,20 +555,24 @@ def test_a_load_whose_client_leaves_as_it_is_answered_is_released(
 
 
 def test_a_load_that_is_interrupted_when_its_answer_is_there_is_released(
-    client: rr.Client, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+    client: rr.Client, connections: list[NotedConnections], provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    worker, copies, receive = client.open_registrar("worker"), list[socket.socket](), ConsoleClient._receive
+    worker, copies = client.open_registrar("worker"), list[socket.socket]()
 
-    def interrupted(connection: ConsoleClient, timeout_s: float | None) -> Any:
-        if threading.current_thread() is not threading.main_thread():  # it waits for statuses
-            return receive(connection, timeout_s)
-        assert select.select([connection], [], [], LIMIT_S)[0]
-        # as a child has one that was forked while the connection was made
-        copies.append(socket.socket(fileno=os.dup(connection.fileno())))
-        raise KeyboardInterrupt
+    class Clock:
+        """Is read when a request has been sent, to know until when its answer is waited for."""
+
+        @staticmethod
+        def monotonic() -> float:
+            if threading.current_thread() is not threading.main_thread():
+                return time.monotonic()
+            (connection,) = select.select(connections[0].opened, [], [], LIMIT_S)[0]
+            # as a child has one that was forked while the connection was made
+            copies.append(socket.socket(fileno=os.dup(connection.fileno())))
+            raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(ConsoleClient, "_receive", interrupted)
+        patch.setattr(console_client, "time", Clock)
         with pytest.raises(KeyboardInterrupt):
             worker.load("provider/camera", "front")
 
@@ -581,7 +598,7 @@ def test_a_load_that_is_interrupted_at_any_point_is_released(
 
 
 def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
-    client: rr.Client, connections: list[Connections], provider: rr.Registrar
+    client: rr.Client, connections: list[NotedConnections], provider: rr.Registrar
 ) -> None:
     worker, connection = client.open_registrar("worker"), connections[0].open()
     held = connection.ask(Hold("client.worker", "provider/camera", encode("front")))
@@ -594,7 +611,7 @@ def test_a_load_whose_answer_was_read_stays_when_its_connection_is_closed(
 
 
 def test_a_load_whose_connection_asks_for_something_else_before_its_keep_is_released(
-    client: rr.Client, connections: list[Connections], provider: rr.Registrar
+    client: rr.Client, connections: list[NotedConnections], provider: rr.Registrar
 ) -> None:
     worker, connection = client.open_registrar("worker"), connections[0].open()
     for request in ("front", "rear"):

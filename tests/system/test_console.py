@@ -19,6 +19,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError, NotFound, NotRunning, RrError, Unavailable, UnknownQuery, UsageError
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.pages import Page, ResourceRow, Wanted
 from rr_actors.system.console import console_feed, console_view
 from rr_actors.system.console.console_client import ConsoleClient, find_console
@@ -670,13 +671,13 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
     shop: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(console_feed, "KEPT", 100)
-    console = console_of(shop)
+    console, node = console_of(shop), node_of(shop)
     with ConsoleClient(find_console(state_dir)) as client:
         feed = client.follow(Follow())
         eventually(lambda: bool(console.feed.readers))
         big, sent = "x" * 100_000, 0
         while not next(iter(console.feed.readers)).missed:  # nobody reads: the connection fills, then the list
-            node_of(shop).dispatcher.run(_publish(shop, big))
+            node.dispatcher.run(_publish(node, big))
             sent += 1
             assert sent < 10_000
 
@@ -694,8 +695,7 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
 
 
 def test_many_long_texts_at_once_reach_a_console_that_records(system: rr.System, state_dir: Path) -> None:
-    console, heard = console_of(system), Calls()
-    assert console is not None
+    console, node, heard = console_of(system), node_of(system), Calls()
     client = ConsoleClient(find_console(state_dir))
     parts = client.record()
 
@@ -709,20 +709,20 @@ def test_many_long_texts_at_once_reach_a_console_that_records(system: rr.System,
     thread.start()
     eventually(lambda: bool(console.feed.readers))
     try:
-        node_of(system).dispatcher.run(_publish_statuses(system, "x" * 10_000))
+        node.dispatcher.run(_publish_statuses(node, "x" * 10_000))
         eventually(lambda: len(heard) == 500)
     finally:
         client.close()
         thread.join()
 
 
-async def _publish_statuses(system: rr.System, text: str) -> None:
+async def _publish_statuses(node: Node, text: str) -> None:
     for _ in range(500):
-        system._publish({"event": "status", "registrar": "r", "server": "r/s", "resource_id": "1", "detail": text})
+        node.emit("status", registrar="r", server="r/s", resource_id="1", detail=text)
 
 
-async def _publish(system: rr.System, text: str) -> None:
-    system._publish({"event": "dead_letter", "pid": os.getpid(), "to": text})
+async def _publish(node: Node, text: str) -> None:
+    node.emit("dead_letter", pid=os.getpid(), to=text)
 
 
 def test_a_reader_that_never_reads_holds_up_nobody(

@@ -260,7 +260,8 @@ def test_events_wait_for_a_free_worker(start: Start) -> None:
     waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
     gate.wait_arrived(2)
     published = Calls()
-    node_of(system).dispatcher.call(lambda: published(system._publish({"event": "progress"})))
+    node = node_of(system)
+    node.dispatcher.call(lambda: published(node.emit("progress")))
     published.wait()
     gate.open()
     for reply in waiting:

@@ -1129,7 +1129,7 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
         (reader,) = feed.readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
-        eventually(lambda: not reader._waiting)
+        eventually(lambda: not reader.is_behind)
         query.unload()
         diagram, said_of_it = drawing.communicate(timeout=30)
 
@@ -1150,7 +1150,7 @@ def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so
         (reader,) = feed.readers
         while not reader.missed:
             app.load_all([("shop/thing", Order("lamp"))] * 100)
-        eventually(lambda: not reader._waiting)
+        eventually(lambda: not reader.is_behind)
         query.unload()
         eventually(lambda: "Unload" in file.read_text())
         recording.send_signal(signal.SIGINT)

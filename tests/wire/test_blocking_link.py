@@ -129,6 +129,11 @@ def test_writing_and_waiting_have_one_time_limit(
         deadlines.append(deadline)
         return left_until(deadline)
 
+    def answer_late(link: Link, message: Note) -> None:
+        time.sleep(0.2)  # so that the answer is waited for
+        peer.echo(link, message)
+
+    peer.answer = answer_late
     monkeypatch.setattr(blocking_link, "left_until", note)
     monkeypatch.setattr(blocking_link, "SPIN_LIMIT_S", 0.0)
     for limit_s in (20.0, None):

@@ -19,6 +19,7 @@ import pytest
 
 from rr_actors.base.errors import CatalogLocked, ConfigError, InvalidName, UsageError
 from rr_actors.tools.inspection import read_state
+from rr_actors.wire import name_service
 from rr_actors.wire.name_service import (
     Directory,
     NameEntry,
@@ -178,14 +179,14 @@ def test_two_threads_that_miss_the_directory_at_once_make_it_once(
 ) -> None:
     directory = Directory(tmp_path / "run", keeps=True)
     shutil.rmtree(directory.run_dir)
-    make, made = directory._open, Calls()  # pyright: ignore[reportPrivateUsage]
+    make, made = name_service.make_directories, Calls()
 
-    def make_slowly() -> object:
+    def make_slowly(path: Path) -> None:
         made()
         time.sleep(0.2)
-        return make()
+        make(path)
 
-    monkeypatch.setattr(directory, "_open", make_slowly)
+    monkeypatch.setattr(name_service, "make_directories", make_slowly)
     other = Background(directory.restore)
     made.wait()
     directory.publish("r.cameras", "here")

@@ -165,6 +165,11 @@ class Line:
             self._woken_for = turn  # last: if the thread is interrupted before this, the next one calls _pump()
 
     @property
+    def open_calls(self) -> int:
+        """How many calls wait for their answers, which come by the link. From any thread."""
+        return len(self._calls)
+
+    @property
     def may_ask(self) -> bool:
         """Whether ask() may succeed: no earlier letter may be in flight. From any thread."""
         return self._unsettled is None and self._link is not None and not (self._left or self._dispatcher.closed)

@@ -66,6 +66,11 @@ class Reader:
         self._waiting: list[Event | Entry] = []
         self._dropped = 0
 
+    @property
+    def is_behind(self) -> bool:
+        """Whether events wait for the console, or were missed and it has not heard so."""
+        return bool(self._waiting) or self.missed > 0
+
     def hear(self, event: Event) -> None:
         """Keep an event for the console, if the console has asked for such events."""
         if self._kinds and event.event not in self._kinds:
