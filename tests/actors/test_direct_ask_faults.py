@@ -22,9 +22,8 @@ from rr_actors.actors.refs import ref_to
 from rr_actors.actors.remote.hub import hub, set_hub
 from rr_actors.base.errors import ActorUnavailable, RrError, Unavailable
 from rr_actors.wire import thread_connections
-from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.name_service import Presence
-from rr_actors.wire.transport import Hello
+from rr_actors.wire.transport import Exchange, Hello
 from support import Workshop, child, eventually, hang, kill, pid_of, wait_gone, wait_respawned
 from support_asks import Background, Puts, idle, in_threads, line_of, warm
 from support_managers import Order, Shop
@@ -72,7 +71,7 @@ def limits_of_dialling(home: Home, monkeypatch: pytest.MonkeyPatch) -> list[floa
     limits: list[float] = []
     dial = home.transport.dial
 
-    def note(address: str, hello: Hello, timeout_s: float) -> BlockingLink:
+    def note(address: str, hello: Hello, timeout_s: float) -> Exchange:
         limits.append(timeout_s)
         return dial(address, hello, timeout_s)
 

@@ -15,7 +15,6 @@ import pytest
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import deadline_of, left_until
-from rr_actors.wire import thread_connections
 from rr_actors.wire.segments import Segments
 from rr_actors.wire.thread_connections import BlockingLink
 from rr_actors.wire.transport import Link, Welcome
@@ -134,8 +133,8 @@ def test_writing_and_waiting_have_one_time_limit(
         peer.echo(link, message)
 
     peer.answer = answer_late
-    monkeypatch.setattr(blocking_link, "left_until", note)
-    monkeypatch.setattr(blocking_link, "SPIN_LIMIT_S", 0.0)
+    monkeypatch.setattr(f"{BlockingLink.__module__}.left_until", note)
+    monkeypatch.setattr(f"{BlockingLink.__module__}.SPIN_LIMIT_S", 0.0)
     for limit_s in (20.0, None):
         deadline = deadline_of(limit_s)
         peer.dispatcher.call(time.sleep, 0.2)  # it cannot all be written before
