@@ -24,7 +24,6 @@ from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire import thread_connections
 from rr_actors.wire.segments import Segments
-from rr_actors.wire.thread_connections import BlockingLink
 from rr_actors.wire.transport import Hello
 from support import Gate, eventually
 from support_asks import FakeExchange, answered
