@@ -18,9 +18,10 @@ from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.engine.monitor import RegistrarMonitor
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
+from rr_actors.registrar.model.effects import Answer
 from rr_actors.registrar.model.rows import Phase, Resource, ServedQuery
 from rr_actors.storage.opening import read_rows
-from support import Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
+from support import LIMIT_S, Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
 from support_inside import actor_of, on_loop
 
 Start = Callable[..., rr.System]
@@ -390,3 +391,66 @@ def test_who_begins_to_watch_hears_nothing_of_what_a_thread_decided_before(
     eventually(lambda: any(event["resource_id"] == after.resource_id for event in heard if event["event"] == "loaded"))
     loaded = [event["resource_id"] for event in heard if event["event"] == "loaded"]
     assert loaded == [after.resource_id]
+
+
+# -- calls of the owner ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def answered(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    """Whether the threads that called for the owner decided that themselves, one after another."""
+    calls = Calls()
+    answer_here = RegistrarMonitor.answer_here
+
+    def noted(monitor: RegistrarMonitor, command: Callable[[object], c.Command]) -> Answer | None:
+        answer = answer_here(monitor, command)
+        calls(answer is not None)
+        return answer
+
+    monkeypatch.setattr(RegistrarMonitor, "answer_here", noted)
+    return calls
+
+
+def test_the_thread_that_sends_a_status_decides_it(
+    app: rr.Registrar, provider: rr.Registrar, state_dir: Path, answered: Calls
+) -> None:
+    serve(provider, "thing")
+    heard = Calls()
+    query = app.load("provider/thing", "x", on_status=heard)
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "first"))
+    (row,) = [row for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Resource)]
+    assert row.message == "first"  # on disk, when the call returns
+    heard.wait(1)
+    eventually(lambda: not actor_of(provider).node.dispatcher.is_behind())
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "second"))
+    assert answered.items == [True, True]
+    eventually(lambda: [status.message for status in heard.items] == ["first", "second"])
+    eventually(lambda: not actor_of(provider).node.dispatcher.is_behind())
+    with pytest.raises(rr.UnknownQuery):
+        provider.send_status("nothing", rr.Status(rr.State.WARNING, "third"))
+    assert answered.items == [True, True, True]
+
+
+def test_a_status_is_decided_behind_what_the_loop_has_still_to_do(
+    app: rr.Registrar, provider: rr.Registrar, answered: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    gate, posted, dispatcher = Gate(), Calls(), actor_of(provider).node.dispatcher
+    dispatcher.call(gate)
+    gate.wait_arrived()
+    call = dispatcher.call
+
+    def noted(fn: Callable[..., object], *args: Any) -> None:
+        call(fn, *args)
+        posted(fn)
+
+    monkeypatch.setattr(dispatcher, "call", noted)
+    sending = threading.Thread(target=provider.send_status, args=(query, rr.Status(rr.State.WARNING, "late")))
+    sending.start()
+    posted.wait(1)
+    gate.open()
+    sending.join(LIMIT_S)
+    assert not sending.is_alive()
+    assert answered.items == []
+    assert provider.resources()[0].message == "late"
