@@ -127,9 +127,12 @@ def remove_unneeded(path: Path, witness: Witness) -> None:
     Raises:
         CatalogError: as open_store() describes; or the catalog cannot be removed.
     """
-    if not is_there(path) or is_needed(content_of(read_rows(path))):
+    if not is_there(path):
         return
-    if is_missing(path) and witness.known() is not None:  # it was removed: the next opening says so
+    if is_missing(path):
+        if witness.known() is not None:  # it was removed: the next opening says so
+            return
+    elif is_needed(content_of(read_rows(path))):
         return
     store = open_store(path, witness=witness)
     needed = True
