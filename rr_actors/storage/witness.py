@@ -65,10 +65,10 @@ class Witness:
                 os.fsync(state.fd)
 
     def known_or_spent(self) -> tuple[Known | None, int]:
-        """Return what known() does; and if that is None, the highest epoch of all catalogs here that were erased."""
+        """Return what known() does; and if it has no epoch, the highest of all catalogs here that were erased."""
         with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
             known = _read(place, self.registrar)
-            return known, 0 if known is not None else _spent(place)
+            return known, 0 if known is not None and known.epoch else _spent(place)
         return None, 0
 
     def forget(self, epoch: int) -> bool:

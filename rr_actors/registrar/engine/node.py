@@ -382,14 +382,16 @@ class Node(ProcessNode):
 
     async def _remove_unneeded(self) -> None:
         left, self._left = list(self._left), set()
-        while left and not self._closing:
-            some, left = left[:_REMOVED_AT_ONCE], left[_REMOVED_AT_ONCE:]
-            gone = [name for name in some if name not in self._opening and self.status_of(name) is _GONE]
-            with contextlib.suppress(Unavailable):  # no worker is free: the next start of the system removes them
-                await self.dispatcher.workers.run(self._remove_catalogs, gone, self.info.state_dir)
-        self._removing = None
-        if self._left:
-            self._remove_later()
+        try:
+            while left and not self._closing:
+                some, left = left[:_REMOVED_AT_ONCE], left[_REMOVED_AT_ONCE:]
+                gone = [name for name in some if name not in self._opening and self.status_of(name) is _GONE]
+                with contextlib.suppress(Unavailable):  # no worker is free: the next start of the system removes them
+                    await self.dispatcher.workers.run(self._remove_catalogs, gone, self.info.state_dir)
+        finally:
+            self._removing = None
+            if self._left:
+                self._remove_later()
 
     async def _tell_gone(self, provider: str, address: str, name: str) -> bool:
         try:
