@@ -14,7 +14,7 @@ import pytest
 
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
-from rr_actors.runtime.time_limits import deadline_of, left_until
+from rr_actors.runtime.time_limits import deadline_of
 from rr_actors.wire.segments import Segments
 from rr_actors.wire.thread_connections import BlockingLink
 from rr_actors.wire.transport import Link, Welcome
@@ -119,29 +119,18 @@ def test_a_message_that_the_kernel_has_no_room_for_is_given_up_in_time_however_s
     goes_on.set()
 
 
-def test_writing_and_waiting_have_one_time_limit(
-    peer: Peer, line: BlockingLink, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    deadlines: list[float] = []
-
-    def note(deadline: float) -> float | None:
-        deadlines.append(deadline)
-        return left_until(deadline)
-
+def test_writing_and_waiting_have_one_time_limit(peer: Peer, line: BlockingLink) -> None:
     def answer_late(link: Link, message: Note) -> None:
         time.sleep(0.2)  # so that the answer is waited for
         peer.echo(link, message)
 
     peer.answer = answer_late
-    monkeypatch.setattr(f"{BlockingLink.__module__}.left_until", note)
-    monkeypatch.setattr(f"{BlockingLink.__module__}.SPIN_LIMIT_S", 0.0)
     for limit_s in (20.0, None):
-        deadline = deadline_of(limit_s)
         peer.dispatcher.call(time.sleep, 0.2)  # it cannot all be written before
-        line.exchange(LONG, deadline)
-        assert len(deadlines) >= 2
-        assert set(deadlines) == {deadline}
-        deadlines.clear()
+        line.exchange(LONG, deadline_of(limit_s))
+    peer.dispatcher.call(time.sleep, 0.2)
+    with pytest.raises(TimeoutError):  # neither alone takes as long
+        line.exchange(LONG, deadline_of(0.3))
 
 
 def test_the_beginning_and_the_rest_of_an_answer_have_one_time_limit(peer: Peer, line: BlockingLink) -> None:
