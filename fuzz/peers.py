@@ -25,10 +25,10 @@ from rr_actors.registrar.registrar import Registrar
 from rr_actors.system.system import System
 from rr_actors.wire.transport import Hello, Welcome
 from rr_actors.wire.unix_link import UnixLink, Wire
-from rr_actors.wire.unix_sockets import Peer
+from rr_actors.wire.unix_sockets import SocketPeer
 
 _LIMIT_BYTES = 100_000
-_PEER = Peer(os.getpid(), os.getuid())
+_PEER = SocketPeer(os.getpid(), os.getuid())
 _WIRE = Wire(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
 _ROLES = 3
 """A consumer's link, a direct line of one of its threads, and a provider's link."""

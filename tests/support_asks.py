@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rr_actors.actors.refs import ActorRef, ref_to
-from rr_actors.actors.remote.peer import Call, Line
+from rr_actors.actors.remote.peer import Line, PendingCall
 from rr_actors.actors.remote.protocol import Answered, Ask, Letter
 from rr_actors.base import pickling
 from rr_actors.runtime.time_limits import left_until
@@ -27,7 +27,7 @@ class Puts:
         self.letters: list[Letter] = []
         put = Line.put
 
-        def note(line: Line, letter: Letter, call: Call | None = None) -> None:
+        def note(line: Line, letter: Letter, call: PendingCall | None = None) -> None:
             self.letters.append(letter)
             put(line, letter, call)
 

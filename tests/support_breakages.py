@@ -26,11 +26,11 @@ from rr_actors.managers.keeper import comparing
 from rr_actors.registrar.core import holding, notices, reconciliation, recovery, releasing, status_delivery, unloading
 from rr_actors.registrar.model.catalog import Decision, add, discard
 from rr_actors.registrar.model.commands import Reconcile, Register
-from rr_actors.registrar.model.effects import Reply
+from rr_actors.registrar.model.effects import SendReply
 from rr_actors.registrar.model.messages import Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Resource, ServedQuery
 from rr_actors.runtime.processes import lifeline
-from rr_actors.storage.journaled_store import Found, JournaledStore, Segment
+from rr_actors.storage.journaled_store import JournaledStore, JournalFiles, Segment
 from rr_actors.supervision.child_main import ChildProcess
 from rr_actors.supervision.child_runs import ProcessRun
 from rr_actors.supervision.core import restarts
@@ -118,14 +118,14 @@ def _not_read() -> None:
     def wrap(since: Any) -> Any:
         return lambda self, folded, owner, begun: since(self, folded, owner, begun)[:0]
 
-    override(Found, "since", wrap)
+    override(JournalFiles, "since", wrap)
 
 
 def _read_without_its_newest() -> None:
     def wrap(since: Any) -> Any:
         return lambda self, folded, owner, begun: since(self, folded, owner, begun)[:-3]
 
-    override(Found, "since", wrap)
+    override(JournalFiles, "since", wrap)
 
 
 # -- the commit ------------------------------------------------------------------------------------------------------
@@ -237,7 +237,7 @@ def _forgotten_without_its_callback() -> None:
         resource = decision.catalog.resources[query.resource_id]
         last = len(decision.catalog.holders[resource.id]) == 1
         unloading.drop_query(decision, query)
-        decision.cause(Reply(query.origin, Unloaded(query.id)))
+        decision.cause(SendReply(query.origin, Unloaded(query.id)))
         if last:
             decision.drop(resource)
 

@@ -39,7 +39,7 @@ from rr_actors.registrar.model.commands import (
     Revoke,
     SetPriority,
 )
-from rr_actors.registrar.model.effects import Request, UnloadResolved
+from rr_actors.registrar.model.effects import SendRequest, UnloadResolved
 from rr_actors.registrar.model.messages import FetchedQuery, Load, Loaded, Unload
 from rr_actors.registrar.model.rows import Change, Held, Hold, Notice, Phase, Put, Resource, is_own
 from simulation import sim_process, sim_registrar
@@ -509,28 +509,28 @@ def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
 def sends_over_the_next_link(patch: Patch) -> type[SimRegistrar]:
     """What was decided for a link goes over the one after it."""
 
-    def request(shell: SimShell, effect: Request) -> None:
+    def request(shell: SimShell, effect: SendRequest) -> None:
         peering = shell.clients.get(effect.registrar)
         if peering is None:
             shell.want(effect.registrar)
         else:
             shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
-    patch(sim_registrar, "ACT", {**sim_registrar.ACT, Request: request})
+    patch(sim_registrar, "ACT", {**sim_registrar.ACT, SendRequest: request})
     return SimRegistrar
 
 
 def sends_to_the_same_run(patch: Patch) -> type[SimRegistrar]:
     """What was decided for a link goes over any that leads to the same run of the provider."""
 
-    def request(shell: SimShell, effect: Request) -> None:
+    def request(shell: SimShell, effect: SendRequest) -> None:
         peering, up = shell.clients.get(effect.registrar), shell.catalog.up.get(effect.registrar, 0)
         if peering is None:
             shell.want(effect.registrar)
         elif shell.epochs.get(up) == shell.epochs[peering.number]:
             shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
-    patch(sim_registrar, "ACT", {**sim_registrar.ACT, Request: request})
+    patch(sim_registrar, "ACT", {**sim_registrar.ACT, SendRequest: request})
     return SimRegistrar
 
 

@@ -154,9 +154,9 @@ class Script:
         """Do one effect, or note that it was caused."""
         name = side.name
         match effect:
-            case e.Reply(origin, message):
+            case e.SendReply(origin, message):
                 self.send(name, origin, message, (origin, name))
-            case e.Request(registrar, message):
+            case e.SendRequest(registrar, message):
                 self.send(name, registrar, message, (name, registrar))
             case e.Connect(registrar):
                 self.connect(name, registrar)
@@ -185,7 +185,7 @@ class Script:
             case e.Hear(held, notice, repeated):
                 side.told[held.id] = notice
                 self.say(name, f"tells the listeners of {held.id}: {status_text(notice)}{' again' * repeated}")
-            case e.Answer(ticket, failure):
+            case e.AnswerCall(ticket, failure):
                 self.say(name, f"returns from {ticket}: {end_text(failure)}")
             case e.Happened():
                 pass
@@ -326,7 +326,7 @@ def _loads(
     script.asked += 1
     number = script.side(name).catalog.since + script.asked
     given = (int(priority or 0), priority is not None)
-    script.post(name, c.Ask(query, provider, server, request.encode(), parent or "", number, *given))
+    script.post(name, c.AskProvider(query, provider, server, request.encode(), parent or "", number, *given))
 
 
 def _gives(script: Script, name: str, id: str, priority: str) -> None:
@@ -337,7 +337,7 @@ def _gives(script: Script, name: str, id: str, priority: str) -> None:
 def _loads_directly(script: Script, name: str, query: str, provider: str, server: str, request: str) -> None:
     script.asked += 1
     catalog = script.side(name).catalog
-    asked = pending(c.Ask(query, provider, server, request.encode(), "", catalog.since + script.asked))
+    asked = pending(c.AskProvider(query, provider, server, request.encode(), "", catalog.since + script.asked))
     catalog.in_flight[query] = asked
     load = m.Load(query, server, asked.request, name, "", 0, asked.seq)
     script.waiting.append((provider, (load, name)))

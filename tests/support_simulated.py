@@ -10,11 +10,11 @@ from rr_actors.supervision.core import child_calls, restarts
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.supervision.core.state import (
     Action,
+    CallReply,
     Decision,
     Exit,
     ExitSupervisor,
     Mode,
-    Reply,
     Report,
     StartChild,
     StopChild,
@@ -42,7 +42,7 @@ class World:
         self.stops: dict[str, StopChild] = {}
         self.up: dict[str, int] = {}
         self.outcomes: dict[str, deque[Outcome]] = defaultdict(deque)
-        self.replies: dict[Hashable, Reply] = {}
+        self.replies: dict[Hashable, CallReply] = {}
         self.reports: list[Report] = []
         self.started = False
         self.ended: ExitSupervisor | None = None
@@ -56,7 +56,7 @@ class World:
             self._act(action)
 
     def _act(self, action: Action) -> None:
-        assert self.ended is None or isinstance(action, Reply), f"{action} after the supervisor's end"
+        assert self.ended is None or isinstance(action, CallReply), f"{action} after the supervisor's end"
         match action:
             case StartChild(id=id, run=run):
                 assert id not in self.up, f"{id} started while it is up"
@@ -69,7 +69,7 @@ class World:
                 assert id in self.starts or self.up.get(id) == run, f"{id} stopped while it is down"
                 self.stops[id] = action
                 self.log.append(f"stop {id}")
-            case Reply(caller=caller):
+            case CallReply(caller=caller):
                 assert caller not in self.replies, f"caller {caller} answered twice"
                 self.replies[caller] = action
             case Report(id=id):

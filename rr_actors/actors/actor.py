@@ -24,7 +24,16 @@ from rr_actors.actors.messaging import dead_letters, death_watch, exit_reports
 from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity
 from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.actors.messaging.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
+from rr_actors.actors.messaging.mailbox import (
+    DownNotice,
+    Ended,
+    Envelope,
+    Mailbox,
+    Packed,
+    StopActor,
+    is_stop,
+    refuse_all,
+)
 from rr_actors.actors.monitors import Monitor, begin, take
 from rr_actors.actors.refs import ActorRef
 from rr_actors.actors.remote.hub import running, urn_of_path
@@ -187,14 +196,14 @@ class BaseActor(pykka.Actor):
             ref: a reference or proxy, or a SupervisorRef, to an actor in any process of the system.
         """
         mailbox = self._mailbox  # not self: a monitor does not keep its actor
-        made = Monitor(ref, lambda monitor, down: mailbox.put(Notice(down, monitor)), self._monitors.discard)
+        made = Monitor(ref, lambda monitor, down: mailbox.put(DownNotice(down, monitor)), self._monitors.discard)
         self._monitors.add(made)  # first: its Down removes it
         begin(made)
         return made
 
     def stop(self, reason: Literal["normal", "shutdown"] = "normal") -> None:
         """Stop this actor when it has handled the waiting messages; with "shutdown", before it handles them."""
-        self._mailbox.put(Envelope(Stop(reason)))
+        self._mailbox.put(Envelope(StopActor(reason)))
 
     # -- hooks for hosts: a subclass overrides them to do more than the user's on_start and on_stop --------------------
 
@@ -314,7 +323,7 @@ class BaseActor(pykka.Actor):
 
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
-        if isinstance(envelope, Notice):
+        if isinstance(envelope, DownNotice):
             monitor = cast("Monitor", envelope.claim)
             self._monitors.discard(monitor)
             if take(monitor) is None:

@@ -26,24 +26,24 @@ RETRY_S = 0.1
 """How long a life that can go on waits if the machine gives no thread for it."""
 
 
-class Request(msgspec.Struct, frozen=True, eq=False):
+class DriverRequest(msgspec.Struct, frozen=True, eq=False):
     """A request that a life awaits from its driver."""
 
-    def __await__(self) -> Generator[Request, Any, Any]:
+    def __await__(self) -> Generator[DriverRequest, Any, Any]:
         return (yield self)
 
 
-class Await(Request, frozen=True, eq=False):
+class Await(DriverRequest, frozen=True, eq=False):
     """The request to run a coroutine: on the framework's loop for hooks and LoopActors, else on the users' loop."""
 
     coroutine: Coroutine[Any, Any, Any]
     on_loop: bool = False
 
 
-REST = Request()
+REST = DriverRequest()
 """The request to rest until the next message comes."""
 
-PAUSE = Request()
+PAUSE = DriverRequest()
 """The request to let other callbacks run on the loop. In worker threads it has no effect."""
 
 
@@ -60,7 +60,13 @@ class Driver:
     """
 
     def __init__(
-        self, dispatcher: Dispatcher, life: Coroutine[Request, Any, None], mailbox: Mailbox, name: str, *, on_loop: bool
+        self,
+        dispatcher: Dispatcher,
+        life: Coroutine[DriverRequest, Any, None],
+        mailbox: Mailbox,
+        name: str,
+        *,
+        on_loop: bool,
     ) -> None:
         self._dispatcher = dispatcher
         self._life = life

@@ -13,7 +13,7 @@ from pykka import ActorDeadError
 from rr_actors.actors.messaging import ask_cycles, dead_letters
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import ExcInfo, Reply, StopReply, error_of
-from rr_actors.actors.messaging.mailbox import Ended, Envelope, Stop, has_ended, is_stop, put
+from rr_actors.actors.messaging.mailbox import Ended, Envelope, StopActor, has_ended, is_stop, put
 from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.remote.peer import Line, Whereabouts
 from rr_actors.actors.remote.proxy import Attributes, DistantInbox, DistantProxy, Mirror, attributes_of, local_proxy
@@ -207,7 +207,7 @@ class ActorRef(pykka.ActorRef[A]):
             _note_dead(self, message, error)
 
     def _stop(self, reply: StopReply, reason: StopReason, *, final: bool) -> None:
-        self._send(Stop(reason, final=final), reply, ())
+        self._send(StopActor(reason, final=final), reply, ())
 
     def __str__(self) -> str:
         return self._target.name

@@ -66,7 +66,7 @@ class RrError(Exception):
         return (_rebuild, (type(self), self.message, self.details))
 
 
-class Described(Exception):
+class DescribedError(Exception):
     """An error of a user's class, with its text and its trace, which were made where they may take long.
 
     Attributes:
@@ -85,7 +85,7 @@ def text_of(error: BaseException) -> str:
 
     It is the class alone if the error's own str() raises.
     """
-    if is_a(error, Described):
+    if is_a(error, DescribedError):
         return error.text
     name = name_of_class(type(error))
     try:

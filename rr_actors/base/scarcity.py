@@ -9,7 +9,7 @@ import errno
 from collections.abc import Iterator
 from typing import cast
 
-from rr_actors.base.errors import CatalogLocked, Described, RrError
+from rr_actors.base.errors import CatalogLocked, DescribedError, RrError
 
 _WANTED = {
     errno.EMFILE: "EMFILE: the process has as many descriptors open as it may (ulimit -n)",
@@ -54,7 +54,7 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
         if found is None or id(found) in seen:
             continue
         seen.add(id(found))
-        if isinstance(found, Described):
+        if isinstance(found, DescribedError):
             rest.append(found.error)
             continue
         yield found

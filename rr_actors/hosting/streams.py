@@ -284,7 +284,7 @@ class Shared(Protocol):
     def take_back(self, holder: object) -> None: ...
 
 
-class Consumer:
+class KnownReader:
     """A reader, as its publisher knows it: what it is sent, and when, and how long what it has is in use.
 
     Args:
@@ -441,7 +441,7 @@ class Publisher:
         self._limit_bytes = segments.limit_bytes
         self._parcels = segments.parcels(os.getpid())
         self._changed = threading.Condition()  # a consumer has come, gone, or wants a frame
-        self._consumers: dict[int, Consumer] = {}
+        self._consumers: dict[int, KnownReader] = {}
         self._meter = _Meter()
         self._tell: Callable[[StreamNews], None] | None = None  # when readers are let in
         self._closed = False
@@ -478,7 +478,7 @@ class Publisher:
         info = StreamInfo(*place, rate_hz, bytes_per_s, len(readers), missed, age_s)
         return StreamRow(info, request, frames, readers)
 
-    def _readers(self) -> list[Consumer]:
+    def _readers(self) -> list[KnownReader]:
         return [reader for reader in list(self._consumers.values()) if reader.keep is not None and not reader.left]
 
     def publish(self, value: object, *, timeout_s: float | None = None) -> int:
@@ -529,7 +529,7 @@ class Publisher:
         self._publish(self._readers(), value, parcel, None)
 
     def _publish(
-        self, readers: list[Consumer], packed: bytes | pickling.Large, body: bytes | Parcel, deadline: float | None
+        self, readers: list[KnownReader], packed: bytes | pickling.Large, body: bytes | Parcel, deadline: float | None
     ) -> int:
         with self._changed:
             if self._closed:
@@ -562,7 +562,7 @@ class Publisher:
         except (MailboxFull, Unavailable):
             return b""
 
-    def _wait_for(self, behind: list[Consumer], number: int, deadline: float | None) -> list[Consumer]:
+    def _wait_for(self, behind: list[KnownReader], number: int, deadline: float | None) -> list[KnownReader]:
         """Wait for readers of all frames; return those that can take this one, or none at the end of the wait."""
         with self._changed:
             while not self._closed:
@@ -606,7 +606,7 @@ class Publisher:
                 connected, _ = self._listener.accept()
             try:
                 connected.setblocking(False)
-                consumer = Consumer(connected, _pid_of(connected), self._parcels, self._ready, self._rebound)
+                consumer = KnownReader(connected, _pid_of(connected), self._parcels, self._ready, self._rebound)
             except OSError:
                 connected.close()
                 raise

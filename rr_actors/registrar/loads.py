@@ -360,11 +360,11 @@ class Loads:
             loading.hearing = hearing
             self.actor.listeners.add(query.id, hearing.progressed)
         facts = query.id, query.registrar, query.server, request, query.parent, next(self.actor.sequence)
-        ask = c.Ask(*facts, _rank(options), options.own)
+        ask = c.AskProvider(*facts, _rank(options), options.own)
         self.calls.dispatcher.call(loading.begin, self._ask, loading, ask)
         return loading
 
-    def _ask(self, loading: Loading, ask: c.Ask) -> None:
+    def _ask(self, loading: Loading, ask: c.AskProvider) -> None:
         self.views.add(loading.query)
         self.actor.ask(ask, loading.ended)
 

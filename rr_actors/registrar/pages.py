@@ -59,7 +59,7 @@ def priority_text(priority: int | None) -> str:
     return "standby" if priority is None else str(priority)
 
 
-class Holder(msgspec.Struct, frozen=True, omit_defaults=True):
+class HolderRow(msgspec.Struct, frozen=True, omit_defaults=True):
     """A query on a resource, with its holder, and the holder's resource that depends on it; "" for none.
 
     `unheard`: how many statuses the holder has not dealt with. `priority`: None for standby.
@@ -95,7 +95,7 @@ class ResourceRow(msgspec.Struct, frozen=True):
     state: str
     message: str
     attempt: int
-    holders: list[Holder]
+    holders: list[HolderRow]
     holder_count: int
     parts: list[str]
     part_count: int
@@ -387,12 +387,12 @@ def _with_part(text: str, ids: Iterable[str]) -> list[str]:
 
 
 def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[ResourceRow]:
-    def around(catalog: Catalog, resource: Resource) -> tuple[list[Holder], int, list[str], int, int | None, bool]:
+    def around(catalog: Catalog, resource: Resource) -> tuple[list[HolderRow], int, list[str], int, int | None, bool]:
         queries, parts = catalog.holders.get(resource.id, ()), catalog.parts_of(resource.id)
         first = [catalog.queries[id] for id in itertools.islice(queries, HOLDERS_SHOWN)]
         unheard = [len(catalog.notices_on.get(query.id, ())) for query in first]
         holders = [
-            Holder(query.id, query.origin, query.parent, n, priority_of(query.priority))
+            HolderRow(query.id, query.origin, query.parent, n, priority_of(query.priority))
             for query, n in zip(first, unheard, strict=True)
         ]
         priority = priority_of(catalog.priority_of(resource.id))

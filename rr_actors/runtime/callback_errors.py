@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from rr_actors.base.errors import Described, Unavailable, UsageError, name_of_class, text_of
+from rr_actors.base.errors import DescribedError, Unavailable, UsageError, name_of_class, text_of
 from rr_actors.base.reporting import tracebacks
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import trace_of
@@ -33,7 +33,7 @@ def _nothing_more(_error: BaseException) -> None:
     return None
 
 
-class Raised(Described):
+class Raised(DescribedError):
     """A callback raised.
 
     Attributes:

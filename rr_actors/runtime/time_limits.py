@@ -114,7 +114,7 @@ _FEW = 8  # probes that begin together, without being spread
 _SOON_S = 0.005
 
 
-class Probe(msgspec.Struct, eq=False):
+class TimedRun(msgspec.Struct, eq=False):
     """One run of a callback.
 
     Attributes:
@@ -152,7 +152,7 @@ class Probes:
         self._loop = loop
         self._every_s, self._timeout_s = every_s, timeout_s
         self._keys, self._start, self._late = keys, start, late
-        self._running: dict[str, Probe] = {}
+        self._running: dict[str, TimedRun] = {}
         self._left: deque[str] = deque()
         self._size = 0  # keys of this round
         self._round_began = -math.inf
@@ -227,7 +227,7 @@ class Probes:
             for key in set(keys) - set(free):
                 self._still_late(key, self._running[key], now)
         if free:
-            self._running.update((key, Probe()) for key in free)
+            self._running.update((key, TimedRun()) for key in free)
             self._start(free)
 
     def _end_late(self, now: float) -> None:
@@ -237,7 +237,7 @@ class Probes:
                 self._late(key)
                 _go_on(probe)
 
-    def _still_late(self, key: str, probe: Probe, now: float) -> None:
+    def _still_late(self, key: str, probe: TimedRun, now: float) -> None:
         if probe.late_at is not None and now - probe.late_at >= self._every_s / 2:  # else this round has counted it
             probe.late_at = now
             self._late(key)
@@ -248,7 +248,7 @@ class Probes:
         return min(round_at, min(limits, default=math.inf) + self._timeout_s)
 
 
-def _go_on(probe: Probe) -> None:
+def _go_on(probe: TimedRun) -> None:
     actions, probe.after = probe.after, []
     for action in actions:
         action()

@@ -217,7 +217,7 @@ _LONGEST = 10**9 - 1000  # bytes: about the longest row that SQLite takes
 _encode = msgspec.msgpack.Encoder().encode
 
 
-class Place(NamedTuple):
+class RecordEnd(NamedTuple):
     """The end of a file or of a record in it: the byte after it, and its checksum."""
 
     at: int
@@ -232,7 +232,7 @@ def record(body: bytes, before: int) -> tuple[bytes, int]:
     return _RECORD.pack(length, first, checksum) + body, checksum
 
 
-def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
+def records(data: bytes, begin: RecordEnd) -> Iterator[tuple[bytes, RecordEnd]]:
     """Yield the records after `begin`, each with its end, up to the first damaged or unfinished one."""
     at, checksum = begin
     while at + _RECORD.size <= len(data):
@@ -242,10 +242,10 @@ def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
         if not length or first != checksum ^ length or len(body) < length or zlib.crc32(body, first) != expected:
             return
         at, checksum = start + length, expected
-        yield body, Place(at, checksum)
+        yield body, RecordEnd(at, checksum)
 
 
-def is_torn(data: bytes, end: Place) -> bool:
+def is_torn(data: bytes, end: RecordEnd) -> bool:
     """Return whether the bytes after the last good record can be the beginning of an unfinished record."""
     left = len(data) - end.at
     if left < _RECORD.size:
@@ -342,7 +342,7 @@ class Segment:
             self._file.close()
 
 
-class Found(msgspec.Struct, frozen=True):
+class JournalFiles(msgspec.Struct, frozen=True):
     """The files of a catalog's journal. `contents`: each segment's bytes by its number, None if it is only begun."""
 
     catalog: Path
@@ -413,7 +413,7 @@ class Found(msgspec.Struct, frozen=True):
         return changes
 
 
-def _tell_of_rest(catalog: Path, name: str, data: bytes, end: Place) -> None:
+def _tell_of_rest(catalog: Path, name: str, data: bytes, end: RecordEnd) -> None:
     left = len(data) - end.at
     if is_torn(data, end):
         text = (
@@ -428,12 +428,12 @@ def _tell_of_rest(catalog: Path, name: str, data: bytes, end: Place) -> None:
     _log.warning("%s: %s: %s", catalog, name, text)
 
 
-def read(folder: Folder, catalog: Path) -> Found:
+def read(folder: Folder, catalog: Path) -> JournalFiles:
     """Read the files of this catalog's journal; a segment that is removed during this is folded, and left out.
 
     Raise Damage for a file that has a segment's name and is none.
     """
-    found = Found(catalog, [], {})
+    found = JournalFiles(catalog, [], {})
     for name in segments_among(folder.names(), catalog):
         try:
             data = folder.read(name)
@@ -483,10 +483,10 @@ def _checked(name: str, number: int, data: bytes) -> bytes | None:
     return data
 
 
-def _read_records(data: bytes, changes: list[Change]) -> tuple[End, Place]:
+def _read_records(data: bytes, changes: list[Change]) -> tuple[End, RecordEnd]:
     """Add the changes of a segment's whole records to `changes`; return the end and the place of the last."""
     checksum: int = _CHECKSUM.unpack_from(data, _HEADER.size - _CHECKSUM.size)[0]
-    end = Place(_HEADER.size, checksum)
+    end = RecordEnd(_HEADER.size, checksum)
     count = 0
     for body, after in records(data, end):
         changes += _decoded(body)

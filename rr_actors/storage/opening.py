@@ -27,7 +27,7 @@ from rr_actors.storage import journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.damage import Damage, damaged, errors_named
 from rr_actors.storage.journaled_store import JournaledStore
-from rr_actors.storage.witness import Known, Witness, is_missing, missing_text
+from rr_actors.storage.witness import LastOpening, Witness, is_missing, missing_text
 
 Durability = Literal["process", "power"]
 
@@ -331,7 +331,7 @@ def _read(
     return meta, content, _Left(found.segments, last, epoch, changes)
 
 
-def _compare(path: Path, meta: sql_tables.Meta, known: Known, registrar: str) -> None:
+def _compare(path: Path, meta: sql_tables.Meta, known: LastOpening, registrar: str) -> None:
     """Compare the catalog with its last known opening, and warn of differences."""
     if not meta.id:
         _log.warning("%s", missing_text(registrar, known))

@@ -28,7 +28,7 @@ from rr_actors.registrar.model.rows import Change, Content, content_of
 from rr_actors.storage import sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.damage import Damage, damaged, errors_named
-from rr_actors.storage.witness import Known, Witness, segment_prefix
+from rr_actors.storage.witness import LastOpening, Witness, segment_prefix
 
 APPLICATION_ID = 0x52524143  # "RRAC"
 
@@ -143,7 +143,7 @@ class SqliteStore:
     def note_outside(self) -> None:
         """Record outside of its directory that the catalog has something, so that it is missed if it is removed."""
         if self._witness is not None:
-            known = Known(self.meta.id, self.epoch, str(self.path))
+            known = LastOpening(self.meta.id, self.epoch, str(self.path))
             self._witness.note(known, synced=self._durability == "power")
 
     def forget_outside(self) -> None:

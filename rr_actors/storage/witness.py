@@ -28,7 +28,7 @@ _EPOCHS = ".epochs"  # nor that
 _log = Log(__name__)
 
 
-class Known(msgspec.Struct, frozen=True):
+class LastOpening(msgspec.Struct, frozen=True):
     """A catalog at its last opening."""
 
     id: str
@@ -50,13 +50,13 @@ class Witness:
         self.formerly = formerly
         self.state_dir = Path(state_dir)
 
-    def known(self) -> Known | None:
+    def known(self) -> LastOpening | None:
         """Return the catalog at its last opening; None if there was none, or the record cannot be read."""
         with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
             return _read(place, self.registrar)
         return None
 
-    def note(self, known: Known, *, synced: bool = False) -> None:
+    def note(self, known: LastOpening, *, synced: bool = False) -> None:
         """Record that the catalog was opened. `synced`: a power cut neither loses the record nor damages it."""
         body = msgspec.json.encode(known)
         with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
@@ -64,7 +64,7 @@ class Witness:
             if synced:
                 os.fsync(state.fd)
 
-    def known_or_spent(self) -> tuple[Known | None, int]:
+    def known_or_spent(self) -> tuple[LastOpening | None, int]:
         """Return what known() does; and if it has no epoch, the highest of all catalogs here that were erased."""
         with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
             known = _read(place, self.registrar)
@@ -121,7 +121,7 @@ def is_missing(path: Path) -> bool:
     return not (os.path.exists(path) or os.path.exists(path.with_name(f"{segment_prefix(path)}1")))
 
 
-def missing_text(registrar: str, known: Known) -> str:
+def missing_text(registrar: str, known: LastOpening) -> str:
     """Return the warning about a catalog that is missing."""
     return (
         f"{registrar}: expected its catalog {known.path} (opened {known.epoch} times), got none: it was removed. What"
@@ -143,7 +143,7 @@ def _number_in(file: io.FileIO) -> int:
     return int(text) if text.isdigit() else 0
 
 
-def _read(place: Folder, name: str) -> Known | None:
+def _read(place: Folder, name: str) -> LastOpening | None:
     try:
         checksum, _, body = place.read(name).partition(b" ")
     except FileNotFoundError:
@@ -152,4 +152,4 @@ def _read(place: Folder, name: str) -> Known | None:
     if checksum != b"%08x" % zlib.crc32(body):
         _log.warning("%s: damaged, and not used; it is written anew when the catalog is opened", place.path / name)
         return None
-    return msgspec.json.decode(body, type=Known)
+    return msgspec.json.decode(body, type=LastOpening)

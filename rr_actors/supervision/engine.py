@@ -27,12 +27,12 @@ from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.supervision.core.state import (
     Action,
+    CallReply,
+    ChildPhase,
     Decision,
     Exit,
     ExitSupervisor,
     Mode,
-    Phase,
-    Reply,
     Report,
     StartChild,
     StopChild,
@@ -169,7 +169,7 @@ class Supervision:
                 self._record(action)
                 if action.state is None:
                     self._specs.pop(action.id, None)
-            case Reply():
+            case CallReply():
                 action.caller(action)  # pyright: ignore[reportCallIssue]  # callers are functions here
             case SupervisorStarted():
                 self._on_started()
@@ -220,7 +220,7 @@ class Supervision:
 
     def _lay_out_next(self) -> None:
         """Make the processes of the next children while others start, and discard processes that are not needed now."""
-        due = Children.of(self.tree.children).first(LAID_OUT, Phase.DUE)
+        due = Children.of(self.tree.children).first(LAID_OUT, ChildPhase.DUE)
         for child in due:
             spec = child.start_spec
             if spec.placement == "process" and child.id not in self._laid_out:
@@ -257,7 +257,7 @@ class Supervision:
     def _is_final(self, id: str) -> bool:
         """Return whether a child that is being stopped will not be started again."""
         child = self.tree.children.get(id)
-        forgotten = child is None or (child.phase is Phase.STOPPING and child.spec.restart == "temporary")
+        forgotten = child is None or (child.phase is ChildPhase.STOPPING and child.spec.restart == "temporary")
         return forgotten or self.tree.dynamic or self._ends_with_supervisor(id)
 
     def _ends_with_supervisor(self, id: str) -> bool:

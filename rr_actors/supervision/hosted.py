@@ -72,7 +72,7 @@ BRUTAL_GRACE_S = 0.1
 """The time limit of "brutal_kill" for an actor in this process, which cannot be killed, only asked and abandoned."""
 
 
-class Place:
+class ActorPlace:
     """The place of an actor in a process, given to its hook _before_start.
 
     Attributes:
@@ -104,7 +104,7 @@ class Hosted(abc.ABC):
         self._cls = cls
         self._on_exit = on_exit
         self._once = once
-        self._place = Place(node, path)
+        self._place = ActorPlace(node, path)
         self._starting: asyncio.Future[Any] | None = None
         self._started: asyncio.Future[None] = loop.create_future()  # start() has returned or raised
         self._ended: asyncio.Future[ExitReport] = loop.create_future()

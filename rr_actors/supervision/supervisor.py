@@ -41,11 +41,11 @@ from rr_actors.supervision.core import child_calls
 from rr_actors.supervision.core.child_calls import Counts
 from rr_actors.supervision.core.rendering import describe_settings
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, count_processes
-from rr_actors.supervision.core.state import ChildState, Decision, ExitSupervisor, Reply
+from rr_actors.supervision.core.state import CallReply, ChildState, Decision, ExitSupervisor
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
 from rr_actors.supervision.event_history import Records
-from rr_actors.supervision.hosted import Place, check_hostable
+from rr_actors.supervision.hosted import ActorPlace, check_hostable
 from rr_actors.supervision.import_guard import check_children_can_import
 from rr_actors.wire.name_service import Directory, Presence, actor_key
 
@@ -72,7 +72,7 @@ class Child(NamedTuple):
     pid: int | None
 
 
-Answer = Callable[[Reply], None]
+Answer = Callable[[CallReply], None]
 """The `caller` of the core's decisions: a function that is called with the Reply."""
 
 
@@ -89,7 +89,7 @@ class SupervisorActor(LoopActor):
         self._all_up: asyncio.Future[None]
         self._all_down: asyncio.Future[ExitSupervisor]
 
-    async def _before_start(self, place: Place) -> None:
+    async def _before_start(self, place: ActorPlace) -> None:
         loop = asyncio.get_running_loop()
         self._all_up, self._all_down = loop.create_future(), loop.create_future()
         self._supervision = Supervision(
@@ -173,7 +173,7 @@ class SupervisorActor(LoopActor):
                 raise UsageError(f"supervisor {supervision.path}: expected a supervisor's call, got {shown(message)}")
 
     def _change(self, change: child_calls.Change, reply: pykka.Future[Any] | None) -> None:
-        def answer(outcome: Reply) -> None:
+        def answer(outcome: CallReply) -> None:
             if reply is None:
                 return
             if outcome.error is not None:

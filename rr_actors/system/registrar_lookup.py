@@ -35,7 +35,7 @@ from rr_actors.registrar.model.rows import (
 from rr_actors.registrar.registrar import Registrar, registrar_of
 from rr_actors.registrar.remote_registrar import RegistrarHandle
 from rr_actors.storage.opening import is_there, move_catalog, read_rows, remove_unneeded
-from rr_actors.storage.witness import Known, Witness, tell_of_missing
+from rr_actors.storage.witness import LastOpening, Witness, tell_of_missing
 from rr_actors.supervision.given_up import change, contents, give_up
 from rr_actors.wire.name_service import Presence
 
@@ -172,7 +172,7 @@ def _take_over(config: SystemConfig, state_dir: Path, name: str, old: str) -> No
     if theirs.known() is None:
         if not is_there(before):
             return
-        theirs.note(Known("", 0, str(before)))  # without a file it has none, and the next start goes on by that
+        theirs.note(LastOpening("", 0, str(before)))  # without a file it has none, and the next start goes on by that
     if before.parent != after.parent and is_there(before):
         remove_unneeded(after, Witness(state_dir, name))
         move_catalog(before, after)

@@ -10,7 +10,7 @@ from rr_actors.base.errors import UnknownQuery, UsageError, few, shown
 from rr_actors.base.names import short_id, short_ids
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
-from rr_actors.registrar.pages import Holder, LoadRow, QueryRow, ResourceRow
+from rr_actors.registrar.pages import HolderRow, LoadRow, QueryRow, ResourceRow
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Found
 from rr_actors.system.console.console_questions import Find
@@ -199,7 +199,7 @@ def _phase(resource: ResourceRow) -> str:
             return f"is loaded{_since(resource.id)}, and {resource.state}."
 
 
-def _of_holder(client: ConsoleClient, holder: Holder, indent: str, below: set[str]) -> Iterator[str]:
+def _of_holder(client: ConsoleClient, holder: HolderRow, indent: str, below: set[str]) -> Iterator[str]:
     """Say that a holder holds the resource; if that is for another resource, say who holds the other one."""
     if holder.unheard:
         yield f"{indent}{holder.origin} has not dealt with {holder.unheard} of its statuses."

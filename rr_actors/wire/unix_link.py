@@ -17,7 +17,7 @@ from rr_actors.base.errors import MailboxFull, NotSerializable, Unavailable
 from rr_actors.base.reporting.log import Log
 from rr_actors.wire.frames import GOODBYE, FrameReader, framed
 from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
-from rr_actors.wire.unix_sockets import Peer
+from rr_actors.wire.unix_sockets import SocketPeer
 
 _log = Log(__name__)
 
@@ -47,7 +47,7 @@ class UnixLink(asyncio.Protocol):
         wire: Wire,
         hello: Hello,
         welcome: Welcome,
-        peer: Peer,
+        peer: SocketPeer,
         name: str,
         start: bytes = b"",
     ) -> None:

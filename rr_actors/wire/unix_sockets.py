@@ -52,7 +52,7 @@ def _is_there(pid: int) -> bool:
     return True
 
 
-class Peer(msgspec.Struct, frozen=True):
+class SocketPeer(msgspec.Struct, frozen=True):
     """The process and user at the other end, as the kernel names them."""
 
     pid: int  # 0: the process runs in another container and has no id in this one
@@ -71,16 +71,16 @@ class Peer(msgspec.Struct, frozen=True):
         return f"pid {self.pid}" if self.pid else "unknown process"
 
 
-def peer_of(transport: asyncio.BaseTransport) -> Peer:
+def peer_of(transport: asyncio.BaseTransport) -> SocketPeer:
     """Return the process and user at the other end of a connection."""
     return peer_at(transport.get_extra_info("socket"))
 
 
-def peer_at(connected: socket.socket) -> Peer:
+def peer_at(connected: socket.socket) -> SocketPeer:
     """Return the process and user at the socket's other end."""
     raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     pid, uid, _ = _CREDENTIALS.unpack(raw)
-    return Peer(pid, uid)
+    return SocketPeer(pid, uid)
 
 
 REFUSALS_S = 10.0

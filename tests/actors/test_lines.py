@@ -17,8 +17,8 @@ import pytest
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.actors.remote import peer
-from rr_actors.actors.remote.peer import Call, Line, Whereabouts
-from rr_actors.actors.remote.protocol import ASKS, Answered, Ask, Dead, Over, Raised, Tell, Watching
+from rr_actors.actors.remote.peer import Line, PendingCall, Whereabouts
+from rr_actors.actors.remote.protocol import ASKS, Answered, Ask, Dead, HandlerRaised, Over, Tell, Watching
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
@@ -98,7 +98,7 @@ class Bench:
         reply: Reply[Any] = Reply()
         number = self.line.next_number()
         self.last = number
-        self.line.put(Ask(number, URN, b"", ()), Call(number, reply, WHERE))
+        self.line.put(Ask(number, URN, b"", ()), PendingCall(number, reply, WHERE))
         self.turn()
         return reply
 
@@ -195,12 +195,12 @@ def test_after_a_tell_it_goes_by_the_link_until_one_that_came_later_is_answered(
     assert bench.ask() is not None
 
 
-@pytest.mark.parametrize("kind", [Answered, Raised, Dead, Over])
+@pytest.mark.parametrize("kind", [Answered, HandlerRaised, Dead, Over])
 def test_each_answer_to_the_last_letter_settles_and_a_watching_does_not(bench: Bench, kind: type[Any]) -> None:
     bench.put_ask()
     bench.hear(Watching(bench.last))
     assert bench.ask() is None
-    rest: dict[Any, tuple[Any, ...]] = {Answered: (b"",), Raised: (b"", "", ""), Dead: (), Over: ("normal", "")}
+    rest: dict[Any, tuple[Any, ...]] = {Answered: (b"",), HandlerRaised: (b"", "", ""), Dead: (), Over: ("normal", "")}
     bench.hear(kind(bench.last, *rest[kind]))
     assert bench.ask() is not None
 
@@ -351,7 +351,9 @@ def test_what_is_left_when_the_loop_has_ended_is_closed(bench: Bench) -> None:
 # -- answers -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrong", [Answered(0, b""), Raised(0, b"", "", ""), Dead(0), Over(1, "", ""), Tell(URN, b"")])
+@pytest.mark.parametrize(
+    "wrong", [Answered(0, b""), HandlerRaised(0, b"", "", ""), Dead(0), Over(1, "", ""), Tell(URN, b"")]
+)
 def test_what_is_not_the_answer_to_this_question_reaches_nobody(bench: Bench, wrong: Any) -> None:
     bench.transport.exchange = lambda _letter, _limit: wrong
     with pytest.raises(ConnectionResetError, match="instead of the answer"):

@@ -10,7 +10,7 @@ import pytest
 from pykka import ActorDeadError
 
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Stop, refuse_all
+from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, StopActor, refuse_all
 from rr_actors.base.errors import MailboxFull, Unavailable
 
 FULL = MailboxFull("no thread", name="workers", limit=1)
@@ -58,7 +58,7 @@ def test_the_actor_is_scheduled_by_the_first_message_and_not_again_until_it_rest
     assert schedule.urgent == [False]
     assert drained(mailbox) == [1, 2]
     assert mailbox.rest()
-    mailbox.put(Envelope(Stop()))
+    mailbox.put(Envelope(StopActor()))
     assert schedule.urgent == [False, True]
 
 
@@ -90,7 +90,7 @@ def test_a_message_for_which_there_is_no_thread_is_refused_and_the_next_schedule
     assert drained(mailbox) == ["next"]
 
 
-@pytest.mark.parametrize("late", [Envelope("late"), Envelope(Stop("shutdown"))])
+@pytest.mark.parametrize("late", [Envelope("late"), Envelope(StopActor("shutdown"))])
 def test_others_that_came_while_one_was_refused_are_handled(late: Envelope) -> None:
     def overtake() -> None:
         mailbox.put(late)

@@ -42,6 +42,8 @@ ROOMS = (
     ("testing",),
 )
 TYPED_ROOMS = ("registrar", "hosting", "system", "supervision", "actors")
+MACHINERY = ("base", "runtime", "wire", "actors", "hosting", "registrar", "storage", "supervision")
+"""The rooms of which the others are made. The managers, the tools and the console have words of their own."""
 HUB_WORDS = ("registrar", "provider", "node", "state", "resource", "actor")
 
 
@@ -110,9 +112,11 @@ def imports_up() -> list[str]:
     return sorted(set(found))
 
 
-def shared_class_names() -> dict[str, int]:
-    """The names that two or more classes of the package have, and how many."""
-    counted = Counter(node.name for _, tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+def shared_class_names(*rooms: str) -> dict[str, int]:
+    """The names that two or more classes of these rooms have, or of the package, and how many."""
+    below = [f"{PACKAGE}/{room}" for room in rooms] or [PACKAGE]
+    nodes = (node for folder in below for _, tree in trees(folder) for node in ast.walk(tree))
+    counted = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
     return {name: count for name, count in sorted(counted.items()) if count > 1 and not name.startswith("_")}
 
 
@@ -208,6 +212,7 @@ def main() -> None:
         ("hubs typed Any", len(untyped_hubs()), "0"),
         ("imports up", len(imports_up()), "0"),
         ("public class names used twice", len(shared_class_names()), ""),
+        ("  of those, within the machinery", len(shared_class_names(*MACHINERY)), "0"),
         ("lines of tests with a private attribute", len(private_uses()), "0"),
         ("files of a first load, both processes", len(passed("load")), "24"),
         ("files that call the monitor on it", len(monitor_entries("load")), "3"),

@@ -18,7 +18,7 @@ from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.engine.monitor import RegistrarMonitor
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
-from rr_actors.registrar.model.effects import Answer
+from rr_actors.registrar.model.effects import AnswerCall
 from rr_actors.registrar.model.rows import Phase, Resource, ServedQuery
 from rr_actors.storage.opening import read_rows
 from support import LIMIT_S, Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
@@ -402,7 +402,7 @@ def answered(monkeypatch: pytest.MonkeyPatch) -> Calls:
     calls = Calls()
     answer_here = RegistrarMonitor.answer_here
 
-    def noted(monitor: RegistrarMonitor, command: Callable[[object], c.Command]) -> Answer | None:
+    def noted(monitor: RegistrarMonitor, command: Callable[[object], c.Command]) -> AnswerCall | None:
         answer = answer_here(monitor, command)
         calls(answer is not None)
         return answer

@@ -66,7 +66,7 @@ class Registrar:
         return self.together((command, None))
 
     def ask(self, id: str, provider: str, server: str, request: bytes, parent: str) -> list[Any]:
-        return self.obey(c.Ask(id, provider, server, request, parent, next(self.numbers)))
+        return self.obey(c.AskProvider(id, provider, server, request, parent, next(self.numbers)))
 
     def begin_again(self) -> list[Any]:
         return self.together((c.BeginAgain(), None))
@@ -88,7 +88,7 @@ class Registrar:
 
     @property
     def replies(self) -> list[Any]:
-        return [effect.message for effect in self.effects if isinstance(effect, e.Reply)]
+        return [effect.message for effect in self.effects if isinstance(effect, e.SendReply)]
 
     def started(self, kind: type) -> list[str]:
         return [effect.resource.id for effect in self.effects if isinstance(effect, kind)]
@@ -240,7 +240,7 @@ def test_a_forced_unload_in_each_phase(phase: str, answer: Any, noticed: bool, a
 def test_unregistering_ends_every_phase_and_answers_once(phase: str) -> None:
     registrar = provider(phase)
     registrar.obey(c.Unregister("cam", "event", "ticket"))
-    answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+    answers = [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)]
 
     for _ in range(4):  # what runs comes to its end
         for resource in list(registrar.catalog.resources.values()):
@@ -251,9 +251,9 @@ def test_unregistering_ends_every_phase_and_answers_once(phase: str) -> None:
                     registrar.obey(c.UnloadDone(resource.id, resource.tries))
                 case _:
                     registrar.obey(c.RecoverDone(resource.id, resource.attempt, None, "r"))
-            answers += [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+            answers += [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)]
 
-    assert answers == [e.Answer("ticket", None)]
+    assert answers == [e.AnswerCall("ticket", None)]
     assert (registrar.catalog.resources, registrar.catalog.queries) == ({}, {})
     assert registrar.catalog.servers == {}
 
@@ -267,7 +267,9 @@ def test_a_stored_server_goes_with_the_decision_that_answers_its_unregistration(
     (resource,) = registrar.catalog.resources.values()
     registrar.obey(c.UnloadDone(resource.id, resource.tries))
 
-    assert [effect for effect in registrar.effects if isinstance(effect, e.Answer)] == [e.Answer("ticket", None)]
+    assert [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)] == [
+        e.AnswerCall("ticket", None)
+    ]
     assert Drop("stored_servers", "cam") in registrar.changes
     assert registrar.catalog.stored_servers == {}
 
@@ -291,7 +293,7 @@ def test_a_status_is_on_disk_and_on_its_way_in_each_phase(phase: str) -> None:
 
     assert [r.notice.id for r in registrar.replies if isinstance(r, Noticed)] == ["s:q"]
     assert "s:q" in registrar.catalog.notices
-    assert e.Answer("ticket", None) in registrar.effects
+    assert e.AnswerCall("ticket", None) in registrar.effects
 
 
 @pytest.mark.parametrize(
@@ -467,7 +469,7 @@ def consumer(hold: str) -> Registrar:
 
 
 def requests(registrar: Registrar) -> list[Any]:
-    return [effect.message for effect in registrar.effects if isinstance(effect, e.Request)]
+    return [effect.message for effect in registrar.effects if isinstance(effect, e.SendRequest)]
 
 
 def hold_of(registrar: Registrar) -> Hold | None:
@@ -594,7 +596,7 @@ def in_flight() -> Registrar:
     return registrar
 
 
-ASKED = holding.pending(c.Ask("q", "p", "cam", b"front", "", (1 << 32) + 7))
+ASKED = holding.pending(c.AskProvider("q", "p", "cam", b"front", "", (1 << 32) + 7))
 GOT = c.Got("q", "res", b"feed")
 
 
@@ -1210,7 +1212,7 @@ def test_a_status_goes_to_the_status_callback_of_its_own_server_first_and_then_t
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", "ticket"))
     assert registrar.effects[-2:] == [
         e.StartStatus(registrar.catalog.resources["q"], own(), repeated=False),
-        e.Answer("ticket", None),
+        e.AnswerCall("ticket", None),
     ]
     assert Put(own()) in registrar.changes
     assert told(registrar) == []
@@ -1501,7 +1503,7 @@ def test_an_interrupted_load_whose_last_holder_goes_before_its_server_is_there_i
     assert registrar.catalog.resources["q"].response is None
     registrar.obey(c.UnloadDone("q", 1))
     assert registrar.catalog.resources == {}
-    answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+    answers = [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)]
     assert len(answers) == (1 if how == "forced" else 0)
 
 
@@ -1547,7 +1549,7 @@ def test_a_notice_of_what_a_list_has_shown_to_be_lost_stays_at_its_provider_unti
     noticed = msgspec.structs.replace(noticed, notice=msgspec.structs.replace(noticed.notice, resource_id="res"))
 
     assert registrar.decide(noticed, "p") == []
-    (unload,) = [effect.message for effect in registrar.obey(c.Heard("q", "r1")) if isinstance(effect, e.Request)]
+    (unload,) = [effect.message for effect in registrar.obey(c.Heard("q", "r1")) if isinstance(effect, e.SendRequest)]
 
     assert registrar.changes == [Drop("held", "q")]
     owner.decide(unload)
@@ -1564,7 +1566,7 @@ def test_a_notice_of_what_the_same_load_got_before_is_not_about_what_is_held(hol
     registrar.decide(Noticed(notice), "p")
 
     assert registrar.catalog.held["q"] == before
-    assert registrar.effects == [e.Request("p", NoticesHandled(["s:q"]))]
+    assert registrar.effects == [e.SendRequest("p", NoticesHandled(["s:q"]))]
 
 
 def test_who_waits_for_a_load_that_was_taken_away_unanswered_is_told_when_its_line_has_broken() -> None:
@@ -1683,7 +1685,7 @@ def test_a_swap_is_one_commit_and_the_holders_hear_the_new_response_from_it() ->
     assert requests(registrar) == [Unload("part", "p"), Unload("older", "p")]
     assert told(registrar) == [("q", State.UPDATE)]
     assert registrar.started(e.StartStatus) == []  # it is the callback that says so
-    assert registrar.effects[-1] == e.Answer("ticket", None)
+    assert registrar.effects[-1] == e.AnswerCall("ticket", None)
 
 
 def test_a_swap_without_a_response_is_heard_by_nobody() -> None:
@@ -1716,7 +1718,7 @@ def test_a_swap_of_what_is_there_no_more_leaves_no_spare(gone: str) -> None:
 
     registrar.obey(SWAP)
 
-    (answer,) = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+    (answer,) = [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)]
     assert answer.failure is not None
     assert answer.failure.kind == "UnknownQuery"
     assert registrar.catalog.held["spare"].hold is Hold.OWED
@@ -1755,7 +1757,7 @@ def building() -> Registrar:
     registrar = Registrar("app", Server("robot"), rows=[Peer("p")])
     registrar.obey(c.Reconcile("p", [], "r0"))
     registrar.decide(Load("r", "robot", b"", "other", "", 0, 1))
-    registrar.catalog.in_flight["q"] = holding.pending(c.Ask("q", "p", "cam", b"front", "r", (1 << 32) + 7), 1)
+    registrar.catalog.in_flight["q"] = holding.pending(c.AskProvider("q", "p", "cam", b"front", "r", (1 << 32) + 7), 1)
     return registrar
 
 

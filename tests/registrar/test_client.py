@@ -36,7 +36,7 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
 
     async def act_and_go_on() -> None:
         EffectRunner(actor, actor.consumers, actor.servers, actor.clients).do(
-            [e.Request("provider", Unload(query.id, "app"))]
+            [e.SendRequest("provider", Unload(query.id, "app"))]
         )
         for command in waiting:
             post(command)

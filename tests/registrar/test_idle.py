@@ -472,7 +472,7 @@ class Resting:
         self.tell(Fetch("app", True))
         self.tell(Load("q", "cam", b"front", "app", "whole", 1, 1))
         self.obey(c.Reconcile("parts", [], "event"))
-        self.obey(c.Ask("part", "parts", "lens", b"", "q", 2))
+        self.obey(c.AskProvider("part", "parts", "lens", b"", "q", 2))
         self.tell(Loaded("part", "lens", b"glass"), "parts")
         self.obey(c.LoadDone("q", 1, b"feed"))
         self.tell(Reprioritise("q", "app", STANDBY))
@@ -497,7 +497,9 @@ class Resting:
 
 
 def asked_of_the_part(effects: list[Any]) -> list[int]:
-    return [it.message.priority for it in effects if isinstance(it, e.Request) and isinstance(it.message, Reprioritise)]
+    return [
+        it.message.priority for it in effects if isinstance(it, e.SendRequest) and isinstance(it.message, Reprioritise)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -513,7 +515,9 @@ def test_a_resumption_that_waits_for_a_part_does_not_begin_for_what_is_lost(comm
     world = Resting()
     assert (world.phase(), asked_of_the_part(world.effects)[-1]) == (Phase.RESUMING, 0)
     effects = world.obey(command)
-    refused = [it.message.query_id for it in effects if isinstance(it, e.Reply) and isinstance(it.message, LoadRefused)]
+    refused = [
+        it.message.query_id for it in effects if isinstance(it, e.SendReply) and isinstance(it.message, LoadRefused)
+    ]
     assert (world.phase(), refused) == (phase, ["next"])
     assert not any(isinstance(it, e.StartResume) for it in effects + world.tell(Reprioritised("part", 0), "parts"))
 
@@ -529,7 +533,7 @@ def test_a_resumption_that_waits_for_a_part_does_not_begin_for_what_nobody_holds
 def test_a_whole_does_not_wait_for_a_part_that_is_lost() -> None:
     """A whole asks the part to run. The part says that it runs, or it is lost, and the whole hears that, too."""
     world = Resting()
-    running = e.Reply("app", Reprioritised("q", 3))
+    running = e.SendReply("app", Reprioritised("q", 3))
     assert running not in world.tell(Reprioritise("q", "app", 3))
     assert running in world.obey(c.SetStatus("q", "event:status", State.FATAL, "burnt out", "ticket"))
     assert running in world.tell(Reprioritise("q", "app", 3))

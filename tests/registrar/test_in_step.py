@@ -12,7 +12,7 @@ from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.engine.registrar_state import is_deciding
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
-from rr_actors.registrar.model.effects import Request
+from rr_actors.registrar.model.effects import SendRequest
 from rr_actors.registrar.model.messages import Unload, Unloaded
 from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Resource, Row, ServedQuery, State, content_of
 from rr_actors.runtime import event_loop
@@ -37,7 +37,7 @@ def whole_of(parts: int) -> tuple[Catalog, list[Any]]:
 
 def release_next(catalog: Catalog, effects: list[Any]) -> list[Any]:
     """Answer the release that was sent, and return the effects of that."""
-    sent = [e.message.query_id for e in effects if isinstance(e, Request) and isinstance(e.message, Unload)]
+    sent = [e.message.query_id for e in effects if isinstance(e, SendRequest) and isinstance(e.message, Unload)]
     return decide(catalog, [(Unloaded(id), "parts") for id in sent]).effects
 
 

@@ -66,7 +66,7 @@ def tell(item: Any, sender: str | None = None) -> Item:
 
 
 CAM = tell(c.Register(Server("cam"), "event"))
-ASKED = tell(c.Ask("mine", "p", "cam", b"front", "", (1 << 32) + 1))
+ASKED = tell(c.AskProvider("mine", "p", "cam", b"front", "", (1 << 32) + 1))
 UP = tell(c.Reconcile("p", [], "event", [], 1))
 HELD = tell(Loaded("mine", "r", b"feed"), "p")
 NOTICE = Notice("n", "mine", "me", "r", "event", State.ERROR, "", "p/cam")
@@ -229,7 +229,7 @@ def test_whoever_is_interrupted_again_while_it_is_rolled_back_leaves_it_to_the_n
 
 # -- the fast paths ------------------------------------------------------------------------------------------------
 
-IN_FLIGHT = holding.pending(c.Ask("mine", "p", "cam", b"front", "", (1 << 32) + 1))
+IN_FLIGHT = holding.pending(c.AskProvider("mine", "p", "cam", b"front", "", (1 << 32) + 1))
 GOT = c.Got("mine", "r", b"feed")
 
 

@@ -26,7 +26,7 @@ from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.engine import registrar_state
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
-from rr_actors.registrar.model.effects import Reply
+from rr_actors.registrar.model.effects import SendReply
 from rr_actors.registrar.model.messages import Fetch, Load, Loaded, Unload, Unloaded
 from rr_actors.registrar.model.rows import Drop, Phase, Put, ServedQuery
 from rr_actors.runtime.event_loop import Dispatcher
@@ -96,7 +96,7 @@ def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[An
         leaves = isinstance(step, Unload) and unloading.leave(general, step)
         decision = decide(general, [(step, step.origin)])
         if leaves:  # the thread answers, and the row is all that changes
-            assert decision.effects == [Reply(step.origin, Unloaded(step.query_id))]
+            assert decision.effects == [SendReply(step.origin, Unloaded(step.query_id))]
             assert (decision.changes, decision.later) == ([Drop("queries", step.query_id)], {})
         query = loading.join(fast, step) if isinstance(step, Load) else None
         if query is None:
@@ -106,7 +106,7 @@ def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[An
             resource = fast.resources[query.resource_id]
             fast.joined[resource.server] = fast.joined.get(resource.server, 0) + 1  # as DirectPaths counts
             answer = Loaded(query.id, resource.id, resource.response or b"", state=resource.state)
-            assert decision.effects == [Reply(step.origin, answer)]
+            assert decision.effects == [SendReply(step.origin, answer)]
             assert (decision.changes, decision.later) == ([Put(query)], {})
         assert everything(fast) == everything(general)
 

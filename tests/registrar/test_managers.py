@@ -710,7 +710,7 @@ def test_the_error_of_a_handles_call_reaches_a_caller_that_reads_late() -> None:
         dispatcher = SimpleNamespace(loop=loop, workers=SimpleNamespace(submit=refuse))
         link: Any = FullAtFirst(loop.create_future())
         place: Any = SimpleNamespace(dispatcher=dispatcher)
-        remote_calls.Door(place, None, link).received(link, remote_calls.Call(7, "x", b""))
+        remote_calls.Door(place, None, link).received(link, remote_calls.CallMethod(7, "x", b""))
         async with asyncio.timeout(5):
             return await link.sent
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rr_actors as rr
-from rr_actors.registrar.model.health import Found, first_counts, judged
+from rr_actors.registrar.model.health import ProbeResult, first_counts, judged
 from rr_actors.registrar.model.rows import State
 from support import Calls, Gate, eventually, serve, wait_gone
 
@@ -32,7 +32,7 @@ def announced(health: rr.Health, results: list[State], begin: State = OK, step_s
     """What is announced after each result, if one comes every `step_s`."""
     counts, said = first_counts(begin), list[State | None]()
     for number, result in enumerate(results):
-        counts, state = judged(health, counts, Found(result), number * step_s)
+        counts, state = judged(health, counts, ProbeResult(result), number * step_s)
         said.append(state)
     return said
 

@@ -141,7 +141,7 @@ REVOKE = c.Revoke("q", "event", "why", 5000, "ticket")
 def test_a_request_for_what_is_revoked_waits_until_it_is_gone() -> None:
     registrar = Served()
     effects = registrar.obey(REVOKE)
-    assert any(isinstance(it, e.Reply) and isinstance(it.message, Noticed) for it in effects)
+    assert any(isinstance(it, e.SendReply) and isinstance(it.message, Noticed) for it in effects)
     registrar.tell(load("next"))
     assert (registrar.phase(), registrar.phase("next")) == (Phase.LOADED, Phase.QUEUED)
     registrar.tell(Unload("q", "app"))
@@ -187,7 +187,7 @@ def test_an_unload_that_fails_ends_the_revocation_and_is_the_answer() -> None:
     registrar.tell(Unload("q", "app"))
     failure = Failure("UnloadFailed", "stuck")
     effects = registrar.obey(c.UnloadErred("q", 1, failure))
-    assert e.Answer("ticket", failure) in effects
+    assert e.AnswerCall("ticket", failure) in effects
     assert not registrar.catalog.revocations
     assert registrar.phase() is Phase.UNLOAD_FAILED
 
@@ -200,7 +200,7 @@ def test_a_release_that_failed_is_sent_again_when_its_resource_is_revoked() -> N
     said = Notice("event:q", "q", "app", "q", "event", rr.State.FATAL, "why", "p/cam", reason=REVOKED, grace_ms=5000)
     decision = decide(catalog, [(Noticed(said), "p")])
     decision.close()
-    assert e.Request("p", Unload("q", "app")) in decision.effects
+    assert e.SendRequest("p", Unload("q", "app")) in decision.effects
 
 
 def test_what_nobody_holds_and_could_not_be_unloaded_is_tried_again() -> None:

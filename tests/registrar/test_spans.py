@@ -45,7 +45,7 @@ def served(number: int, phase: Phase = Phase.LOADED, state: State = State.OK, re
     return [resource, ServedQuery(f"q{number}", f"r{number}", "app", "", 0, number)]
 
 
-def known(consumer: Catalog, before: digests.Known | None = None) -> digests.Known:
+def known(consumer: Catalog, before: digests.HeldRows | None = None) -> digests.HeldRows:
     """What the consumer tells of what it holds."""
     return digests.known(digests.held_at(consumer, "p"), before)
 
@@ -53,7 +53,7 @@ def known(consumer: Catalog, before: digests.Known | None = None) -> digests.Kno
 def told(provider: Catalog, known: digests.Spans) -> Fetched:
     """The provider's answer, as one message."""
     decision = decide(provider, [(Fetch("app", True, 7, known), "app")])
-    messages = [effect.message for effect in decision.effects if isinstance(effect, e.Reply)]
+    messages = [effect.message for effect in decision.effects if isinstance(effect, e.SendReply)]
     parts = [message for message in messages if isinstance(message, Fetched)]
     assert [part.more for part in parts] == [True] * (len(parts) - 1) + [False]
     return Fetched([query for part in parts for query in part.queries], False, 7, parts[-1].same)

@@ -60,8 +60,8 @@ def load(id: str) -> Load:
     return Load(id, "cam", b"front", "app", "", 0, 1)
 
 
-def ask() -> c.Ask:
-    return c.Ask("new", "p", "cam", b"front", "", 1)
+def ask() -> c.AskProvider:
+    return c.AskProvider("new", "p", "cam", b"front", "", 1)
 
 
 def refused(*items: Any) -> tuple[list[Any], list[Any], Decision]:
@@ -74,16 +74,16 @@ def refused(*items: Any) -> tuple[list[Any], list[Any], Decision]:
 
 
 TOLD: list[tuple[Any, Any]] = [
-    (load("new"), e.Reply("app", LoadRefused("new", FULL))),
+    (load("new"), e.SendReply("app", LoadRefused("new", FULL))),
     (c.Release("mine"), e.UnloadResolved("mine", FULL)),
     (c.ReleaseOverdue("owed", LATE), e.UnloadResolved("owed", LATE)),  # it is owed on disk, and stays so
-    (c.SetStatus("r", "event", State.OK, "", "ticket"), e.Answer("ticket", FULL)),
-    (c.SetResponse("r", "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
-    (c.Swap("r", "part", "spare", (), "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
-    (c.SetPriority("mine", 5, "ticket"), e.Answer("ticket", FULL)),
-    (c.ForceUnload("r", "event", "ticket"), e.Answer("ticket", FULL)),
-    (c.Revoke("r", "event", "why", 5000, "ticket"), e.Answer("ticket", FULL)),
-    (c.Unregister("cam", "event", "ticket"), e.Answer("ticket", FULL)),
+    (c.SetStatus("r", "event", State.OK, "", "ticket"), e.AnswerCall("ticket", FULL)),
+    (c.SetResponse("r", "event", b"", "", "ticket"), e.AnswerCall("ticket", FULL)),
+    (c.Swap("r", "part", "spare", (), "event", b"", "", "ticket"), e.AnswerCall("ticket", FULL)),
+    (c.SetPriority("mine", 5, "ticket"), e.AnswerCall("ticket", FULL)),
+    (c.ForceUnload("r", "event", "ticket"), e.AnswerCall("ticket", FULL)),
+    (c.Revoke("r", "event", "why", 5000, "ticket"), e.AnswerCall("ticket", FULL)),
+    (c.Unregister("cam", "event", "ticket"), e.AnswerCall("ticket", FULL)),
 ]
 
 AGAIN: list[Any] = [

@@ -18,7 +18,7 @@ from simulation.sim_links import TO_CONSUMER, TO_PROVIDER
 from simulation.sim_process import SimShell
 
 
-def _reply(shell: SimShell, effect: e.Reply) -> None:
+def _reply(shell: SimShell, effect: e.SendReply) -> None:
     """To a consumer, by the way its request came."""
     message: Any = effect.message
     if type(message) is Loaded and message.query_id not in shell.world.ledger.stored:
@@ -31,7 +31,7 @@ def _reply(shell: SimShell, effect: e.Reply) -> None:
         shell.send(link, effect.origin, shell.name, TO_CONSUMER, message)
 
 
-def _request(shell: SimShell, effect: e.Request) -> None:
+def _request(shell: SimShell, effect: e.SendRequest) -> None:
     """To a provider, if there is a link."""
     peering = shell.clients.get(effect.registrar)
     if peering is None:
@@ -152,7 +152,7 @@ def _connect(shell: SimShell, effect: e.Connect) -> None:
     shell.want(effect.registrar)
 
 
-def _answer(shell: SimShell, effect: e.Answer) -> None:
+def _answer(shell: SimShell, effect: e.AnswerCall) -> None:
     ledger = shell.world.ledger
     ledger.ticket(effect.ticket, given=False)
     ledger.wish_answered(effect.ticket, done=effect.failure is None)
@@ -173,8 +173,8 @@ def _died(shell: SimShell, effect: e.Died) -> None:
 
 
 ACT: dict[type, Callable[[SimShell, Any], None]] = {
-    e.Reply: _reply,
-    e.Request: _request,
+    e.SendReply: _reply,
+    e.SendRequest: _request,
     e.Connect: _connect,
     e.StartLoad: _start_load,
     e.StartUnload: _start_unload,
@@ -189,7 +189,7 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.Receive: _receive,
     e.Hear: _hear,
     e.FellBehind: _fell_behind,
-    e.Answer: _answer,
+    e.AnswerCall: _answer,
     e.Happened: _happened,
     e.Died: _died,
 }

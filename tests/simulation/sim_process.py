@@ -308,12 +308,12 @@ class SimShell:
             return {r.id for r in others}
         return {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
 
-    def ask(self, ask: c.Ask, run: Run | None) -> None:
+    def ask(self, ask: c.AskProvider, run: Run | None) -> None:
         """Load by the loop, for a callback or for somebody outside."""
         self._asked(ask, run)
         self.post(ask)
 
-    def begin_directly(self, ask: c.Ask, run: Run | None) -> Load | None:
+    def begin_directly(self, ask: c.AskProvider, run: Run | None) -> Load | None:
         """As RegistrarActor.begin_directly: load by a thread's own connection; None: its parent is gone."""
         resource = self.catalog.resources.get(ask.parent)
         if ask.parent and resource is None:
@@ -324,7 +324,7 @@ class SimShell:
         held = self.catalog.in_flight[ask.query_id] = holding.pending(ask, attempt, priority)
         return Load(held.id, held.server, held.request, self.name, held.parent, attempt, held.seq, priority, held.own)
 
-    def _asked(self, ask: c.Ask, run: Run | None) -> None:
+    def _asked(self, ask: c.AskProvider, run: Run | None) -> None:
         query_id = ask.query_id
         self.world.ledger.fate[query_id] = "asked"
         self.world.ledger.provider[query_id] = ask.registrar

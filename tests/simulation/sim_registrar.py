@@ -11,7 +11,7 @@ from rr_actors.registrar.core.callback_runs import ATTEMPTS, is_given_up
 from rr_actors.registrar.core.decide import decide, refuse_uncommitted
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
-from rr_actors.registrar.model.effects import Happened, Reply
+from rr_actors.registrar.model.effects import Happened, SendReply
 from rr_actors.registrar.model.messages import Load, Loaded, Message, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import (
     TABLE_OF,
@@ -274,8 +274,8 @@ class SimRegistrar(SimShell):
 
     def act_by_thread(self, decision: Decision) -> None:
         """As Acting.by_thread: the answer to one direct line; the rest is the loop's to do."""
-        replies = [effect for effect in decision.effects if type(effect) is Reply]
-        others = [effect for effect in decision.effects if type(effect) not in (Reply, Happened)]
+        replies = [effect for effect in decision.effects if type(effect) is SendReply]
+        others = [effect for effect in decision.effects if type(effect) not in (SendReply, Happened)]
         line = self.routes.line_of(replies[0].message) if len(replies) == 1 and not others else None
         if line is not None:
             self.routes.answered(replies[0].message)

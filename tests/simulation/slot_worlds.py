@@ -27,7 +27,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from rr_actors.hosting.streams import Connected, Consumer, Keep, PublishedFrame, Stream
+from rr_actors.hosting.streams import Connected, Keep, KnownReader, PublishedFrame, Stream
 from rr_actors.wire.segments import PAGE_BYTES, Lie, Parcel, Slot, Slots, places_in
 from simulation.explore import Walk
 
@@ -214,7 +214,7 @@ class Core(NamedTuple):
     """The decisions that are walked."""
 
     slots: type[Slots] = Slots
-    consumer: type[Consumer] = Consumer
+    consumer: type[KnownReader] = KnownReader
     reader: type[Reader] = Reader
 
 
@@ -255,7 +255,7 @@ class Thread:
         self.written = 0
         self.frame = 0
         self.number = 0  # from when readers are given it
-        self.to: deque[Consumer] = deque()  # who is still to be given it
+        self.to: deque[KnownReader] = deque()  # who is still to be given it
 
 
 class World:
@@ -279,7 +279,7 @@ class World:
         numbers = range(_FIRST_NUMBER, _FIRST_NUMBER + self.small.numbers)
         self.slots = self.core.slots(self.segment.head, PAGE_BYTES, len(self.segment.head), numbers)
         self.sharing = Sharing(self.slots)
-        self.consumers: list[tuple[Link, Consumer]] = []
+        self.consumers: list[tuple[Link, KnownReader]] = []
         self.number = 0
 
     # -- what can happen -----------------------------------------------------------------------------------------------

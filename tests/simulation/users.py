@@ -37,12 +37,12 @@ class People(Trouble):
         if registrar.state not in ("up", "starting") or query_id in self.ledger.fate:
             return False
         self.asker[query_id] = name
-        ask = c.Ask(query_id, provider, server, request, "", registrar.next_seq(), priority, own=True)
+        ask = c.AskProvider(query_id, provider, server, request, "", registrar.next_seq(), priority, own=True)
         if not (direct and self.ask_directly(registrar, ask, None)):
             registrar.ask(ask, None)
         return True
 
-    def ask_directly(self, registrar: SimShell, ask: c.Ask, run: Run | None) -> bool:
+    def ask_directly(self, registrar: SimShell, ask: c.AskProvider, run: Run | None) -> bool:
         """As Loads does, for somebody outside or for a callback; False: the loop is to ask."""
         if registrar.catalog.shut or not registrar.reaches(self.registrars[ask.registrar]):
             return False
@@ -62,7 +62,7 @@ class People(Trouble):
             return False
         if registrar.catalog.shut or not registrar.reaches(registrar):
             return False
-        ask = c.Ask(query_id, name, server, request, "", registrar.next_seq())
+        ask = c.AskProvider(query_id, name, server, request, "", registrar.next_seq())
         try:
             joined = registrar.join(Load(query_id, server, request, name, "", 0, ask.seq), fault)
         except Killed:

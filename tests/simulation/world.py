@@ -123,7 +123,7 @@ class World(Lives):
             run.waits = f"{id}/{number}.{run.subs}"
             provider, server, request, *rest = place
             own = [priority for priority in rest if isinstance(priority, int)]
-            ask = c.Ask(run.waits, provider, server, request, run.id, registrar.next_seq(), *own, own=bool(own))
+            ask = c.AskProvider(run.waits, provider, server, request, run.id, registrar.next_seq(), *own, own=bool(own))
             if not ("directly" in rest and self.ask_directly(registrar, ask, run)):
                 registrar.ask(ask, run)
             return True

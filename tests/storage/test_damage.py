@@ -23,7 +23,7 @@ from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, ServedQuery,
 from rr_actors.registrar.model.store import Store
 from rr_actors.storage.catalog_lock import Reached
 from rr_actors.storage.opening import Durability, open_store, read_rows, remove_unneeded
-from rr_actors.storage.witness import Known, Witness, tell_of_missing
+from rr_actors.storage.witness import LastOpening, Witness, tell_of_missing
 from rr_actors.wire.name_service import open_state_dir
 from support_slow import few_now
 from support_stores import in_order
@@ -264,7 +264,7 @@ def test_a_catalog_says_whose_it_is_and_how_far_it_has_come(tmp_path: Path) -> N
     with closing(sqlite3.connect(path)) as connection:
         ((id_, epoch, folded, registrar),) = connection.execute("SELECT id, epoch, folded, registrar FROM meta")
     assert (epoch, registrar) == (3, "app")
-    assert Witness(tmp_path / "left", "app").known() == Known(id_, 3, str(path))
+    assert Witness(tmp_path / "left", "app").known() == LastOpening(id_, 3, str(path))
     assert f"{id_} 3 tables {folded:020}" in path.with_name("catalog.lock").read_text()
     assert Reached(id_, 3, folded, in_tables=True).number == folded
     assert in_order(rows_of(store.load()))[0] == Peer("before")
@@ -276,18 +276,18 @@ def test_a_disk_without_room_leaves_the_record_of_a_catalog_as_it_was(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     witness = Witness(tmp_path, "app")
-    witness.note(Known("id", 1, "/nowhere"))
+    witness.note(LastOpening("id", 1, "/nowhere"))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20, before[1]))
     try:
-        witness.note(Known("id", 2, "/nowhere"))
+        witness.note(LastOpening("id", 2, "/nowhere"))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert (tmp_path / ".catalogs" / ".app.new").stat().st_size == 20
     assert "File too large" in caplog.text
-    assert witness.known() == Known("id", 1, "/nowhere")
-    witness.note(Known("id", 3, "/nowhere"))
-    assert witness.known() == Known("id", 3, "/nowhere")
+    assert witness.known() == LastOpening("id", 1, "/nowhere")
+    witness.note(LastOpening("id", 3, "/nowhere"))
+    assert witness.known() == LastOpening("id", 3, "/nowhere")
 
 
 def test_a_power_cut_leaves_the_record_of_a_catalog_for_which_commits_survive_it(
@@ -338,7 +338,7 @@ def test_records_that_cannot_be_reached_are_told_of_and_hold_up_nothing(
 ) -> None:
     (tmp_path / ".catalogs").write_bytes(b"something else")
     witness = Witness(tmp_path, "app")
-    for use in (witness.known, lambda: witness.note(Known("id", 1, "/nowhere")), lambda: witness.forget(1)):
+    for use in (witness.known, lambda: witness.note(LastOpening("id", 1, "/nowhere")), lambda: witness.forget(1)):
         assert not use()
         assert "cannot be read or written" in caplog.text
         caplog.clear()

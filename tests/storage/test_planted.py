@@ -15,7 +15,7 @@ from rr_actors.base.folder import Folder, NotAFile
 from rr_actors.hosting.run_files import Watched
 from rr_actors.registrar.model.rows import Peer, Put, rows_of
 from rr_actors.storage.opening import open_store
-from rr_actors.storage.witness import Known, Witness
+from rr_actors.storage.witness import LastOpening, Witness
 from rr_actors.wire.name_service import Directory, open_state_dir
 from rr_actors.wire.unix_sockets import SocketDir
 
@@ -256,11 +256,11 @@ def test_what_is_planted_in_the_place_of_a_witness_is_not_used(
     tmp_path: Path, plant: Callable[[Path, Path], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     witness = Witness(tmp_path, "app")
-    witness.note(Known("id", 1, "/nowhere"))
+    witness.note(LastOpening("id", 1, "/nowhere"))
     planted = Planted(tmp_path / ".catalogs" / "app", tmp_path / "precious", plant)
     assert witness.known() is None
     assert "app" in caplog.text
-    witness.note(Known("id", 2, "/nowhere"))
+    witness.note(LastOpening("id", 2, "/nowhere"))
     assert planted.target_is_as_it_was()
 
 

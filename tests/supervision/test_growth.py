@@ -15,9 +15,9 @@ from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Strategy, Supervisor
 from rr_actors.supervision.core.state import (
     Action,
+    ChildPhase,
     Decision,
     Exit,
-    Phase,
     StartChild,
     StopChild,
     SupervisedChild,
@@ -132,7 +132,7 @@ def test_a_stop_takes_as_many_steps_for_each_of_many_children_as_for_each_of_few
     def each(count: int) -> float:
         tree, _ = running(count, strategy)
         steps, tree = steps_of(lambda: settled(*restarts.decide_stop(tree, 1.0)))
-        assert all(child.phase is Phase.STOPPED for child in tree.children.values())
+        assert all(child.phase is ChildPhase.STOPPED for child in tree.children.values())
         return steps / count
 
     assert each(1_000) <= each(100) * 1.1
@@ -171,7 +171,7 @@ def changes(draw: st.DrawFn) -> tuple[int, str, SupervisedChild | None]:
     """Draw which version is changed, the id of a child, and what is put there; None removes it."""
     significant = draw(st.booleans())
     spec = ChildSpec(Actor, id="x", restart="temporary", significant=significant)
-    child = SupervisedChild("x", spec, phase=draw(st.sampled_from(Phase)), why=draw(st.sampled_from(Why)))
+    child = SupervisedChild("x", spec, phase=draw(st.sampled_from(ChildPhase)), why=draw(st.sampled_from(Why)))
     return draw(st.integers(0, 30)), draw(st.sampled_from(IDS)), draw(st.sampled_from((child, child, None)))
 
 
@@ -192,12 +192,12 @@ def test_each_version_of_children_stays_what_it_was_whichever_is_changed_or_read
         assert len(children) == len(model)
         for position, id in enumerate(model):
             assert children.after(id) == list(model.values())[position + 1 :]
-        for phase in Phase:
+        for phase in ChildPhase:
             those = [child for child in model.values() if child.phase is phase]
             assert children.first(2, phase) == those[:2]
             assert children.last(phase) == (those[-1] if those else None)
             assert children.any(phase) == bool(those)
             assert children.first(9, phase, whys=(Why.NEW,)) == [c for c in those if c.why is Why.NEW]
         assert children.any_significant() == any(
-            child.spec.significant and child.phase is not Phase.STOPPED for child in model.values()
+            child.spec.significant and child.phase is not ChildPhase.STOPPED for child in model.values()
         )

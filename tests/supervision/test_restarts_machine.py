@@ -21,7 +21,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.supervision.core.child_calls import which_children
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
-from rr_actors.supervision.core.state import Mode, Phase, Why
+from rr_actors.supervision.core.state import ChildPhase, Mode, Why
 from support_simulated import Outcome, World, child
 
 IDS = ["a", "b", "c", "d", "e"]
@@ -362,17 +362,19 @@ class AllAtOnce(RuleBasedStateMachine):
         children = list(self.world.tree.children.values())
         assert len(self.world.starts.keys() - self.world.stops.keys() - self.condemned()) <= 1
         for index, starting in enumerate(children):
-            if starting.phase is Phase.STARTING and starting.why is Why.RESTART:
+            if starting.phase is ChildPhase.STARTING and starting.why is Why.RESTART:
                 assert all(later.id not in self.world.up for later in children[index:])
                 assert not self.condemned()
 
     def condemned(self) -> set[str]:
-        return {c.id for c in self.world.tree.children.values() if c.phase is Phase.CONDEMNED}
+        return {c.id for c in self.world.tree.children.values() if c.phase is ChildPhase.CONDEMNED}
 
     @invariant()
     def something_is_always_under_way_until_all_is_at_rest(self) -> None:
         tree, busy = self.world.tree, bool(self.world.starts or self.world.stops)
-        waiting = [c for c in tree.children.values() if c.phase in (Phase.DUE, Phase.CONDEMNED, Phase.RECYCLING)]
+        waiting = [
+            c for c in tree.children.values() if c.phase in (ChildPhase.DUE, ChildPhase.CONDEMNED, ChildPhase.RECYCLING)
+        ]
         assert busy or not waiting
         assert busy or tree.mode in (Mode.RUNNING, Mode.STOPPED)
         assert busy or all(caller in self.world.replies for caller in self.callers)

@@ -19,7 +19,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.restarts import needs_restart
-from rr_actors.supervision.core.state import Exit, Phase, StopChild
+from rr_actors.supervision.core.state import ChildPhase, Exit, StopChild
 from support_simulated import SHUTDOWN, World, child, world
 
 STRATEGIES = ("one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one")
@@ -358,11 +358,11 @@ NOTHING = None
 PHASES = {
     phase_stopped: (NOTHING, NOTHING, NOTHING, NOTHING, NOTHING),
     phase_due: (NOTHING, NOTHING, NOTHING, NOTHING, NOTHING),
-    phase_starting: (Phase.RUNNING, Phase.STOPPED, Phase.STARTING, Phase.STARTING, NOTHING),
-    phase_running: (NOTHING, NOTHING, NOTHING, Phase.STARTING, NOTHING),
-    phase_condemned: (Phase.CONDEMNED, Phase.DUE, Phase.DUE, Phase.DUE, NOTHING),
-    phase_recycling: (NOTHING, NOTHING, NOTHING, NOTHING, Phase.DUE),
-    phase_stopping: (NOTHING, NOTHING, NOTHING, NOTHING, Phase.STOPPED),
+    phase_starting: (ChildPhase.RUNNING, ChildPhase.STOPPED, ChildPhase.STARTING, ChildPhase.STARTING, NOTHING),
+    phase_running: (NOTHING, NOTHING, NOTHING, ChildPhase.STARTING, NOTHING),
+    phase_condemned: (ChildPhase.CONDEMNED, ChildPhase.DUE, ChildPhase.DUE, ChildPhase.DUE, NOTHING),
+    phase_recycling: (NOTHING, NOTHING, NOTHING, NOTHING, ChildPhase.DUE),
+    phase_stopping: (NOTHING, NOTHING, NOTHING, NOTHING, ChildPhase.STOPPED),
 }
 
 

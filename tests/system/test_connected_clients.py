@@ -38,7 +38,7 @@ from rr_actors.system.console import connected_client, console_client, console_s
 from rr_actors.system.console.console_client import Connections, ConsoleClient, NotRunning
 from rr_actors.system.console.console_commands import Hold
 from rr_actors.system.console.console_questions import Find
-from rr_actors.wire.unix_sockets import Peer
+from rr_actors.wire.unix_sockets import SocketPeer
 from support import LIMIT_S, TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
 from support_interrupts import interrupted
 from support_managers import Made, Order, Shop
@@ -697,7 +697,7 @@ def test_where_no_system_or_several_run_connect_says_so(start: Start, tmp_path: 
 def test_a_system_of_another_user_is_refused(
     system: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(console_client, "peer_at", lambda _socket: Peer(1, 4711))
+    monkeypatch.setattr(console_client, "peer_at", lambda _socket: SocketPeer(1, 4711))
 
     with pytest.raises(Unavailable, match=r"expected a system of user .*, got one of user 4711"):
         rr.connect(state_dir)

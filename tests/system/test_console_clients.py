@@ -253,7 +253,7 @@ def test_another_version_is_refused_by_name(system: rr.System, dialled: Callable
 def test_a_process_of_another_user_is_cut_off_without_a_word(
     dialled: Callable[[], socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(console_server, "peer_of", lambda transport: unix_sockets.Peer(4711, 12345))
+    monkeypatch.setattr(console_server, "peer_of", lambda transport: unix_sockets.SocketPeer(4711, 12345))
     peer = dialled()
 
     assert said_until_cut_off(peer) == []
@@ -263,7 +263,7 @@ def test_a_client_does_not_speak_to_another_users_system(
     system: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = find_console(state_dir)
-    monkeypatch.setattr(console_client, "peer_at", lambda connected: unix_sockets.Peer(4711, 12345))
+    monkeypatch.setattr(console_client, "peer_at", lambda connected: unix_sockets.SocketPeer(4711, 12345))
 
     with pytest.raises(Unavailable, match="got one of user 12345"):
         ConsoleClient(place)

@@ -22,7 +22,7 @@ from rich.cells import cell_len
 from textual.pilot import Pilot
 
 from rr_actors.hosting.streams import ReaderRow, StreamInfo, StreamRow
-from rr_actors.registrar.pages import Holder, LoadRow, QueryRow, ResourceRow
+from rr_actors.registrar.pages import HolderRow, LoadRow, QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
@@ -61,13 +61,14 @@ REGISTRARS = [
 SERVED = {
     "lenses": [
         ResourceRow(LENS, "lenses/lens", '"front"', '"glass"', "loaded", "WARNING", "dusty",
-                    1, [Holder(id_of(9, 88), "cameras", FRONT)], 1, [], 0),
+                    1, [HolderRow(id_of(9, 88), "cameras", FRONT)], 1, [], 0),
     ],
     "cameras": [
         ResourceRow(FRONT, "cameras/camera", '"/dev/video0"', '"3 fps"', "loaded", "OK", "",
-                    1, [Holder(id_of(7, 90), "app", ""), Holder(id_of(8, 30), "planner", "")], 2, [id_of(9, 88)], 1),
+                    1, [HolderRow(id_of(7, 90), "app", ""), HolderRow(id_of(8, 30), "planner", "")],
+                    2, [id_of(9, 88)], 1),
         ResourceRow(BACK, "cameras/camera", '"/dev/video1"', '"dark"', "loaded", "FATAL", "unplugged",
-                    1, [Holder(id_of(6, 60), "app", "")], 1, [], 0),
+                    1, [HolderRow(id_of(6, 60), "app", "")], 1, [], 0),
     ],
 }  # fmt: skip
 _READERS = [ReaderRow("app", PID + 8, "latest", 311), ReaderRow("planner", PID + 9, "all", 0)]

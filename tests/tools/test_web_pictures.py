@@ -14,7 +14,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.registrar.pages import Holder, ResourceRow, ServerRow
+from rr_actors.registrar.pages import HolderRow, ResourceRow, ServerRow
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Entries, RegistrarRow
 from rr_actors.system.console.console_questions import ListServers
@@ -31,7 +31,7 @@ Start = Callable[..., rr.System]
 
 def resource(id: str, server: str, *holders: tuple[str, str], state: str = "OK") -> ResourceRow:
     """A resource, and who holds it for which of its own."""
-    held = [Holder(f"{id}-{origin}-{parent}", origin, parent) for origin, parent in holders]
+    held = [HolderRow(f"{id}-{origin}-{parent}", origin, parent) for origin, parent in holders]
     return ResourceRow(id, server, f'"{id}"', "", "loaded", state, "", 1, held, len(held), [], 0)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rr_actors.hosting.streams import Connected, Consumer, PollSet, Shared, Stream
+from rr_actors.hosting.streams import Connected, KnownReader, PollSet, Shared, Stream
 from rr_actors.wire.segments import Parcel, Slot, Slots
 from simulation.explore import Walk
 from simulation.slot_worlds import PRODUCT, WORLDS, Reader, main, walk_slots
@@ -97,7 +97,7 @@ class _Keeping:
         pass
 
 
-class ReplacedAndKept(Consumer):
+class ReplacedAndKept(KnownReader):
     """A frame that a newer one replaces before it is sent stays in use."""
 
     def __init__(
@@ -106,7 +106,7 @@ class ReplacedAndKept(Consumer):
         super().__init__(connected, pid, _Keeping(parcels), ready, rebound)
 
 
-class TakenBackTooSoon(Consumer):
+class TakenBackTooSoon(KnownReader):
     """What a reader has is free when it reads no more, and not when it has ended."""
 
     def __init__(
@@ -120,7 +120,7 @@ class TakenBackTooSoon(Consumer):
         self.shared.take_back(self)
 
 
-class Deaf(Consumer):
+class Deaf(KnownReader):
     """The publisher's thread is not told that a reader wants the frame that waits for it."""
 
     def hear(self, hears: bool) -> None:
@@ -177,7 +177,7 @@ def test_a_planted_defect_is_found_with_a_shortest_history(defect: type) -> None
     core = PRODUCT
     if issubclass(defect, Slots):
         core = core._replace(slots=defect)
-    elif issubclass(defect, Consumer):
+    elif issubclass(defect, KnownReader):
         core = core._replace(consumer=defect)
     else:
         core = core._replace(reader=defect)

@@ -211,13 +211,13 @@ def messages_with(trap: bytes) -> dict[str, tuple[str, Any]]:
         "load": ("registrar", Load("0" * 32, "shop/thing", trap, "app", "", 1, 1)),
         "direct load": (DIRECT, Load("1" * 32, "shop/thing", trap, "app", "", 1, 1)),
         "describe": ("registrar", Describe("thing")),
-        "call": (remote_calls.KIND, remote_calls.Call(1, "queries", trap)),
-        "stored server": (remote_calls.KIND, remote_calls.Call(2, "_register_stored", trap)),
+        "call": (remote_calls.KIND, remote_calls.CallMethod(1, "queries", trap)),
+        "stored server": (remote_calls.KIND, remote_calls.CallMethod(2, "_register_stored", trap)),
         "returned": (remote_calls.KIND, remote_calls.Returned(1, trap)),
         "ask": (protocol.KIND, protocol.Ask(1, "root/shop", trap, ())),
         "tell": (protocol.KIND, protocol.Tell("root/shop", trap)),
         "answered": (protocol.KIND, protocol.Answered(1, trap)),
-        "raised": (protocol.KIND, protocol.Raised(1, trap, "ValueError: x", "")),
+        "raised": (protocol.KIND, protocol.HandlerRaised(1, trap, "ValueError: x", "")),
     }
 
 

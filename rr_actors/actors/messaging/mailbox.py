@@ -29,7 +29,7 @@ class Envelope(PykkaEnvelope[Any]):
         self.chain = chain
 
 
-class Notice(Envelope):
+class DownNotice(Envelope):
     """A Down on its way to the actor that monitors. It goes by the control lane.
 
     `claim` is its Monitor: the actor drops the Down if the Monitor was cancelled.
@@ -42,7 +42,7 @@ class Notice(Envelope):
         self.claim = claim
 
 
-class Stop(PykkaStop):
+class StopActor(PykkaStop):
     """Ask an actor to stop.
 
     "normal" waits for its turn, as Pykka documents; "shutdown", from its supervisor, overtakes queued messages.
@@ -52,7 +52,7 @@ class Stop(PykkaStop):
     reason: str
     final: bool
 
-    def __new__(cls, reason: str = "normal", *, final: bool = False) -> Stop:
+    def __new__(cls, reason: str = "normal", *, final: bool = False) -> StopActor:
         self = super().__new__(cls)
         self.reason = reason
         self.final = final
@@ -126,7 +126,7 @@ class Mailbox:
             MailboxFull: `limit` messages are queued, or no thread is free for the actor; nothing was queued.
         """
         message = envelope.message
-        notice = type(envelope) is Notice
+        notice = type(envelope) is DownNotice
         urgent = notice or is_stop(message)
         overtakes = notice or (urgent and getattr(message, "reason", "normal") == "shutdown")
         lane = self._control if overtakes else self._messages
@@ -247,7 +247,7 @@ def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
             reply.set(None)  # as the actor has ended
         elif reply is not None:
             reply.set_exception((Ended, Ended(f"{name} stopped before handling the message", name), None))
-    letters = [envelope for envelope in envelopes if type(envelope) is not Notice and not is_stop(envelope.message)]
+    letters = [envelope for envelope in envelopes if type(envelope) is not DownNotice and not is_stop(envelope.message)]
     if letters:
         dead_letters.office.record(
             name,

@@ -18,7 +18,7 @@ from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import Reply, StopReply
 from rr_actors.actors.messaging.mailbox import Mailbox, refuse_all
 from rr_actors.actors.remote.inbound import Asker, Visitor
-from rr_actors.actors.remote.peer import Call, Cut, Line, Whereabouts
+from rr_actors.actors.remote.peer import Cut, Line, PendingCall, Whereabouts
 from rr_actors.actors.remote.protocol import ASKS, KIND, PATH_URN, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
 from rr_actors.base import pickling
 from rr_actors.base.errors import ActorUnavailable, Unavailable, UsageError
@@ -155,7 +155,7 @@ class ActorHub:
             NotSerializable: the message cannot be pickled, or is too long.
         """
         body = pickling.dumps_large(message, f"message to {where.target.name}")
-        call = Call(line.next_number(), reply, where)
+        call = PendingCall(line.next_number(), reply, where)
         try:
             if isinstance(body, bytes):
                 answer = line.ask(Ask(call.number, where.target.urn, body, chain), timeout_s)
@@ -253,7 +253,7 @@ class ActorHub:
         line = self._line(address)
         number = line.next_number()
         reply.when_set(told)
-        line.put(Watch(number, where.target.urn), Call(number, reply, where, begun))
+        line.put(Watch(number, where.target.urn), PendingCall(number, reply, where, begun))
         if self._dispatcher.may_block():
             deadline = time.monotonic() + self.ask_timeout_s
             while not placed.wait(WATCH_S) and not paused(address) and time.monotonic() < deadline:
@@ -345,7 +345,7 @@ class ActorHub:
     def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[int, Line], Letter]) -> Callable[[], None]:
         line = self._line(self._locate(where))
         number = line.next_number()
-        line.put(letter(number, line), Call(number, reply, where))
+        line.put(letter(number, line), PendingCall(number, reply, where))
         return lambda: line.give_up(number)
 
     def _address(self, where: Whereabouts) -> str:

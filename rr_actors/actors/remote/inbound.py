@@ -12,17 +12,17 @@ from rr_actors.actors.messaging import dead_letters, death_watch
 from rr_actors.actors.messaging.ask_cycles import Chain, Target, check_chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import ExcInfo, error_of
-from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, Stop, has_ended, put
+from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, StopActor, has_ended, put
 from rr_actors.actors.remote.protocol import (
     PATH_URN,
     Answered,
     Ask,
     Dead,
     Halt,
+    HandlerRaised,
     Inquire,
     Letter,
     Over,
-    Raised,
     Tell,
     Unwatch,
     Watch,
@@ -40,7 +40,7 @@ from rr_actors.wire.unix_link import UnixLink
 
 logger = Log("rr_actors")
 
-Outgoing = Answered | Raised | Dead | Watching | Over
+Outgoing = Answered | HandlerRaised | Dead | Watching | Over
 Find = Callable[[str], "pykka.ActorRef[Any] | None"]
 
 
@@ -117,7 +117,7 @@ class Visitor:
             logger.debug("an exception travels as text: %s", reason)
             body = b""
         trace = trace_of(error)
-        self.post(Raised(call, body, text_of(error), trace))
+        self.post(HandlerRaised(call, body, text_of(error), trace))
 
     def post(self, letter: Outgoing) -> None:
         """Send an answer. From any thread."""
@@ -133,7 +133,7 @@ class Visitor:
             try:
                 self._link.send(letter)
             except NotSerializable as error:  # too long for a frame
-                self._link.send(Raised(letter.call, pickling.dumps(error), text_of(error), ""))
+                self._link.send(HandlerRaised(letter.call, pickling.dumps(error), text_of(error), ""))
         except RrError as error:  # the asker would wait for ever: an answer may be lost only with its link
             logger.error("%s does not read its answers, and is cut off: %s", self._link.peer, error)
             self._link.close()
@@ -169,7 +169,7 @@ class Visitor:
         try:
             if call is not None:
                 check_chain(Target(to, str(ref)), chain)
-            answer = None if call is None else Answer(self, call, str(ref))
+            answer = None if call is None else RemoteAnswer(self, call, str(ref))
             put(ref, Envelope(message, answer, chain), str(ref))
         except ActorDeadError:
             self._undeliverable(to, call, message)
@@ -221,7 +221,7 @@ class Visitor:
             self.post(Dead(call))
             return
         try:
-            ref.actor_inbox.put(Envelope(Stop(reason, final=final), Answer(self, call, str(ref))))
+            ref.actor_inbox.put(Envelope(StopActor(reason, final=final), RemoteAnswer(self, call, str(ref))))
         except Exception as error:
             self.raised(call, error, str(ref))
 
@@ -272,7 +272,7 @@ class Asker(Visitor):
             answer()
 
 
-class Answer(pykka.Future[Any]):
+class RemoteAnswer(pykka.Future[Any]):
     """The future for the result of a handler whose asker is in another process. No thread waits on it here."""
 
     def __init__(self, visitor: Visitor, call: int, name: str) -> None:

@@ -28,9 +28,9 @@ from rr_actors.actors.remote.protocol import (
     Ask,
     Dead,
     Halt,
+    HandlerRaised,
     Letter,
     Over,
-    Raised,
     Tell,
     Unwatch,
     Watch,
@@ -72,7 +72,7 @@ class Whereabouts(msgspec.Struct):
     ended_at: str = ""
 
 
-class Call(msgspec.Struct, frozen=True):
+class PendingCall(msgspec.Struct, frozen=True):
     """A call that waits for its answer.
 
     Attributes:
@@ -123,8 +123,8 @@ class Line:
         self._hello = hello
         self._missing = missing
         self._forget = forget
-        self._waiting: deque[tuple[Letter, Call | None]] = deque()
-        self._calls: dict[int, Call] = {}
+        self._waiting: deque[tuple[Letter, PendingCall | None]] = deque()
+        self._calls: dict[int, PendingCall] = {}
         self._turn = 0  # how often _pump() has run
         self._woken_for = -1  # the turn that the loop was last asked for
         self._link: Link | None = None
@@ -141,7 +141,7 @@ class Line:
         """Return a number that no other call of this process has. From any thread."""
         return next(_numbers)
 
-    def put(self, letter: Letter, call: Call | None = None) -> None:
+    def put(self, letter: Letter, call: PendingCall | None = None) -> None:
         """Send the letter after all earlier ones; `call` is answered or fails later. From any thread.
 
         Raises:
@@ -176,7 +176,7 @@ class Line:
 
     def ask(
         self, letter: Ask, timeout_s: float | None, large: pickling.Large | None = None
-    ) -> Answered | Arrived | Raised | Dead | None:
+    ) -> Answered | Arrived | HandlerRaised | Dead | None:
         """Send the letter by a connection of the calling thread alone, and wait; None if this is impossible now.
 
         From any thread that may block.
@@ -198,7 +198,7 @@ class Line:
             if large is not None:
                 letter = msgspec.structs.replace(letter, body=line.parcels.pack(large))
             answer = line.exchange(letter, deadline)
-            if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
+            if isinstance(answer, (Answered, HandlerRaised, Dead)) and answer.call == letter.call:
                 if type(answer) is Answered and not isinstance(answer.body, bytes):
                     answer = Arrived(line.parcels.claim(answer.body))
                 self.connections.give_back(line)
@@ -243,7 +243,7 @@ class Line:
 
     def received(self, link: Link, message: Letter) -> None:
         """Take an answer from the other process."""
-        if not isinstance(message, (Answered, Raised, Dead, Watching, Over)):
+        if not isinstance(message, (Answered, HandlerRaised, Dead, Watching, Over)):
             logger.error("%s sent %s on a link that this process opened", link.peer, type(message).__name__)
             link.close()
             return
@@ -262,7 +262,7 @@ class Line:
         if call is not None:  # not given up
             self.answer(call, answer)
 
-    def answer(self, call: Call, message: Answered | Arrived | Raised | Dead | Over) -> None:
+    def answer(self, call: PendingCall, message: Answered | Arrived | HandlerRaised | Dead | Over) -> None:
         """Set the call's reply. From any thread."""
         match message:
             case Answered():
@@ -271,7 +271,7 @@ class Line:
                     call.reply.set_unopened(lambda: pickling.loads(body))
             case Arrived():
                 call.reply.set_unopened(message.open)
-            case Raised():
+            case HandlerRaised():
                 origin = f"{call.where.target.name} in {self._peer}"
                 call.reply.set_unopened(lambda: _reraise(message, origin), raises=True)
             case Over():
@@ -368,7 +368,7 @@ class Line:
         for urn, letters in untold.items():
             _record_lost(urn, letters, f"lost with its process at {self.address}")
 
-    def cut_off(self, call: Call, reason: Exception | None) -> None:
+    def cut_off(self, call: PendingCall, reason: Exception | None) -> None:
         """Fail a call whose link or connection is lost. From any thread."""
         if call.begun is not None:
             error = Cut()
@@ -421,7 +421,7 @@ def _record_lost(urn: str, letters: list[Tell], why: str) -> None:
     dead_letters.office.record(urn.removeprefix(PATH_URN), lost, why, unheard=len(lost))
 
 
-def _reraise(raised: Raised, origin: str) -> Any:
+def _reraise(raised: HandlerRaised, origin: str) -> Any:
     """Raise the exception of the handler, in the thread that asked: its class may have to be imported."""
     error: BaseException | None = None
     if raised.error:

@@ -64,7 +64,7 @@ class Answered(msgspec.Struct, frozen=True, array_like=True, tag=5):
     body: bytes | Parcel
 
 
-class Raised(msgspec.Struct, frozen=True, array_like=True, tag=6):
+class HandlerRaised(msgspec.Struct, frozen=True, array_like=True, tag=6):
     """The handler raised. `error`: the pickled exception, or b"" if it cannot be pickled; `text` is its text."""
 
     call: int
@@ -107,7 +107,7 @@ class Watching(msgspec.Struct, frozen=True, array_like=True, tag=11):
     call: int
 
 
-Letter = Ask | Tell | Inquire | Halt | Answered | Raised | Dead | Watch | Unwatch | Watching | Over
+Letter = Ask | Tell | Inquire | Halt | Answered | HandlerRaised | Dead | Watch | Unwatch | Watching | Over
 
 
 CODECS: dict[str, Any] = {KIND: Letter, ASKS: Letter}

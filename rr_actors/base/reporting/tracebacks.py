@@ -14,7 +14,7 @@ from types import FrameType, TracebackType
 
 import msgspec
 
-from rr_actors.base.errors import Described, is_a, name_of_class, readable, text_of
+from rr_actors.base.errors import DescribedError, is_a, name_of_class, readable, text_of
 
 _LONGEST = 50_000  # characters
 _FRAMES = 100  # of a traceback or of a thread
@@ -34,7 +34,7 @@ def trace_of(error: BaseException, since: TracebackType | None = None) -> str:
 
     If Python cannot print it, because a method of its class raises, say, return its frames and its text.
     """
-    if is_a(error, Described):
+    if is_a(error, DescribedError):
         return error.trace
     found = since or traceback_of(error)
     try:

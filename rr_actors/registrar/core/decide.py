@@ -27,7 +27,7 @@ from rr_actors.registrar.core.notices import refuse
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import messages as m
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.effects import Answer, LoadResolved, Reply, UnloadResolved
+from rr_actors.registrar.model.effects import AnswerCall, LoadResolved, SendReply, UnloadResolved
 from rr_actors.registrar.model.rows import Hold, Put
 
 Item = tuple[Any, str | None]
@@ -68,7 +68,7 @@ def _describe(decision: Decision, sender: str, message: m.Describe) -> None:
     """Answer with the types of a server; if there is no such server, send nothing."""
     server = decision.catalog.servers.get(message.server)
     if server is not None:
-        decision.cause(Reply(sender, m.Described(message.server, server.types)))
+        decision.cause(SendReply(sender, m.Described(message.server, server.types)))
 
 
 def _unload_erred(decision: Decision, command: c.UnloadErred) -> None:
@@ -138,7 +138,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.ForceUnload: unloading.force_unload,
     c.Revoke: status_changes.revoke,
     c.GraceOver: unloading.grace_over,
-    c.Ask: holding.ask,
+    c.AskProvider: holding.ask,
     c.Got: holding.got,
     c.SendAgain: holding.send_again,
     c.GiveUp: holding.give_up,
@@ -168,7 +168,7 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure
         match item:
             case m.Load() if item.query_id not in decision.catalog.queries:
                 decision.cause(refuse(decision, item.origin, item.query_id, failure))
-            case c.Ask():
+            case c.AskProvider():
                 decision.cause(LoadResolved(holding.pending(item), failure))
             case c.Release():
                 decision.cause(UnloadResolved(item.query_id, failure))
@@ -185,7 +185,7 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure
                 | c.Unregister()
                 | c.SetPriority()
             ):
-                decision.cause(Answer(item.ticket, failure))
+                decision.cause(AnswerCall(item.ticket, failure))
             case _:
                 again.append((item, sender))
     return decision, again

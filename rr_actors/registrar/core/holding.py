@@ -16,7 +16,7 @@ from rr_actors.registrar.core.priorities import follow
 from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, withdraw
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
-from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
+from rr_actors.registrar.model.commands import AskProvider, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Noticed, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import HELD, OK, OWED, PENDING, Held, Notice, Phase, State
@@ -24,7 +24,7 @@ from rr_actors.registrar.model.rows import HELD, OK, OWED, PENDING, Held, Notice
 # -- load ----------------------------------------------------------------------------------------------------------
 
 
-def ask(decision: Decision, command: Ask) -> None:
+def ask(decision: Decision, command: AskProvider) -> None:
     """Ask a provider for a query. The provider's Peer row is on disk before the request is sent."""
     catalog = decision.catalog
     attempt, priority = 0, command.priority
@@ -124,7 +124,7 @@ def _unknown(query_id: str) -> Held:
     return Held(query_id, "", "", b"", None, "", "", 0, 0, PENDING, State.FATAL)
 
 
-def pending(ask: Ask, attempt: int = 0, priority: int = 0) -> Held:
+def pending(ask: AskProvider, attempt: int = 0, priority: int = 0) -> Held:
     """Return the row of a query that is asked for."""
     place = (ask.query_id, ask.registrar, ask.server, ask.request)
     return Held(*place, None, "", ask.parent, attempt, ask.seq, PENDING, OK, priority, ask.own)

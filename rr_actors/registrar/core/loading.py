@@ -36,7 +36,7 @@ from rr_actors.registrar.core.unloading import answers_to_owners, balance, retir
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import LoadDone, LoadErred, LoadOverdue
-from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
+from rr_actors.registrar.model.effects import Effect, Happened, SendReply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -67,7 +67,7 @@ def load(decision: Decision, message: Load) -> None:
     server = message.server
     refused = catalog.refused.get(message.query_id)
     if refused is not None:
-        decision.cause(Reply(message.origin, LoadRefused(message.query_id, refused)))
+        decision.cause(SendReply(message.origin, LoadRefused(message.query_id, refused)))
         return
     if catalog.shut:
         decision.cause(refuse(decision, message.origin, message.query_id, catalog.shut[False]))
@@ -116,7 +116,7 @@ def _join(decision: Decision, message: Load, resource: Resource) -> None:
         if alone:
             decision.forget(catalog.idle, resource.id)
             decision.cause(SetTimer("linger:" + resource.id, None, None))
-        decision.cause(Reply(message.origin, loaded(catalog, message.query_id, resource)))
+        decision.cause(SendReply(message.origin, loaded(catalog, message.query_id, resource)))
         return
     decision.note(catalog.waiting, message.query_id, resource.id)
     decision.note(catalog.waited, message.server, catalog.waited.get(message.server, 0) + 1)
@@ -162,7 +162,7 @@ def _load_again(decision: Decision, message: Load, query: ServedQuery) -> None:
         decision.note(catalog.waiting, query.id, resource.id)
         _look_for_ring(decision, message, resource)
     else:
-        decision.cause(Reply(query.origin, loaded(catalog, query.id, resource)))
+        decision.cause(SendReply(query.origin, loaded(catalog, query.id, resource)))
 
 
 def _is_to_run(resource: Resource) -> bool:
@@ -211,7 +211,7 @@ def load_done(decision: Decision, done: LoadDone) -> None:
     if holders:
         for query_id in holders:
             if decision.forget(catalog.waiting, query_id) is not None:
-                decision.cause(Reply(catalog.queries[query_id].origin, loaded(catalog, query_id, resource)))
+                decision.cause(SendReply(catalog.queries[query_id].origin, loaded(catalog, query_id, resource)))
         # The owner may have unloaded it while it was loading; its present holders came after that.
         if catalog.owners:
             decision.effects += answers_to_owners(decision, resource, None)

@@ -16,7 +16,7 @@ from rr_actors.registrar.core.holding import end_direct
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.effects import FellBehind, LoadResolved, Reply, SetTimer
+from rr_actors.registrar.model.effects import FellBehind, LoadResolved, SendReply, SetTimer
 from rr_actors.registrar.model.messages import Load, LoadRefused, Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Hold, Notice, Resource, ServedQuery, State, is_own
 
@@ -87,7 +87,7 @@ def _send_notice(decision: Decision, notice: Notice) -> None:
     if repeated and notice.response is not None and (resource := catalog.resources.get(notice.resource_id)) is not None:
         notice = replace(notice, response=resource.response)  # its holder may have heard of a newer one
     decision.note(catalog.told, notice.id, True)
-    decision.cause(Reply(notice.origin, Noticed(notice, repeated)))
+    decision.cause(SendReply(notice.origin, Noticed(notice, repeated)))
 
 
 def _send_more(decision: Decision, query_id: str) -> None:
@@ -198,10 +198,10 @@ def _notices_of(decision: Decision, origin: str, query_id: str) -> list[Notice]:
 _REMEMBERED = 4096
 
 
-def refuse(decision: Decision, origin: str, query_id: str, failure: Failure) -> Reply:
+def refuse(decision: Decision, origin: str, query_id: str, failure: Failure) -> SendReply:
     """Return the answer to a Load that has failed, and remember it."""
     remember(decision, query_id, failure)
-    return Reply(origin, LoadRefused(query_id, failure))
+    return SendReply(origin, LoadRefused(query_id, failure))
 
 
 def remember(decision: Decision, query_id: str, failure: Failure) -> None:
@@ -213,9 +213,9 @@ def remember(decision: Decision, query_id: str, failure: Failure) -> None:
             decision.forget(refused, old)
 
 
-def refuse_all(decision: Decision, resource: Resource, failure: Failure) -> list[Reply]:
+def refuse_all(decision: Decision, resource: Resource, failure: Failure) -> list[SendReply]:
     """Return the answers to all that wait for a resource that failed or is taken away, and remove their queries."""
-    replies: list[Reply] = []
+    replies: list[SendReply] = []
     for query in decision.catalog.queries_of(resource.id):
         replies.append(refuse(decision, query.origin, query.id, failure))
         drop_query(decision, query)

@@ -20,7 +20,7 @@ from rr_actors.registrar.core.releasing import add_in_flight, parts_of
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import SetPriority
-from rr_actors.registrar.model.effects import Answer, Happened, Reply, Request, StartResume
+from rr_actors.registrar.model.effects import AnswerCall, Happened, SendReply, SendRequest, StartResume
 from rr_actors.registrar.model.messages import Reprioritise, Reprioritised
 from rr_actors.registrar.model.rows import HELD, QUEUED, RESTING, STANDBY, UNLOADING, Held, State, shown_priority
 
@@ -37,7 +37,7 @@ def reprioritise(decision: Decision, message: Reprioritise) -> None:
         decision.put(replace(query, priority=message.priority))
     resource = decision.catalog.resources[query.resource_id]
     if message.priority <= STANDBY or resource.phase not in RESTING or resource.state is State.FATAL:
-        decision.cause(Reply(query.origin, Reprioritised(query.id, message.priority)))
+        decision.cause(SendReply(query.origin, Reprioritised(query.id, message.priority)))
 
 
 def touch(decision: Decision, resource_id: str) -> None:
@@ -82,7 +82,7 @@ def tell(decision: Decision, held: Held) -> None:
     """Send the provider the priority that a query has here; over its next link, if that is not reconciled."""
     catalog = decision.catalog
     if held.registrar in catalog.up:
-        decision.cause(Request(held.registrar, Reprioritise(held.id, catalog.name, held.priority)))
+        decision.cause(SendRequest(held.registrar, Reprioritise(held.id, catalog.name, held.priority)))
     else:
         decision.note(catalog.unsent, held.id, True)
 
@@ -127,7 +127,7 @@ def set_priority(decision: Decision, command: SetPriority) -> None:
     add_in_flight(decision, command.query_id)
     held = catalog.held.get(command.query_id)
     if held is None or held.hold is not HELD or held.id in catalog.ending:
-        decision.cause(Answer(command.ticket, failures.unknown_query(catalog, command.query_id)))
+        decision.cause(AnswerCall(command.ticket, failures.unknown_query(catalog, command.query_id)))
         return
     changes = held.priority != command.priority
     if changes or not held.own:
@@ -135,7 +135,7 @@ def set_priority(decision: Decision, command: SetPriority) -> None:
         decision.put(held)
     if changes:
         tell(decision, held)
-    decision.cause(Answer(command.ticket, None))
+    decision.cause(AnswerCall(command.ticket, None))
 
 
 def reprioritised(decision: Decision, message: Reprioritised) -> None:

@@ -14,7 +14,7 @@ from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, pr
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import BeginClosing, ConsumerLost, EndClosing, LinkLost, PeerGone, Reconcile
-from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request, UnloadResolved
+from rr_actors.registrar.model.effects import Connect, LoadResolved, SendReply, SendRequest, UnloadResolved
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
 from rr_actors.registrar.model.rows import Held, Hold, State
 from rr_actors.registrar.model.store import is_needed
@@ -131,7 +131,7 @@ def link_lost(decision: Decision, command: LinkLost) -> None:
     reach a provider that was restarted and does not know that it has answered them.
     """
     catalog = decision.catalog
-    kept = [e for e in decision.effects if not (isinstance(e, Request) and e.registrar == command.registrar)]
+    kept = [e for e in decision.effects if not (isinstance(e, SendRequest) and e.registrar == command.registrar)]
     if len(kept) < len(decision.effects):
         decision.effects = [*kept, Connect(command.registrar)]
     decision.forget(catalog.up, command.registrar)
@@ -247,12 +247,12 @@ def fetch(decision: Decision, message: Fetch) -> None:
         row = FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
         more = len(row.request) + len(response or b"")
         if rows and (len(rows) == _CHUNK or size + more > _CHUNK_BYTES):
-            decision.cause(Reply(message.origin, Fetched(rows, True, message.number, same)))
+            decision.cause(SendReply(message.origin, Fetched(rows, True, message.number, same)))
             rows, size = [], 0
         rows.append(row)
         size += more
     notices = message.resume and bool(catalog.notices_to.get(message.origin))
-    decision.cause(Reply(message.origin, Fetched(rows, False, message.number, same, notices)))
+    decision.cause(SendReply(message.origin, Fetched(rows, False, message.number, same, notices)))
     if message.resume:
         drop_parked(decision, lambda parked: parked.origin == message.origin)  # a consumer that lives sends them again
         for id in list(catalog.unanswered):  # the consumer sends these Unloads again over the new link

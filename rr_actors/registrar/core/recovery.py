@@ -66,7 +66,7 @@ from rr_actors.registrar.model.commands import (
     ResumeErred,
     TrialOver,
 )
-from rr_actors.registrar.model.effects import Died, Happened, Reply, SetTimer, StartProbe, StartRecover
+from rr_actors.registrar.model.effects import Died, Happened, SendReply, SetTimer, StartProbe, StartRecover
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import (
     NOT_BEGUN,
@@ -360,7 +360,7 @@ def _answer_loads(decision: Decision, resource: Resource) -> None:
     catalog = decision.catalog
     for query in catalog.queries_of(resource.id):
         if decision.forget(catalog.waiting, query.id) is not None:
-            decision.cause(Reply(query.origin, loaded(catalog, query.id, resource)))
+            decision.cause(SendReply(query.origin, loaded(catalog, query.id, resource)))
     answer_wholes(decision, resource)
     _answer_owners(decision, resource)
 

@@ -17,7 +17,7 @@ from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core.callback_runs import run_id
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Closing, Decision, after_epoch
-from rr_actors.registrar.model.effects import Connect, Effect, LoadResolved, Request
+from rr_actors.registrar.model.effects import Connect, Effect, LoadResolved, SendRequest
 from rr_actors.registrar.model.messages import Unload
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -125,7 +125,7 @@ def _release_next(decision: Decision, closing: Closing) -> None:
         held = catalog.held.get(id)
         if held is not None and held.registrar in catalog.up:
             decision.note(catalog.closings, id, replace(closing, sent=place + 1))
-            decision.cause(Request(held.registrar, Unload(id, catalog.name)))
+            decision.cause(SendRequest(held.registrar, Unload(id, catalog.name)))
             return
         if held is not None:
             decision.cause(Connect(held.registrar))

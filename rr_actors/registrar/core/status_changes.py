@@ -23,7 +23,7 @@ from rr_actors.registrar.core.unloading import begin_unload, stay_lost
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import GraceOver, Revoke, SetResponse, SetStatus, Swap
-from rr_actors.registrar.model.effects import Answer, Happened, SetTimer, StartStatus
+from rr_actors.registrar.model.effects import AnswerCall, Happened, SetTimer, StartStatus
 from rr_actors.registrar.model.messages import Unload
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -93,12 +93,12 @@ def revoke(decision: Decision, command: Revoke) -> None:
     catalog = decision.catalog
     resource = catalog.find(command.target)
     if resource is None:
-        decision.cause(Answer(command.ticket, failures.unknown_target(catalog, command.target)))
+        decision.cause(AnswerCall(command.ticket, failures.unknown_target(catalog, command.target)))
     elif resource.id in catalog.revocations:
-        decision.cause(Answer(command.ticket, failures.not_revoked(resource, "is revoked already")))
+        decision.cause(AnswerCall(command.ticket, failures.not_revoked(resource, "is revoked already")))
     elif not _is_revocable(catalog, resource):
         phase = "recovering" if resource.id in catalog.recovering else resource.phase
-        decision.cause(Answer(command.ticket, failures.not_revoked(resource, f"is {phase}")))
+        decision.cause(AnswerCall(command.ticket, failures.not_revoked(resource, f"is {phase}")))
     else:
         decision.note(catalog.owners, resource.id, (*catalog.owners.get(resource.id, ()), command.ticket))
         _revoke(decision, resource, Revocation(resource.id, command.event, command.why, command.grace_ms))
@@ -243,22 +243,22 @@ def set_status(decision: Decision, command: SetStatus) -> None:
     """Set a status of a resource: its server hears it first, then all holders."""
     resource = decision.catalog.find(command.target)
     if resource is None:
-        decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
+        decision.cause(AnswerCall(command.ticket, failures.unknown_target(decision.catalog, command.target)))
         return
     _say(decision, resource, command, command.state, None)
-    decision.cause(Answer(command.ticket, None))
+    decision.cause(AnswerCall(command.ticket, None))
 
 
 def set_response(decision: Decision, command: SetResponse) -> None:
     """Replace the response of a resource, and send it to every holder with an UPDATE."""
     resource = decision.catalog.find(command.target)
     if resource is None:
-        decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
+        decision.cause(AnswerCall(command.ticket, failures.unknown_target(decision.catalog, command.target)))
     elif resource.response is None:  # it is loading, or it is an interrupted load that is being cleaned up
-        decision.cause(Answer(command.ticket, failures.no_response_yet(resource)))
+        decision.cause(AnswerCall(command.ticket, failures.no_response_yet(resource)))
     else:
         _say(decision, resource, command, State.UPDATE, command.response)
-        decision.cause(Answer(command.ticket, None))
+        decision.cause(AnswerCall(command.ticket, None))
 
 
 def swap(decision: Decision, command: Swap) -> None:
@@ -269,14 +269,14 @@ def swap(decision: Decision, command: Swap) -> None:
     if resource is None or resource.phase not in (LOADED, *RESTING) or part is None or spare is None:
         _release(decision, command.resource_id, (command.spare,))
         failure = failures.not_swapped(catalog, command.resource_id, command.part)
-        decision.cause(Answer(command.ticket, failure))
+        decision.cause(AnswerCall(command.ticket, failure))
         return
     decision.put(spare)  # the disk may not have it yet
     _release(decision, resource.id, (command.part, *command.others))
     if command.response is not None:
         said = SetResponse(resource.id, command.event, command.response, command.message, None, resource.id)
         _say(decision, resource, said, State.UPDATE, command.response)
-    decision.cause(Answer(command.ticket, None))
+    decision.cause(AnswerCall(command.ticket, None))
 
 
 def _part(catalog: Catalog, resource_id: str, query_id: str) -> Held | None:

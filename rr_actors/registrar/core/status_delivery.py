@@ -25,7 +25,7 @@ from rr_actors.registrar.core.status_changes import (
     spread,
     start_status,
 )
-from rr_actors.registrar.model.catalog import Catalog, Decision, Hearing
+from rr_actors.registrar.model.catalog import Catalog, Decision, DeliveredNotice
 from rr_actors.registrar.model.commands import Heard, StatusDone
 from rr_actors.registrar.model.effects import Hear, StartStatus
 from rr_actors.registrar.model.messages import Noticed, Unload
@@ -92,7 +92,7 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
         receivers += _concerns(decision, StartStatus(resource, notice, repeated), listened=listened)
     ends = held.id if notice.released else ""
     if receivers:
-        decision.note(catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
+        decision.note(catalog.hearing, notice.id, DeliveredNotice(provider, receivers, repeated, ends))
     else:
         end_query(decision, ends, provider)
         acknowledge(decision, provider, notice.id)

@@ -34,7 +34,7 @@ from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import ForceUnload, GraceOver, LingerOver, UnloadDone, UnloadErred, Unregister
-from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer, StartPause
+from rr_actors.registrar.model.effects import AnswerCall, Effect, Happened, SendReply, SetTimer, StartPause
 from rr_actors.registrar.model.messages import Gone, Reprioritised, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -63,10 +63,10 @@ def unload(decision: Decision, message: Unload) -> None:
         drop_parked(decision, lambda parked: parked.query_id == message.query_id)
         remember(decision, message.query_id, failures.LET_GO)  # its Load may still come, by another way
         drop_notices(decision, message.origin, message.query_id)  # they say that it was taken away: no longer needed
-        decision.cause(Reply(message.origin, Unloaded(message.query_id)))
+        decision.cause(SendReply(message.origin, Unloaded(message.query_id)))
     elif query.origin != message.origin:
         refusal = UnloadRefused(message.query_id, failures.not_holder(query.id, query.origin, message.origin))
-        decision.cause(Reply(message.origin, refusal))
+        decision.cause(SendReply(message.origin, refusal))
     elif query.resource_id in catalog.recovering:
         park(decision, query.resource_id, message)
     else:
@@ -84,10 +84,10 @@ def _release(decision: Decision, query: ServedQuery) -> None:
         if not again:
             run_unload(decision, resource)
         if resource.server not in catalog.servers:  # the release stays owed, and its end is answered, too
-            decision.cause(Reply(query.origin, UnloadRefused(query.id, failures.serverless(catalog, resource))))
+            decision.cause(SendReply(query.origin, UnloadRefused(query.id, failures.serverless(catalog, resource))))
         return
     drop_query(decision, query)
-    decision.cause(Reply(query.origin, Unloaded(query.id)))
+    decision.cause(SendReply(query.origin, Unloaded(query.id)))
     if last:
         unheld(decision, resource)
 
@@ -231,7 +231,7 @@ def answer_wholes(decision: Decision, resource: Resource) -> None:
     """Say to each whole that may wait for this part that it runs, or that it will not."""
     for query in decision.catalog.queries_of(resource.id):
         if query.parent:
-            decision.cause(Reply(query.origin, Reprioritised(query.id, query.priority)))
+            decision.cause(SendReply(query.origin, Reprioritised(query.id, query.priority)))
 
 
 def refuse_waiting(decision: Decision, resource: Resource, failure: Failure) -> None:
@@ -287,7 +287,7 @@ def _remove(decision: Decision, resource: Resource) -> None:
     after: list[Effect] = []
     for query in decision.catalog.queries_of(resource.id):
         drop_query(decision, query)
-        after.append(Reply(query.origin, Unloaded(query.id)))
+        after.append(SendReply(query.origin, Unloaded(query.id)))
     after += answers_to_owners(decision, resource, None)
     drop_resource(decision, resource)
     decision.cause(Happened("unloaded", resource, ""))
@@ -312,7 +312,7 @@ def _keep(decision: Decision, resource: Resource, failure: Failure) -> None:
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try
             remember(decision, query.id, failure)  # its holder does not let it go any more
-            decision.cause(Reply(query.origin, UnloadRefused(query.id, failure)))
+            decision.cause(SendReply(query.origin, UnloadRefused(query.id, failure)))
         send_notices(decision, query)  # the holder passed them over while it was releasing the query
     decision.effects += answers_to_owners(decision, resource, failure)
     _next_in_queue(decision, resource)
@@ -326,9 +326,9 @@ def _next_in_queue(decision: Decision, gone: Resource) -> None:
             start_queued(decision, catalog.resources[id])
 
 
-def answers_to_owners(decision: Decision, resource: Resource, failure: Failure | None) -> list[Answer]:
+def answers_to_owners(decision: Decision, resource: Resource, failure: Failure | None) -> list[AnswerCall]:
     """Return the answers to the owner's calls that unloaded the resource by force."""
-    return [Answer(ticket, failure) for ticket in decision.forget(decision.catalog.owners, resource.id) or ()]
+    return [AnswerCall(ticket, failure) for ticket in decision.forget(decision.catalog.owners, resource.id) or ()]
 
 
 def settle(decision: Decision, server: str, failure: Failure | None = None) -> None:
@@ -344,7 +344,7 @@ def settle(decision: Decision, server: str, failure: Failure | None = None) -> N
             decision.drop(stored)
         if left and failure is None:
             failure = failures.left_behind(catalog, left)
-        decision.cause(Answer(ticket, failure))
+        decision.cause(AnswerCall(ticket, failure))
 
 
 # The decisions of a provider that takes queries from their holders.
@@ -354,7 +354,7 @@ def force_unload(decision: Decision, command: ForceUnload) -> None:
     """Take a resource from all its holders and unload it; answer the owner when it is gone."""
     resource = decision.catalog.find(command.target)
     if resource is None:
-        decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
+        decision.cause(AnswerCall(command.ticket, failures.unknown_target(decision.catalog, command.target)))
         return
     waiting = decision.catalog.owners.get(resource.id, ())
     decision.note(decision.catalog.owners, resource.id, (*waiting, command.ticket))
@@ -372,7 +372,7 @@ def unregister(decision: Decision, command: Unregister) -> None:
         _clear(decision, command)
         return
     if command.name not in catalog.servers or command.name in catalog.leaving:
-        decision.cause(Answer(command.ticket, failures.unknown_server(catalog, command.name)))
+        decision.cause(AnswerCall(command.ticket, failures.unknown_server(catalog, command.name)))
         return
     decision.note(catalog.leaving, command.name, command.ticket)
     for resource_id in list(catalog.by_server.get(command.name, ())):
@@ -390,7 +390,7 @@ def _clear(decision: Decision, command: Unregister) -> None:
         else:
             _take_away(decision, resource, command.event, why)
         _remove(decision, resource)
-    decision.cause(Answer(command.ticket, None))
+    decision.cause(AnswerCall(command.ticket, None))
 
 
 def grace_over(decision: Decision, command: GraceOver) -> None:
@@ -412,7 +412,7 @@ def _evict(decision: Decision, resource: Resource, event: str, why: str, reason:
         case Phase.UNLOADING:
             for query in decision.catalog.queries_of(resource.id):
                 drop_query(decision, query)
-                decision.cause(Reply(query.origin, Unloaded(query.id)))
+                decision.cause(SendReply(query.origin, Unloaded(query.id)))
         case _:
             refuse_waiting(decision, resource, failures.load_failed(decision.catalog, resource, why))
             _take_away(decision, resource, event, why, reason)

@@ -45,8 +45,8 @@ class EffectRunner:
         self._dirty: dict[int, Link] = {}
         self._silent_until: dict[str, float] = {}  # by consumer: when the log says next that it is behind
         self._methods: dict[type, Callable[[Any], None]] = {
-            e.Reply: self._reply,
-            e.Request: self._request,
+            e.SendReply: self._reply,
+            e.SendRequest: self._request,
             e.Connect: self._connect,
             e.StartLoad: self._start_load,
             e.StartUnload: self._start_unload,
@@ -61,7 +61,7 @@ class EffectRunner:
             e.Receive: self._receive,
             e.Hear: self._hear,
             e.FellBehind: self._fell_behind,
-            e.Answer: self._answer,
+            e.AnswerCall: self._answer,
             e.Happened: self._happened,
             e.Died: self._died,
         }
@@ -98,9 +98,9 @@ class EffectRunner:
         A thread may send only the answer to one direct line, which has no order with other messages. Watchers hear of
         an event before the answer, so while anybody watches, the loop sends both.
         """
-        answer: e.Reply | None = None
+        answer: e.SendReply | None = None
         for effect in effects:
-            if type(effect) is e.Reply and answer is None:
+            if type(effect) is e.SendReply and answer is None:
                 answer = effect
             elif type(effect) is not e.Happened or self._registrar.node.watched.level[0]:
                 return None
@@ -113,10 +113,10 @@ class EffectRunner:
 
     # -- messages ------------------------------------------------------------------------------------------------
 
-    def _reply(self, effect: e.Reply) -> None:
+    def _reply(self, effect: e.SendReply) -> None:
         self._consumers.send(effect.origin, effect.message)
 
-    def _request(self, effect: e.Request) -> None:
+    def _request(self, effect: e.SendRequest) -> None:
         client = self._clients[effect.registrar]
         link = client.link
         if link is None:
@@ -135,7 +135,7 @@ class EffectRunner:
             self._registrar.recorder.message("sent", self._registrar.name, effect.registrar, effect.message)
         self._dirty[id(link)] = link
 
-    def _not_sent(self, effect: e.Request, error: RrError) -> None:
+    def _not_sent(self, effect: e.SendRequest, error: RrError) -> None:
         if type(effect.message) is Load:
             self._registrar.post(c.GiveUp(effect.message.query_id, failure_of(error)))
             return
@@ -263,7 +263,7 @@ class EffectRunner:
         if self._registrar.audience is not None:
             self._registrar.audience.forget(query_id)
 
-    def _answer(self, effect: e.Answer) -> None:
+    def _answer(self, effect: e.AnswerCall) -> None:
         effect.ticket(None if effect.failure is None else error_of(effect.failure))
 
     def _happened(self, effect: e.Happened) -> None:

@@ -31,7 +31,7 @@ from rr_actors.registrar.engine.progress import ProgressListeners, ProgressRepor
 from rr_actors.registrar.engine.registrar_state import DirectPaths, may_be_interrupted
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.effects import Answer, Effect
+from rr_actors.registrar.model.effects import AnswerCall, Effect
 from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, Message, Noticed
 from rr_actors.registrar.model.rows import Change, Held, Notice
 from rr_actors.registrar.model.store import Store
@@ -258,7 +258,7 @@ class RegistrarMonitor:
         return True
 
     @any_thread
-    def answer_here(self, command: Callable[[object], c.Command]) -> Answer | None:
+    def answer_here(self, command: Callable[[object], c.Command]) -> AnswerCall | None:
         """Decide a command of the calling thread, and return its answer; None if the loop has to decide it.
 
         The loop carries out all other effects, in order.
@@ -272,7 +272,7 @@ class RegistrarMonitor:
             effects = self._committed_here(command(None))
             if effects is None:
                 return None
-            answer = next(effect for effect in effects if type(effect) is Answer and effect.ticket is None)
+            answer = next(effect for effect in effects if type(effect) is AnswerCall and effect.ticket is None)
             effects.remove(answer)
             self._effects.append(effects)
         self._dispatcher.hand_over(self.act)

@@ -173,7 +173,7 @@ class RegistrarActor(RegistrarBase):
     # -- loads and unloads ---------------------------------------------------------------------------------------
 
     @on_loop
-    def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
+    def ask(self, ask: c.AskProvider, waiter: LoadWaiter) -> None:
         """Load; `waiter` hears how the load ended."""
         if self.closed:
             waiter(None, self.down())

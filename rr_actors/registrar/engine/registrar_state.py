@@ -103,7 +103,7 @@ def answered_by_line(_error: RrError | None) -> None:
     """Do nothing: this waiter marks an unload whose thread reads the answer on its own direct line."""
 
 
-class Stop(threading.Event):
+class StopEvent(threading.Event):
     """Says that nobody needs the result of a run of a callback any more.
 
     `cancel`: called when it is set. `is_told`: whether the registrar has set it. User code may set it, too: to end its
@@ -156,7 +156,7 @@ class RegistrarState:
         self.sequence = itertools.count(self.catalog.since + 1)
         self.loads: dict[str, LoadWaiter] = {}
         self.unloads: dict[str, UnloadWaiter] = {}
-        self._stops: dict[str, dict[tuple[Phase, int], Stop]] = {}  # of runs of callbacks, by resource
+        self._stops: dict[str, dict[tuple[Phase, int], StopEvent]] = {}  # of runs of callbacks, by resource
         self._loads_over: dict[str, threading.Event] = {}  # set when a load is over, by resource
         self.closed = False
         self._why_down = "closed"
@@ -230,7 +230,7 @@ class RegistrarState:
             cancel: called when it is set, with the lock; at once if it is set already.
         """
         with self.lock:
-            stop = self._stops.setdefault(resource_id, {}).setdefault((phase, attempt), Stop())
+            stop = self._stops.setdefault(resource_id, {}).setdefault((phase, attempt), StopEvent())
             stop.cancel = cancel or stop.cancel
             catalog = self.whole()
             unwanted = self.closed or is_unwanted(catalog, resource_id, phase, attempt)

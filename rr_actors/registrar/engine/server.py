@@ -57,7 +57,7 @@ from rr_actors.registrar.engine.status import Status, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
-from rr_actors.registrar.model.health import WELL, Found, Health, ProbeCounts, first_counts, judged
+from rr_actors.registrar.model.health import WELL, Health, ProbeCounts, ProbeResult, first_counts, judged
 from rr_actors.registrar.model.messages import Described, Load
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -786,7 +786,7 @@ class ServerActor:
             done = functools.partial(self._suspect_ended, resource_id)
             self._submit(PROBE, resource, resource.attempt, done)
 
-    def _suspect_ended(self, resource_id: str, found: Found | None, error: BaseException | None) -> None:
+    def _suspect_ended(self, resource_id: str, found: ProbeResult | None, error: BaseException | None) -> None:
         self.registrar.post(c.ProbeDone(resource_id))
         self._probe_ended(resource_id, found, error)
 
@@ -795,7 +795,7 @@ class ServerActor:
             raise Unavailable(f"{self.origin}: resource {resource.id} is not probed now")
         return self._request_and_response_of(resource)
 
-    def _found(self, answer: object) -> Found:
+    def _found(self, answer: object) -> ProbeResult:
         if answer is None:
             return WELL
         status = answer if is_a(answer, Status) else None
@@ -804,16 +804,16 @@ class ServerActor:
             expected = "None, or the State OK, WARNING, ERROR or FATAL, or a Status with one"
             text = f"expected {expected}, got {shown(answer)} ({type(answer).__name__})"
             raise InvalidResponse(text, server=self.origin, path="", expected=expected)
-        return Found(State(state), "" if status is None else status.message)
+        return ProbeResult(State(state), "" if status is None else status.message)
 
-    def _probe_ended(self, resource_id: str, found: Found | None, error: BaseException | None) -> None:
+    def _probe_ended(self, resource_id: str, found: ProbeResult | None, error: BaseException | None) -> None:
         if self.probes.ended(resource_id):
-            self._judge(resource_id, found or Found(State.ERROR, "" if error is None else _text_of(error)), error)
+            self._judge(resource_id, found or ProbeResult(State.ERROR, "" if error is None else _text_of(error)), error)
 
     def _probe_late(self, resource_id: str) -> None:
-        self._judge(resource_id, Found(State.ERROR, f"not returned within {self._health.timeout_s:g} s"))
+        self._judge(resource_id, ProbeResult(State.ERROR, f"not returned within {self._health.timeout_s:g} s"))
 
-    def _judge(self, resource_id: str, found: Found, error: BaseException | None = None) -> None:
+    def _judge(self, resource_id: str, found: ProbeResult, error: BaseException | None = None) -> None:
         """Count a result, and set the status of the resource if its state changes by that."""
         if self.registrar.closed or not self._is_probed(resource_id):
             return

@@ -83,7 +83,7 @@ class ProviderLink:
         self._fetching: list[Fetching] = []  # called fetch(), oldest first
         self._listed_for = 0  # how many of them the last Fetch asks for: those that had called before it was sent
         self._reconciled = False
-        self._known: digests.Known | None = None  # the rows held there, and their digests, when last looked at
+        self._known: digests.HeldRows | None = None  # the rows held there, and their digests, when last looked at
         self._number = registrar.epoch << 32  # the number of the last Fetch
         self._linked = False  # whether there was ever a link
         self._gone = False  # whether the registrar knows that the provider is gone for good
@@ -220,7 +220,7 @@ class ProviderLink:
             return _STOPPED_RETRY_S
         return None
 
-    async def _look_ahead(self) -> digests.Known | None:
+    async def _look_ahead(self) -> digests.HeldRows | None:
         """Return the rows held at the provider with their digests, before the link is there.
 
         They are probably still true then. The loop serves others in between.
@@ -232,7 +232,7 @@ class ProviderLink:
         for span in digests.cut(rows):
             told.append(span)
             await asyncio.sleep(0)
-        return digests.Known(rows, told)
+        return digests.HeldRows(rows, told)
 
     async def _dial(self, address: str) -> None:
         transport = self._node.local if address == self._node.local.address else self._node.transport
@@ -256,7 +256,7 @@ class ProviderLink:
     def _hello(self, kind: str) -> Hello:
         return Hello(kind, self.provider, self._registrar.name, self._registrar.epoch)
 
-    def _send_fetch(self, link: Link, *, resume: bool, known: digests.Known | None = None) -> None:
+    def _send_fetch(self, link: Link, *, resume: bool, known: digests.HeldRows | None = None) -> None:
         self._number += 1
         self._listed_for = len(self._fetching)
         link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))

@@ -21,8 +21,7 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import MailboxFull, RegistrarDown, RrError, Unavailable, UnknownRegistrar
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.failure import Failure, error_of, failure_of
-from rr_actors.runtime.callback_errors import Raised as CallbackRaised
-from rr_actors.runtime.callback_errors import described
+from rr_actors.runtime.callback_errors import Raised, described
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.name_service import Directory, Presence, registrar_key
 from rr_actors.wire.transport import Hello, Link, Transport
@@ -33,7 +32,7 @@ logger = Log("rr_actors")
 KIND = "handle"
 
 
-class Call(msgspec.Struct, frozen=True, array_like=True, tag=1):
+class CallMethod(msgspec.Struct, frozen=True, array_like=True, tag=1):
     """Call a method; `body` has its arguments. Its `timeout_s` is shortened by `late_s`, its wait to be sent."""
 
     number: int
@@ -50,14 +49,14 @@ class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
     more: bool = False
 
 
-class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
+class CallRaised(msgspec.Struct, frozen=True, array_like=True, tag=3):
     """The error of a call."""
 
     number: int
     failure: Failure
 
 
-HandleMessage = Call | Returned | Raised
+HandleMessage = CallMethod | Returned | CallRaised
 
 _ASKING = frozenset(
     {
@@ -76,7 +75,7 @@ METHODS = _ASKING | {
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
 
-class Place(Protocol):
+class LinkHost(Protocol):
     """What both ends of a handle's link use of their process (hosting/node.py)."""
 
     dispatcher: Dispatcher
@@ -93,12 +92,12 @@ class Place(Protocol):
 class Door:
     """The end of a handle's link where the registrar lives."""
 
-    def __init__(self, node: Place, registrar: object, _link: Link) -> None:
+    def __init__(self, node: LinkHost, registrar: object, _link: Link) -> None:
         self._node = node
         self._registrar = registrar
         self._calling = described(self._call, "a handle's call", failure_of)
 
-    def received(self, link: Link, message: Call) -> None:
+    def received(self, link: Link, message: CallMethod) -> None:
         """Run the call in a worker and send its answer."""
         workers = self._node.dispatcher.workers
 
@@ -106,15 +105,15 @@ class Door:
             if error is None:
                 self._send_parts(link, message.number, memoryview(body))
             else:
-                own = error.details if type(error) is CallbackRaised else failure_of(error)
-                self._send_error(link, Raised(message.number, own))
+                own = error.details if type(error) is Raised else failure_of(error)
+                self._send_error(link, CallRaised(message.number, own))
 
         try:
             workers.submit(self._calling, message, done=done)
         except Unavailable as error:
             done(b"", error)
 
-    def _call(self, message: Call) -> bytes:
+    def _call(self, message: CallMethod) -> bytes:
         if message.method not in METHODS:
             raise Unavailable(f"registrar handle: no method {message.method!r}")
         args, kwargs = pickling.loads(message.body)
@@ -134,7 +133,7 @@ class Door:
             self._node.dispatcher.loop.call_later(_RETRY_S, self._send_parts, link, number, left)
         link.flush()
 
-    def _send_error(self, link: Link, error: Raised) -> None:
+    def _send_error(self, link: Link, error: CallRaised) -> None:
         """Send a call's error, if need be every 10 ms until the link takes it."""
         try:
             link.send(error)
@@ -165,7 +164,7 @@ class _Open(msgspec.Struct):
 class HandleLine:
     """The caller's end of a handle's link. It calls methods of one registrar, in whatever process that is now."""
 
-    def __init__(self, node: Place, registrar: str) -> None:
+    def __init__(self, node: LinkHost, registrar: str) -> None:
         self._node = node
         self._registrar = registrar
         self._link: Link | None = None
@@ -233,7 +232,7 @@ class HandleLine:
         number = next(self._numbers)
         call = self._open[number] = _Open(method, asyncio.get_running_loop().create_future())
         try:
-            link.send(Call(number, method, body, late_s if late_s >= _RETRY_S else 0.0))
+            link.send(CallMethod(number, method, body, late_s if late_s >= _RETRY_S else 0.0))
             link.flush()
             return await call.answer
         finally:
@@ -282,12 +281,12 @@ class HandleLine:
         text = f"registrar {self._registrar!r}: {status}{because}"
         return RegistrarDown(text, registrar=self._registrar, status=str(status))
 
-    def received(self, link: Link, message: Returned | Raised) -> None:
+    def received(self, link: Link, message: Returned | CallRaised) -> None:
         """Note an answer, or a part of one, for its call."""
         call = self._open.get(message.number)
         if call is None or call.answer.done():
             return
-        if isinstance(message, Raised):
+        if isinstance(message, CallRaised):
             call.answer.set_exception(error_of(message.failure))
             return
         call.parts.append(message.body)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.model.effects import Connect, Effect, Request, StartStatus
+from rr_actors.registrar.model.effects import Connect, Effect, SendRequest, StartStatus
 from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import (
     HELD,
@@ -90,7 +90,7 @@ class Closing(msgspec.Struct, frozen=True):
     after: tuple[Effect, ...]
 
 
-class Hearing(msgspec.Struct, frozen=True):
+class DeliveredNotice(msgspec.Struct, frozen=True):
     """A notice that its receivers are dealing with: its provider, how many receivers are left, whether it is repeated.
 
     `ends`: the query that ends when they have finished ("" for none).
@@ -201,7 +201,7 @@ class Catalog:
         self.told: dict[str, bool] = dict.fromkeys(self.notices, False)
         self.behind: dict[str, int] = {}
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
-        self.hearing: dict[str, Hearing] = {}
+        self.hearing: dict[str, DeliveredNotice] = {}
         self.deferred: dict[str, tuple[StartStatus, ...]] = {}
         self.next_to_hear: dict[str, StartStatus] = {}
         self.listened: set[str] = set()  # queries and server ids with a listener, which may deal with a status
@@ -606,7 +606,7 @@ class Decision:
 
     def request(self, registrar: str, message: Message) -> None:
         """Send a message to a provider if its link is up; else have one made, which sends all open messages again."""
-        self.cause(Request(registrar, message) if registrar in self.catalog.up else Connect(registrar))
+        self.cause(SendRequest(registrar, message) if registrar in self.catalog.up else Connect(registrar))
 
     def close(self) -> None:
         """Keep the changes: they are on disk, or wait to be written."""

@@ -294,7 +294,7 @@ class GraceOver(Command, frozen=True):
 # -- as a consumer ---------------------------------------------------------------------------------------------------
 
 
-class Ask(Command, frozen=True, gc=False):
+class AskProvider(Command, frozen=True, gc=False):
     """Load from a provider's server, for a resource of this registrar (`parent`, "" for none).
 
     `seq`: its running number in the order of loads. `own`: the caller gave a `priority`; else a part inherits it.

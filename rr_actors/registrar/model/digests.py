@@ -40,7 +40,7 @@ Bounds = list[tuple[int, int]]
 """Spans that do not differ, in order: the number before the first query, and the last number."""
 
 
-class Known(msgspec.Struct, frozen=True):
+class HeldRows(msgspec.Struct, frozen=True):
     """The rows held at a provider, and their spans."""
 
     rows: list[Held]
@@ -55,9 +55,9 @@ def held_at(catalog: Catalog, provider: str) -> list[Held]:
     return [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is HELD]
 
 
-def known(rows: list[Held], before: Known | None = None) -> Known:
+def known(rows: list[Held], before: HeldRows | None = None) -> HeldRows:
     """Return the rows with their digests. If the rows are those of `before`, its digests are reused."""
-    return before if before is not None and rows == before.rows else Known(rows, list(cut(rows)))
+    return before if before is not None and rows == before.rows else HeldRows(rows, list(cut(rows)))
 
 
 def cut(rows: list[Held]) -> Iterator[tuple[int, bytes]]:

@@ -19,14 +19,14 @@ class Effect(msgspec.Struct, frozen=True):
     """The base of all effects; EffectRunner has a table from each type to its method."""
 
 
-class Reply(Effect, frozen=True, gc=False):
+class SendReply(Effect, frozen=True, gc=False):
     """Send to the consumer `origin`; lost if it has no link (it will ask again)."""
 
     origin: str
     message: Message
 
 
-class Request(Effect, frozen=True, gc=False):
+class SendRequest(Effect, frozen=True, gc=False):
     """Send to a provider over our link; lost if that is down (the next link sends all open messages again)."""
 
     registrar: str
@@ -139,7 +139,7 @@ class FellBehind(Effect, frozen=True):
     dropped: int = 0
 
 
-class Answer(Effect, frozen=True):
+class AnswerCall(Effect, frozen=True):
     """Answer a call of the owner."""
 
     ticket: Any

@@ -57,14 +57,14 @@ class Health(msgspec.Struct, frozen=True):
         check_number(seconds, "health", field, least=_SHORTEST_S, most=_LONGEST_S, also=also)
 
 
-class Found(msgspec.Struct, frozen=True):
+class ProbeResult(msgspec.Struct, frozen=True):
     """The result of a probe. ERROR is a failure. `message` is text for people."""
 
     state: State
     message: str = ""
 
 
-WELL = Found(State.OK)
+WELL = ProbeResult(State.OK)
 
 
 class ProbeCounts(msgspec.Struct, frozen=True):
@@ -92,7 +92,7 @@ def first_counts(state: State) -> ProbeCounts:
     return ProbeCounts(state if state in _NOT_WELL else State.OK)
 
 
-def judged(health: Health, counts: ProbeCounts, found: Found, now_s: float) -> tuple[ProbeCounts, State | None]:
+def judged(health: Health, counts: ProbeCounts, found: ProbeResult, now_s: float) -> tuple[ProbeCounts, State | None]:
     """Return the counters after one more result, and the state to announce; None if it has not changed.
 
     Args:

@@ -36,7 +36,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, check_significant
-from rr_actors.supervision.core.state import Call, Decision, Phase, SupervisedChild, SupervisorState, Why
+from rr_actors.supervision.core.state import Call, ChildPhase, Decision, SupervisedChild, SupervisorState, Why
 from rr_actors.supervision.core.transition import Draft
 
 # -- messages ------------------------------------------------------------------------------------------------------
@@ -245,26 +245,26 @@ def _terminate(draft: Draft, child: SupervisedChild, caller: Hashable) -> None:
         draft.reply(child.starters, error=draft.start_error(child, "terminate_child() ended it"))
         child = draft.put(child, starters=())
     match child.phase:
-        case Phase.STOPPED if not draft.forgets(child):
+        case ChildPhase.STOPPED if not draft.forgets(child):
             draft.reply([caller])
-        case Phase.DUE | Phase.STOPPED:  # a temporary child is STOPPED only if an update added it
+        case ChildPhase.DUE | ChildPhase.STOPPED:  # a temporary child is STOPPED only if an update added it
             draft.down(child, "stopped")
             draft.reply([caller])
             replay(draft, child.waiting)
-        case Phase.STARTING | Phase.RUNNING | Phase.CONDEMNED:
+        case ChildPhase.STARTING | ChildPhase.RUNNING | ChildPhase.CONDEMNED:
             draft.stop(draft.put(child, stoppers=(caller,)))
-        case Phase.RECYCLING | Phase.STOPPING:
-            draft.put(child, phase=Phase.STOPPING, stoppers=(*child.stoppers, caller))
+        case ChildPhase.RECYCLING | ChildPhase.STOPPING:
+            draft.put(child, phase=ChildPhase.STOPPING, stoppers=(*child.stoppers, caller))
 
 
 def _standing(child: SupervisedChild) -> Literal["running", "restarting", "stopped"] | None:
     """Return a child's state for a call; None if the call must wait for a start or stop that a caller asked for."""
     match child.phase:
-        case Phase.STOPPED:
+        case ChildPhase.STOPPED:
             return "stopped"
-        case Phase.RUNNING:
+        case ChildPhase.RUNNING:
             return "running"
-        case Phase.STOPPING:
+        case ChildPhase.STOPPING:
             return None
         case _:
             return "restarting" if child.why is Why.RESTART else None
@@ -286,7 +286,7 @@ def _refusal(draft: Draft, child: SupervisedChild, call: Call, standing: str) ->
 
 
 def _not_found(tree: SupervisorState, id: str) -> NotFound:
-    known = ", ".join(child.id for child in Children.of(tree.children).first(10, *Phase)) or "none"
+    known = ", ".join(child.id for child in Children.of(tree.children).first(10, *ChildPhase)) or "none"
     more = ", ..." if len(tree.children) > 10 else ""
     return NotFound(f"supervisor {tree.path} has no child {shown(id)} (it has: {known}{more})", id=id)
 

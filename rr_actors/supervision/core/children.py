@@ -12,9 +12,9 @@ from collections.abc import Collection, Iterator, Mapping
 from heapq import merge
 from itertools import islice
 
-from rr_actors.supervision.core.state import Phase, SupervisedChild, Why
+from rr_actors.supervision.core.state import ChildPhase, SupervisedChild, Why
 
-_Kind = tuple[Phase, Why, bool]
+_Kind = tuple[ChildPhase, Why, bool]
 _Place = tuple[int, SupervisedChild]  # its number in the order, and the child
 
 _ALL = tuple(Why)
@@ -88,12 +88,12 @@ class Children(Mapping[str, SupervisedChild]):
         """Return the children but that one."""
         return self._next(self._own(), id, None)
 
-    def first(self, count: int, *phases: Phase, whys: Collection[Why] = _ALL) -> list[SupervisedChild]:
+    def first(self, count: int, *phases: ChildPhase, whys: Collection[Why] = _ALL) -> list[SupervisedChild]:
         """Return the first children, `count` at most, that are in one of these phases for one of these purposes."""
         table = self._own()
         return [self[table.ids[number]] for number in islice(merge(*_having(table, phases, whys)), count)]
 
-    def last(self, *phases: Phase) -> SupervisedChild | None:
+    def last(self, *phases: ChildPhase) -> SupervisedChild | None:
         """Return the last child that is in one of these phases."""
         table = self._own()
         found = max((numbers[-1] for numbers in _having(table, phases, _ALL)), default=None)
@@ -106,13 +106,13 @@ class Children(Mapping[str, SupervisedChild]):
         following = merge(*(numbers[bisect_right(numbers, number) :] for numbers in table.numbers.values()))
         return [self[table.ids[each]] for each in following]
 
-    def any(self, *phases: Phase, whys: Collection[Why] = _ALL) -> bool:
+    def any(self, *phases: ChildPhase, whys: Collection[Why] = _ALL) -> bool:
         """Return whether a child is in one of these phases, for one of these purposes."""
         return bool(_having(self._own(), phases, whys))
 
     def any_significant(self) -> bool:
         """Return whether a significant child is not stopped."""
-        return any(significant and phase is not Phase.STOPPED for phase, _, significant in self._own().numbers)
+        return any(significant and phase is not ChildPhase.STOPPED for phase, _, significant in self._own().numbers)
 
     def __getitem__(self, id: str) -> SupervisedChild:
         return self._own().places[id][1]
@@ -143,5 +143,5 @@ class Children(Mapping[str, SupervisedChild]):
         return new
 
 
-def _having(table: _Table, phases: Collection[Phase], whys: Collection[Why]) -> list[list[int]]:
+def _having(table: _Table, phases: Collection[ChildPhase], whys: Collection[Why]) -> list[list[int]]:
     return [numbers for (phase, why, _), numbers in table.numbers.items() if phase in phases and why in whys]

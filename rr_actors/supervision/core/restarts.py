@@ -17,12 +17,12 @@ from rr_actors.supervision.core.child_calls import replay
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import Backoff, RestartType
 from rr_actors.supervision.core.state import (
+    ChildPhase,
     Decision,
     Event,
     Exit,
     ExitSupervisor,
     Mode,
-    Phase,
     Reason,
     SupervisedChild,
     SupervisorState,
@@ -60,7 +60,7 @@ def decide_start(tree: SupervisorState, now: float) -> Decision:
         raise UsageError(f"supervisor {tree.path}: started twice (it is {tree.mode.name.lower()})")
     draft = Draft(replace(tree, mode=Mode.STARTING), now)
     for child in list(tree.children.values()):
-        draft.put(child, phase=Phase.DUE, why=Why.INIT)
+        draft.put(child, phase=ChildPhase.DUE, why=Why.INIT)
     draft.advance()
     return draft.done()
 
@@ -87,14 +87,14 @@ def decide_started(tree: SupervisorState, id: str, run: int, now: float, *, igno
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case SupervisedChild(phase=Phase.STARTING):
+        case SupervisedChild(phase=ChildPhase.STARTING):
             if ignored:
                 draft.down(replace(child, why=Why.RESTART), "ignored", keep=child.why is Why.MANUAL)
             else:
                 draft.report("started", child, "running")
                 draft.put(
                     child,
-                    phase=Phase.RUNNING,
+                    phase=ChildPhase.RUNNING,
                     why=Why.RESTART,
                     up_at=now,
                     starters=(),
@@ -105,9 +105,9 @@ def decide_started(tree: SupervisorState, id: str, run: int, now: float, *, igno
             draft.reply(child.starters, id=None if ignored else id)
             if child.waiting:
                 replay(draft, child.waiting)
-        case SupervisedChild(phase=Phase.CONDEMNED) if ignored:
-            draft.put(child, phase=Phase.DUE)
-        case SupervisedChild(phase=Phase.CONDEMNED):
+        case SupervisedChild(phase=ChildPhase.CONDEMNED) if ignored:
+            draft.put(child, phase=ChildPhase.DUE)
+        case SupervisedChild(phase=ChildPhase.CONDEMNED):
             draft.put(child, up_at=now)
         case _:
             return tree, []  # the child is being stopped: decide_stopped follows
@@ -122,11 +122,11 @@ def decide_start_failed(
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case SupervisedChild(phase=Phase.STARTING):
+        case SupervisedChild(phase=ChildPhase.STARTING):
             _start_failed(draft, child, reason, chance)
-        case SupervisedChild(phase=Phase.CONDEMNED):  # a group restart was about to stop it: the failure does not count
+        case SupervisedChild(phase=ChildPhase.CONDEMNED):  # a group restart was to stop it: the failure does not count
             draft.report("start_failed", child, child.state, error=reason)
-            draft.put(child, phase=Phase.DUE)
+            draft.put(child, phase=ChildPhase.DUE)
         case _:
             return tree, []
     draft.advance()
@@ -183,15 +183,15 @@ def decide_exit(tree: SupervisorState, id: str, run: int, exit: Exit, now: float
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case SupervisedChild(phase=Phase.RUNNING):
+        case SupervisedChild(phase=ChildPhase.RUNNING):
             _exited(draft, child, exit, chance)
-        case SupervisedChild(phase=Phase.CONDEMNED):  # a group restart was about to stop it: its end does not count
+        case SupervisedChild(phase=ChildPhase.CONDEMNED):  # a group restart was to stop it: its end does not count
             if child.spec.restart == "temporary" and child.why is Why.RESTART:
                 draft.down(child, "exited", exit)
             else:
                 draft.report("exited", child, child.state, exit=exit)
-                draft.put(child, phase=Phase.DUE)
-        case SupervisedChild(phase=Phase.STARTING):
+                draft.put(child, phase=ChildPhase.DUE)
+        case SupervisedChild(phase=ChildPhase.STARTING):
             return decide_start_failed(tree, id, run, StartFailed(f"ended before it was ready: {exit}"), now, chance)
         case _:
             return tree, []
@@ -214,15 +214,15 @@ def decide_stopped(tree: SupervisorState, id: str, run: int, exit: Exit, now: fl
     draft = Draft(tree, now)
     child = draft.find(id, run)
     match child:
-        case SupervisedChild(phase=Phase.RECYCLING):
+        case SupervisedChild(phase=ChildPhase.RECYCLING):
             draft.report("stopped", child, child.state, exit=exit)
-            draft.put(child, phase=Phase.DUE, stoppers=())
-        case SupervisedChild(phase=Phase.STOPPING):
+            draft.put(child, phase=ChildPhase.DUE, stoppers=())
+        case SupervisedChild(phase=ChildPhase.STOPPING):
             draft.down(child, "stopped", exit)
         case _:
             return tree, []
     draft.reply(child.stoppers)
-    if child.phase is Phase.STOPPING:
+    if child.phase is ChildPhase.STOPPING:
         replay(draft, child.waiting)
     draft.advance()
     return draft.done()

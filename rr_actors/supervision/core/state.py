@@ -50,7 +50,7 @@ class Exit(Struct, frozen=True):
         return f"{self.reason} ({self.detail})" if self.detail else self.reason
 
 
-class Phase(enum.Enum):
+class ChildPhase(enum.Enum):
     """The phase of a child between start and stop, as the core sees it."""
 
     STOPPED = enum.auto()  # down, and nothing will start it by itself (OTP: undefined)
@@ -100,7 +100,7 @@ class SupervisedChild(Struct, frozen=True):
     id: str
     spec: ChildSpec
     extra: tuple[Any, ...] = ()
-    phase: Phase = Phase.STOPPED
+    phase: ChildPhase = ChildPhase.STOPPED
     why: Why = Why.INIT
     run: int = 0
     previous: int = 0
@@ -116,9 +116,9 @@ class SupervisedChild(Struct, frozen=True):
     def state(self) -> ChildState:
         """The state that which_children shows. A child that a caller stops is "running" until it is down."""
         match self.phase:
-            case Phase.STOPPED:
+            case ChildPhase.STOPPED:
                 return "stopped"
-            case Phase.RUNNING | Phase.STOPPING:
+            case ChildPhase.RUNNING | ChildPhase.STOPPING:
                 return "running"
             case _:
                 return "restarting" if self.why is Why.RESTART else "starting"
@@ -126,7 +126,7 @@ class SupervisedChild(Struct, frozen=True):
     @property
     def down(self) -> bool:
         """Whether nothing of the child runs."""
-        return self.phase in (Phase.STOPPED, Phase.DUE)
+        return self.phase in (ChildPhase.STOPPED, ChildPhase.DUE)
 
     @property
     def start_spec(self) -> ChildSpec:
@@ -265,7 +265,7 @@ class Report(Struct, frozen=True):
     delay_s: float = 0.0
 
 
-class Reply(Struct, frozen=True):
+class CallReply(Struct, frozen=True):
     """The answer to an administrative call: `error` if set, else the child's `id`, or None if it returned IGNORE.
 
     start_child, restart_child: the child's id; terminate_child, delete_child, update: None.
@@ -291,5 +291,5 @@ class ExitSupervisor(Struct, frozen=True):
     error: RrError | None = None
 
 
-Action = StartChild | StopChild | Report | Reply | SupervisorStarted | ExitSupervisor
+Action = StartChild | StopChild | Report | CallReply | SupervisorStarted | ExitSupervisor
 Decision = tuple[SupervisorState, list[Action]]

@@ -18,19 +18,19 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rr_actors.base.errors import Described, NotFound, RestartIntensityExceeded, RrError, StartFailed, text_of
+from rr_actors.base.errors import DescribedError, NotFound, RestartIntensityExceeded, RrError, StartFailed, text_of
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.state import (
     Action,
+    CallReply,
+    ChildPhase,
     ChildState,
     Decision,
     Event,
     Exit,
     ExitSupervisor,
     Mode,
-    Phase,
-    Reply,
     Report,
     Restart,
     StartChild,
@@ -76,18 +76,18 @@ class Draft:
     def start(self, child: SupervisedChild, delay_s: float = 0.0) -> None:
         """Start the child, as the next run."""
         self.tree = replace(self.tree, last_run=self.tree.last_run + 1)
-        child = self.put(child, phase=Phase.STARTING, run=self.tree.last_run, previous=child.run, up_at=None)
+        child = self.put(child, phase=ChildPhase.STARTING, run=self.tree.last_run, previous=child.run, up_at=None)
         self.actions.append(StartChild(child.id, child.run, child.start_spec, delay_s, child.why))
 
     def due(self, child: SupervisedChild, delay_s: float = 0.0) -> None:
         """Start the child now, or, in a group, make it due until its turn comes."""
         if self.tree.grouped:
             self.tree = replace(self.tree, delay_s=max(delay_s, self.tree.delay_s))
-            self.put(child, phase=Phase.DUE)
+            self.put(child, phase=ChildPhase.DUE)
         else:
             self.start(child, delay_s)
 
-    def stop(self, child: SupervisedChild, phase: Phase = Phase.STOPPING) -> SupervisedChild:
+    def stop(self, child: SupervisedChild, phase: ChildPhase = ChildPhase.STOPPING) -> SupervisedChild:
         """Stop the child's present run; `phase` is STOPPING or RECYCLING."""
         self.actions.append(StopChild(child.id, child.run, child.spec.shutdown_s))
         return self.put(child, phase=phase)
@@ -108,7 +108,7 @@ class Draft:
         if forgotten:
             self.children = self.children.without(child.id)
         else:
-            self.put(child, phase=Phase.STOPPED, why=Why.RESTART, starters=(), stoppers=(), waiting=())
+            self.put(child, phase=ChildPhase.STOPPED, why=Why.RESTART, starters=(), stoppers=(), waiting=())
 
     # -- what to tell ------------------------------------------------------------------------------------------------
 
@@ -118,13 +118,13 @@ class Draft:
 
     def reply(self, callers: Iterable[Hashable], id: str | None = None, error: RrError | None = None) -> None:
         """Give all these callers the same answer."""
-        self.actions.extend(Reply(caller, id, error) for caller in callers)
+        self.actions.extend(CallReply(caller, id, error) for caller in callers)
 
     def start_error(self, child: SupervisedChild, cause: BaseException | str) -> StartFailed:
         """Return the error for a start that failed or was cut short."""
         text = cause if isinstance(cause, str) else text_of(cause)
         wanted = wanted_by(cause) if isinstance(cause, BaseException) else ""
-        if isinstance(cause, Described):
+        if isinstance(cause, DescribedError):
             cause = cause.error
         if isinstance(cause, RrError):  # its text says it all
             text = text.partition(": ")[2] or text
@@ -176,18 +176,18 @@ class Draft:
             match child.phase:
                 case _ if child.id == cause:
                     pass
-                case Phase.RUNNING:
-                    self.put(child, phase=Phase.CONDEMNED)
-                case Phase.STARTING:  # not up yet: its start is repeated, for the same purpose
+                case ChildPhase.RUNNING:
+                    self.put(child, phase=ChildPhase.CONDEMNED)
+                case ChildPhase.STARTING:  # not up yet: its start is repeated, for the same purpose
                     # A temporary child never becomes a member that is restarted: its caller waits for the second start.
                     joins = child.why is Why.MANUAL and child.spec.restart != "temporary"
-                    self.put(child, phase=Phase.CONDEMNED, why=Why.RESTART if joins else child.why)
-                case Phase.STOPPED if self.forgets(child):  # an update added it, and it was never started
+                    self.put(child, phase=ChildPhase.CONDEMNED, why=Why.RESTART if joins else child.why)
+                case ChildPhase.STOPPED if self.forgets(child):  # an update added it, and it was never started
                     self.down(child, "stopped")
-                case Phase.STOPPED:  # OTP: the whole group is started, also children stopped by hand
-                    self.put(child, phase=Phase.DUE, why=Why.RESTART)
-                case Phase.STOPPING if not self.forgets(child):
-                    self.put(child, phase=Phase.RECYCLING, why=Why.RESTART)
+                case ChildPhase.STOPPED:  # OTP: the whole group is started, also children stopped by hand
+                    self.put(child, phase=ChildPhase.DUE, why=Why.RESTART)
+                case ChildPhase.STOPPING if not self.forgets(child):
+                    self.put(child, phase=ChildPhase.RECYCLING, why=Why.RESTART)
                 case _:
                     pass
 
@@ -200,15 +200,15 @@ class Draft:
             self.reply(child.starters, error=self.start_error(child, f"supervisor {self.tree.path} is stopping"))
             self.reply([call.caller for call in child.waiting], error=self.gone())
             child = self.put(child, starters=(), waiting=())
-            starting = child.phase in (Phase.STARTING, Phase.CONDEMNED) and child.up_at is None
-            if child.phase is Phase.DUE:
+            starting = child.phase in (ChildPhase.STARTING, ChildPhase.CONDEMNED) and child.up_at is None
+            if child.phase is ChildPhase.DUE:
                 self.down(child, "stopped")
-            elif starting or (child.phase is Phase.RUNNING and self.tree.dynamic):
+            elif starting or (child.phase is ChildPhase.RUNNING and self.tree.dynamic):
                 self.stop(child)
-            elif child.phase is Phase.CONDEMNED:
-                self.put(child, phase=Phase.RUNNING)
-            elif child.phase is Phase.RECYCLING:
-                self.put(child, phase=Phase.STOPPING)
+            elif child.phase is ChildPhase.CONDEMNED:
+                self.put(child, phase=ChildPhase.RUNNING)
+            elif child.phase is ChildPhase.RECYCLING:
+                self.put(child, phase=ChildPhase.STOPPING)
 
     def advance(self) -> None:
         """Take the next steps that the phases allow."""
@@ -228,38 +228,42 @@ class Draft:
         if self.tree.dynamic:
             return False
         again = (Why.NEW, Why.MANUAL, Why.RESTART)
-        return self.children.any(Phase.DUE, whys=again) or self.children.any(Phase.CONDEMNED, Phase.RECYCLING)
+        return self.children.any(ChildPhase.DUE, whys=again) or self.children.any(
+            ChildPhase.CONDEMNED, ChildPhase.RECYCLING
+        )
 
     def _regroup(self) -> None:
-        if self.children.any(Phase.STOPPING, Phase.RECYCLING):
+        if self.children.any(ChildPhase.STOPPING, ChildPhase.RECYCLING):
             return
-        condemned = self.children.last(Phase.CONDEMNED)
+        condemned = self.children.last(ChildPhase.CONDEMNED)
         if condemned is None:
             self._start_next(tuple(Why))
         elif condemned.spec.restart == "temporary" and condemned.why is Why.RESTART:
             self.stop(condemned)  # a temporary sibling is not started again
         else:
-            self.stop(condemned, Phase.RECYCLING)
+            self.stop(condemned, ChildPhase.RECYCLING)
 
     def _start_next(self, whys: tuple[Why, ...]) -> None:
         """Start the first child that is due, for one of these purposes, if none is starting for one of them."""
-        if self.children.any(Phase.STARTING, whys=whys):
+        if self.children.any(ChildPhase.STARTING, whys=whys):
             return
         delay_s, self.tree = self.tree.delay_s, replace(self.tree, delay_s=0.0)
-        for due in self.children.first(1, Phase.DUE, whys=whys):
+        for due in self.children.first(1, ChildPhase.DUE, whys=whys):
             self.start(due, delay_s)
 
     def _stop_next(self) -> None:
-        last = self.children.last(Phase.STARTING, Phase.RUNNING, Phase.CONDEMNED, Phase.RECYCLING, Phase.STOPPING)
+        last = self.children.last(
+            ChildPhase.STARTING, ChildPhase.RUNNING, ChildPhase.CONDEMNED, ChildPhase.RECYCLING, ChildPhase.STOPPING
+        )
         if last is None:
             self.tree = replace(self.tree, mode=Mode.STOPPED)
             self.actions.append(ExitSupervisor("shutdown", self.tree.error))
-        elif last.phase is Phase.RUNNING:
+        elif last.phase is ChildPhase.RUNNING:
             self.stop(last)
 
     def _ready(self) -> bool:
         """Return whether the supervisor's start is complete: no first start and no restart is left; callers' may be."""
-        coming = (Phase.DUE, Phase.STARTING, Phase.CONDEMNED, Phase.RECYCLING)
+        coming = (ChildPhase.DUE, ChildPhase.STARTING, ChildPhase.CONDEMNED, ChildPhase.RECYCLING)
         return not self.children.any(*coming, whys=(Why.INIT, Why.RESTART))
 
 

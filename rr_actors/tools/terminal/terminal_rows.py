@@ -14,7 +14,7 @@ from rr_actors.base.names import named, short_id
 from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.hosting.streams import StreamRow
 from rr_actors.managers.actions.graph_pictures import ShownGraph, shown_graph
-from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
+from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
@@ -372,7 +372,7 @@ def _query(row: QueryRow) -> Row:
     return Row(row.id, f"-> {row.name}", note, resource=row.resource_id, query=row.id, name=row.name)
 
 
-def _holder(link: Asks, holder: Holder) -> Row:
+def _holder(link: Asks, holder: HolderRow) -> Row:
     name = name_of_resource(partial(link.ask, timeout_s=LOOK_S), holder.parent, holder.origin) if holder.parent else ""
     text = f"  {holder.origin}, for {name or 'itself'}"
     text += _priority(holder.priority)
