@@ -59,7 +59,7 @@ def test_whoever_has_the_answer_writes_it() -> None:
     asker.raised(2, ValueError("no"), "root/a")
     any_link: Any = link
     asker.received(any_link, Ask(3, URN, b"", ()))
-    assert [type(letter).__name__ for letter in link.by_outlet] == ["Answered", "Raised", "Dead"]
+    assert [type(letter).__name__ for letter in link.by_outlet] == ["Answered", "HandlerRaised", "Dead"]
     assert link.by_outlet[2] == Dead(3)
 
 

