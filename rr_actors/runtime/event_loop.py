@@ -11,6 +11,7 @@ import contextlib
 import contextvars
 import os
 import threading
+import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Coroutine
@@ -29,6 +30,8 @@ logger = Log("rr_actors")
 
 T = TypeVar("T")
 
+_BEGINS_S = 1.0
+"""After which time a thread looks whether the loop that is to begin its coroutine still runs."""
 FORKED = "belongs to the process that this one was forked from; start a System in this one, after the fork"
 
 
@@ -237,7 +240,7 @@ class Course(Generic[T]):
         except Unavailable:
             self._coroutine.close()
             raise
-        if not self._ended.wait(timeout_s):
+        if not self._has_ended_within(timeout_s):
             self.give_up()
             raise TimeoutError
         task, self._task = self._task, None
@@ -247,6 +250,19 @@ class Course(Generic[T]):
             return task.result()
         finally:
             del task  # it has the error, whose traceback has this frame
+
+    def _has_ended_within(self, timeout_s: float | None) -> bool:
+        """Wait until the coroutine has ended. A loop that has ended before it began the coroutine never will."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._begun:
+            left_s = None if deadline is None else deadline - time.monotonic()
+            if self._ended.wait(_BEGINS_S if left_s is None else min(left_s, _BEGINS_S)):
+                return True
+            if left_s is not None and left_s <= _BEGINS_S:
+                return False
+            if not (self._begun or self._dispatcher.thread.is_alive()):
+                raise Unavailable(self._dispatcher.no_loop)
+        return self._ended.wait(None if deadline is None else deadline - time.monotonic())
 
     def give_up(self) -> None:
         """Cancel the coroutine. The waiting thread gets an error when the coroutine has ended."""

@@ -22,6 +22,7 @@ from rr_actors.registrar.model.effects import AnswerCall
 from rr_actors.registrar.model.rows import Phase, Resource, ServedQuery
 from rr_actors.storage.opening import read_rows
 from support import LIMIT_S, Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
+from support_asks import in_threads
 from support_inside import actor_of, on_loop
 
 Start = Callable[..., rr.System]
@@ -417,18 +418,34 @@ def test_the_thread_that_sends_a_status_decides_it(
     serve(provider, "thing")
     heard = Calls()
     query = app.load("provider/thing", "x", on_status=heard)
-    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "first"))
+
+    def send(target: str, status: rr.Status) -> None:
+        in_threads(lambda: provider.send_status(target, status))
+
+    send(query.resource_id, rr.Status(rr.State.WARNING, "first"))
     (row,) = [row for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Resource)]
     assert row.message == "first"  # on disk, when the call returns
     heard.wait(1)
     eventually(lambda: not actor_of(provider).node.dispatcher.is_behind())
-    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "second"))
+    send(query.resource_id, rr.Status(rr.State.WARNING, "second"))
     assert answered.items == [True, True]
     eventually(lambda: [status.message for status in heard.items] == ["first", "second"])
     eventually(lambda: not actor_of(provider).node.dispatcher.is_behind())
     with pytest.raises(rr.UnknownQuery):
-        provider.send_status("nothing", rr.Status(rr.State.WARNING, "third"))
+        send("nothing", rr.Status(rr.State.WARNING, "third"))
     assert answered.items == [True, True, True]
+
+
+def test_the_main_thread_leaves_a_status_to_the_loop(
+    app: rr.Registrar, provider: rr.Registrar, answered: Calls
+) -> None:
+    """A Ctrl-C between the commit and what follows from it would leave the holders without the status."""
+    serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    eventually(lambda: not actor_of(provider).node.dispatcher.is_behind())
+    provider.send_status(query, rr.Status(rr.State.WARNING, "hot"))
+    assert query.wait_status(timeout_s=LIMIT_S).message == "hot"
+    assert True not in answered.items
 
 
 def test_a_status_is_decided_behind_what_the_loop_has_still_to_do(

@@ -383,3 +383,13 @@ def test_at_exit_the_loop_ends_and_its_holders_may_still_release_it() -> None:
     assert not dispatcher.thread.is_alive()
     release()
     assert current() is None
+
+
+def test_a_coroutine_is_refused_if_the_loop_ends_before_it_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def nothing() -> None:
+        """Never begun: else Python warns."""
+
+    dispatcher = Dispatcher()
+    monkeypatch.setattr(dispatcher, "hand_over", lambda _begin: dispatcher.close())  # the loop's last look was before
+    with pytest.raises(Unavailable, match="has ended"):
+        dispatcher.run(nothing())

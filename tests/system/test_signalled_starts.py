@@ -103,6 +103,6 @@ def test_nothing_is_said_when_a_start_is_ended_by_sigterm(tmp_path: Path, how: s
 def test_only_the_program_itself_says_that_it_was_interrupted(tmp_path: Path) -> None:
     for code, said in tries(tmp_path / "tries", signal.SIGINT, "dying"):
         assert code == -signal.SIGINT
-        assert said.startswith('Traceback (most recent call last):\n  File "<string>", line')
+        assert said.startswith("Traceback (most recent call last):\n"), said  # perhaps of the interpreter's own start
         assert said.count("Traceback") == 1, said
         assert said.endswith("\nKeyboardInterrupt\n")

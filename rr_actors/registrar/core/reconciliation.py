@@ -43,10 +43,8 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     decision.note(catalog.agreed, command.registrar, True)
     if command.notices:  # if this link is lost before them, they come over the next, and then the provider forgets them
         decision.note(catalog.acked, command.registrar, True)
-    if command.registrar not in catalog.peers:
-        look_there(
-            decision, command.registrar
-        )  # the list may have brought the first row there, or a thread's line does
+    if command.registrar not in catalog.peers:  # the list has brought the first row there, or a thread's line does
+        look_there(decision, command.registrar)
     agreed, differing = digests.split(catalog, command.registrar, command.same)
     for held in agreed:
         decision.forget(catalog.kept, held.id)

@@ -28,7 +28,7 @@ from rr_actors.hosting.process_node import ProcessNode
 from rr_actors.hosting.streams import Publishers
 from rr_actors.registrar.core.decide import Item, refuse_uncommitted
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
-from rr_actors.registrar.engine.registrar_state import DirectPaths, may_be_interrupted
+from rr_actors.registrar.engine.registrar_state import DirectPaths, may_be_interrupted, runs_handlers
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.effects import AnswerCall, Effect
@@ -261,12 +261,13 @@ class RegistrarMonitor:
     def answer_here(self, command: Callable[[object], c.Command]) -> AnswerCall | None:
         """Decide a command of the calling thread, and return its answer; None if the loop has to decide it.
 
-        The loop carries out all other effects, in order.
+        The loop carries out all other effects, in order. A Ctrl-C behind the commit would lose them, so the main thread
+        decides nothing here.
 
         Args:
             command: makes the command, without a ticket; called with the lock, so ids have the order of decisions.
         """
-        if self._registrar.closed or self._gathers or may_be_interrupted():
+        if self._registrar.closed or self._gathers or runs_handlers():
             return None
         with self._registrar.lock:
             effects = self._committed_here(command(None))

@@ -472,6 +472,11 @@ class _Interruptions:
 _interruptions = _Interruptions()
 
 
+def runs_handlers() -> bool:
+    """Return whether signal handlers run in the calling thread, at least that of Ctrl-C, which raises."""
+    return threading.get_ident() == _interruptions.main
+
+
 def may_be_interrupted() -> bool:
     """Return whether a handler other than that of Ctrl-C may interrupt the calling thread; up to 50 ms old."""
     if threading.get_ident() != _interruptions.main:
