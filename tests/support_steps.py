@@ -12,43 +12,42 @@ from rr_actors.runtime import event_loop
 T = TypeVar("T")
 
 
+class _Steps:
+    """Counts the bytecodes of each thread whose trace function it is."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, frame: FrameType, event: str, _: Any) -> Any:
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        self.count += event == "opcode"
+        return self
+
+
 def steps_of(work: Callable[[], T]) -> tuple[int, T]:
     """Return how many bytecodes of Python `work` takes in this thread, and what it returns."""
-    steps = 0
-
-    def count(frame: FrameType, event: str, _: Any) -> Any:
-        nonlocal steps
-        frame.f_trace_opcodes, frame.f_trace_lines = True, False
-        steps += event == "opcode"
-        return count
-
+    steps = _Steps()
     before = sys.gettrace()
-    sys.settrace(count)
+    sys.settrace(steps)
     try:
         result = work()
     finally:
         sys.settrace(before)
-    return steps, result
+    return steps.count, result
 
 
 def steps_on_loop(work: Callable[[], object]) -> int:
     """Return how many bytecodes of Python the event loop takes, while `work` runs in this thread."""
-    steps = 0
-
-    def count(frame: FrameType, event: str, _: Any) -> Any:
-        nonlocal steps
-        frame.f_trace_opcodes, frame.f_trace_lines = True, False
-        steps += event == "opcode"
-        return count
+    steps = _Steps()
 
     async def trace(function: Any) -> None:
         sys.settrace(function)
 
     dispatcher = event_loop.acquire()
     try:
-        dispatcher.run(trace(count))
+        dispatcher.run(trace(steps))
         work()
         dispatcher.run(trace(None))
     finally:
         event_loop.release()
-    return steps
+    return steps.count
