@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import functools
 import math
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
@@ -130,7 +131,8 @@ class Calls:
     def command(self, command: Callable[[Any], Any], what: str) -> None:
         """Have a command decided, behind what the thread has asked for before, and wait for its answer.
 
-        This thread decides it if it can, else the loop.
+        This thread decides it if it can, else the loop. In both cases the loop has carried out what follows, such as
+        messages to holders, when this returns: what the caller says next does not overtake that.
 
         Args:
             command: makes the command of a function that takes the answer; or of None, if the decision is made here.
@@ -140,8 +142,11 @@ class Calls:
         """
         self.check_open()
         if not (is_deciding() or self.dispatcher.is_behind()) and self.dispatcher.may_block():
-            answer = self.actor.monitor.answer_here(command)
+            done = threading.Event()
+            answer = self.actor.monitor.answer_here(command, done.set)
             if answer is not None:
+                if not done.wait(CALL_TIMEOUT_S):
+                    raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {CALL_TIMEOUT_S:g} s")
                 if answer.failure is not None:
                     raise error_of(answer.failure)
                 return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.engine.monitor import RegistrarMonitor
+from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.effects import AnswerCall
+from rr_actors.registrar.model.messages import Message, Noticed
 from rr_actors.registrar.model.rows import Phase, Resource, ServedQuery
 from rr_actors.storage.opening import read_rows
 from support import LIMIT_S, Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
@@ -403,8 +406,10 @@ def answered(monkeypatch: pytest.MonkeyPatch) -> Calls:
     calls = Calls()
     answer_here = RegistrarMonitor.answer_here
 
-    def noted(monitor: RegistrarMonitor, command: Callable[[object], c.Command]) -> AnswerCall | None:
-        answer = answer_here(monitor, command)
+    def noted(
+        monitor: RegistrarMonitor, command: Callable[[object], c.Command], done: Callable[[], object]
+    ) -> AnswerCall | None:
+        answer = answer_here(monitor, command, done)
         calls(answer is not None)
         return answer
 
@@ -434,6 +439,27 @@ def test_the_thread_that_sends_a_status_decides_it(
     with pytest.raises(rr.UnknownQuery):
         send("nothing", rr.Status(rr.State.WARNING, "third"))
     assert answered.items == [True, True, True]
+
+
+def test_a_status_is_on_its_way_to_the_holders_when_the_call_returns(
+    app: rr.Registrar, provider: rr.Registrar, answered: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else what its sender says next, to an actor for instance, would overtake it."""
+    provider.register_server("thing", lambda request: request)  # a status callback of its own would come first
+    query = app.load("provider/thing", "x")
+    sent = Calls()
+    send = Consumers.send
+
+    def send_slowly(consumers: Consumers, origin: str, message: Message) -> None:
+        time.sleep(0.1)
+        send(consumers, origin, message)
+        sent(type(message))
+
+    monkeypatch.setattr(Consumers, "send", send_slowly)
+    eventually(lambda: not actor_of(provider).node.dispatcher.is_behind())
+    in_threads(lambda: provider.send_status(query, rr.Status(rr.State.WARNING, "hot")))
+    assert answered.items == [True]
+    assert Noticed in sent.items
 
 
 def test_the_main_thread_leaves_a_status_to_the_loop(

@@ -258,7 +258,7 @@ class RegistrarMonitor:
         return True
 
     @any_thread
-    def answer_here(self, command: Callable[[object], c.Command]) -> AnswerCall | None:
+    def answer_here(self, command: Callable[[object], c.Command], done: Callable[[], object]) -> AnswerCall | None:
         """Decide a command of the calling thread, and return its answer; None if the loop has to decide it.
 
         The loop carries out all other effects, in order. A Ctrl-C behind the commit would lose them, so the main thread
@@ -266,6 +266,7 @@ class RegistrarMonitor:
 
         Args:
             command: makes the command, without a ticket; called with the lock, so ids have the order of decisions.
+            done: called on the loop when it has carried the effects out, if there is an answer.
         """
         if self._registrar.closed or self._gathers or runs_handlers():
             return None
@@ -276,8 +277,12 @@ class RegistrarMonitor:
             answer = next(effect for effect in effects if type(effect) is AnswerCall and effect.ticket is None)
             effects.remove(answer)
             self._effects.append(effects)
-        self._dispatcher.hand_over(self.act)
+        self._dispatcher.hand_over(self._act_and_say, done)
         return answer
+
+    def _act_and_say(self, done: Callable[[], object]) -> None:
+        self.act()
+        done()
 
     @with_lock
     def _committed_here(self, command: c.Command) -> list[Effect] | None:
