@@ -210,7 +210,7 @@ def _nothing_is_agreed() -> None:
 
 
 def _released_by(release: Callable[[Decision, ServedQuery], None]) -> None:
-    """Have a query that its holder lets go released so."""
+    """Release a query by this function when its holder releases it."""
     unload = unloading.unload
 
     def broken(decision: Decision, message: Unload) -> None:

@@ -108,4 +108,4 @@ def test_of_many_registrars_that_share_locks_each_says_that_its_thread_is_decidi
     for registrar in registrars[:-1]:
         registrar.close()
     with actor_of(registrars[-1]).lock:
-        assert is_deciding(), "the lock of one that is open is asked, whoever else had it"
+        assert is_deciding(), "the lock of an open registrar counts, also if a closed one shared it"

@@ -121,8 +121,7 @@ def test_a_message_that_the_kernel_has_no_room_for_is_given_up_in_time_however_s
 
 def test_writing_and_waiting_have_one_time_limit(peer: Peer, line: BlockingLink) -> None:
     def answer_late(link: Link, message: Note) -> None:
-        time.sleep(0.2)  # so that the answer is waited for
-        peer.echo(link, message)
+        peer.dispatcher.loop.call_later(0.2, peer.echo, link, message)
 
     peer.answer = answer_late
     for limit_s in (20.0, None):
