@@ -421,14 +421,15 @@ class BaseActor(pykka.Actor):
             except BaseException as error:
                 self._note_failure(error)
         death_watch.ended(self.actor_stopped, self._report)
-        with contextlib.suppress(Unavailable):  # the loop has ended
-            self._dispatcher.call(self._ended, self._on_exit, self._report)
-        for reply in self._stop_replies:
-            reply.set(None)
+        try:
+            self._dispatcher.call(self._ended, self._on_exit, self._report, self._stop_replies)
+        except Unavailable:  # the loop has ended
+            _confirm(self._stop_replies)
 
     @staticmethod
-    def _ended(on_exit: OnExit | None, report: ExitReport) -> None:
+    def _ended(on_exit: OnExit | None, report: ExitReport, stop_replies: list[pykka.Future[Any]]) -> None:
         try:
+            _confirm(stop_replies)  # first: on_exit may end this process, and an answer to another would be lost
             if on_exit is not None:
                 on_exit(report)
         finally:
@@ -454,6 +455,11 @@ class BaseActor(pykka.Actor):
         mine = getattr(type(self), hook.__name__)
         if mine is not hook:  # go to the loop only if a subclass has overridden the hook
             await Await(mine(self, *args), on_loop=True)
+
+
+def _confirm(stop_replies: list[pykka.Future[Any]]) -> None:
+    for reply in stop_replies:
+        reply.set(None)
 
 
 class LoopActor(BaseActor):

@@ -546,6 +546,25 @@ def test_an_exit_callback_runs_on_the_loop_when_all_is_over(dispatcher: Dispatch
     assert seen.wait() == [("rr-loop", [])]
 
 
+def test_all_stops_are_answered_before_the_exit_callback_which_may_end_the_process(dispatcher: Dispatcher) -> None:
+    unanswered = Calls()
+    exiting = threading.Event()
+    gate = Gate()
+    stops: list[Any] = []
+
+    def on_exit(_report: ExitReport) -> None:
+        unanswered(sum(not stop.done() for stop in stops))
+        exiting.set()
+
+    ref: Any = dispatcher.run(Echo.launch(on_exit=on_exit))
+    ref.tell(gate)
+    stops += [ref.stop(block=False) for _ in range(2)]
+    stops[0].when_set(lambda: exiting.wait(0.2))  # the answer to the second one takes as long as this
+    gate.open()
+    assert unanswered.wait() == [0]
+    assert [stop.get(timeout=5) for stop in stops] == [True, True]
+
+
 def test_an_exit_callback_that_raises_is_logged(dispatcher: Dispatcher, caplog: pytest.LogCaptureFixture) -> None:
     def on_exit(_report: ExitReport) -> None:
         raise ValueError("deaf")

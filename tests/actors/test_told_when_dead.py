@@ -42,7 +42,7 @@ def maker(start: Callable[..., rr.System]) -> Any:
 def test_after_stop_tell_raises(maker: Any) -> None:
     ref = maker.make().get(timeout=5)
     assert ref.ask("hello") == "hello"
-    ref.stop()
+    assert ref.stop() is True
     with pytest.raises(rr.ActorDeadError):
         ref.tell("more")
     with pytest.raises(rr.ActorDeadError):
@@ -90,7 +90,7 @@ def test_after_the_end_of_a_child_that_shares_a_process_with_its_supervisor_tell
     worker = rr.ChildSpec(Worker, id="worker", restart=restart, placement="thread")
     ref = start(rr.Supervisor([worker], id="inner", placement="process")).ref("worker")
     assert ref.ask("hello") == "hello"
-    ref.stop()
+    assert ref.stop() is True
     with pytest.raises((rr.ActorDeadError, rr.ActorUnavailable)):
         ref.tell("more")
 
@@ -101,7 +101,7 @@ def test_after_stop_of_a_child_that_is_not_started_again_tell_raises(
 ) -> None:
     ref = start(rr.ChildSpec(Worker, id="worker", restart=restart)).ref("worker")
     ref.tell("a")
-    ref.stop()
+    assert ref.stop() is True
     with pytest.raises((rr.ActorDeadError, rr.ActorUnavailable)):
         ref.tell("more")
     deadline = time.monotonic() + 10
