@@ -10,7 +10,8 @@ import abc
 import asyncio
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, cast
 
 import pykka
 
@@ -29,6 +30,9 @@ from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision.core.specs import Shutdown
 from rr_actors.supervision.import_guard import in_progress
+
+if TYPE_CHECKING:
+    from pykka._envelope import Envelope
 
 logger = Log("rr_actors.supervision")
 
@@ -278,61 +282,23 @@ class HostedThread(Hosted):
 
     def _make(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Make the actor, wrap its methods and start its thread. In a worker, since __init__ is users' code."""
-        actor: Any = self._cls(*args, **kwargs)
-        call = self._node.dispatcher.call
-        ref = ref_to(self.path)
-        on_start, handle, loop, fail = actor.on_start, actor._handle_receive, actor._actor_loop, actor._handle_failure
-        take = actor.actor_inbox.get
-        envelope: Any = None  # of the message that the actor handles
-
-        def wrapped_take(*args: Any, **kwargs: Any) -> Any:
-            nonlocal envelope
-            envelope = take(*args, **kwargs)
-            return envelope
-
-        def wrapped_on_start() -> None:
-            answer = on_start()
-            if answer is IGNORE:
-                actor.actor_stopped.set()
-            call(self._has_started, answer, None)
-
-        def wrapped_handle(message: Any) -> Any:
-            try:
-                check_for_actor(message, actor)
-                return as_answer(actor, ref, message, handle(message))
-            except Exception:
-                raise
-            except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
-                raised = raised_by(error)
-                if not (isinstance(error, SystemExit) and not error.code):
-                    self._report = abnormal(raised)
-                reply, envelope.reply_to = envelope.reply_to, None  # Pykka would set it to None
-                if reply is not None:
-                    dead = pykka.ActorDeadError(f"{self.path} ended while it handled the message: {raised.text}")
-                    dead.__cause__ = error
-                    reply.set_exception((pykka.ActorDeadError, dead, None))
-                actor._stop()
-                return None
-
-        def wrapped_fail(kind: Any, error: Any, trace: Any) -> None:
-            self._report = abnormal(raised_by(error))
-            fail(kind, error, trace)
-
-        def wrapped_loop() -> None:
-            try:
-                loop()
-            except BaseException as error:  # SystemExit in on_start
-                self._report = abnormal(raised_by(error))
-                actor.actor_stopped.set()
-            call(self._has_started, None, self._report.exception)
-            call(self._end, self._report)
-
-        actor.on_start, actor._handle_receive = wrapped_on_start, wrapped_handle
-        actor._actor_loop, actor._handle_failure = wrapped_loop, wrapped_fail
-        actor.actor_inbox.get = wrapped_take
-        actor.use_daemon_thread = True
+        actor: pykka.ThreadingActor = self._cls(*args, **kwargs)
+        _Insides.wrap(actor, self)
         self.ref = actor.actor_ref
-        actor._start_actor_loop()
+        _Insides.run(actor)
+
+    def note(self, report: ExitReport) -> None:
+        """Note how the actor ends, before it has. In its thread."""
+        self._report = report
+
+    def started(self, answer: object) -> None:
+        """Hear that on_start has returned this. In the actor's thread."""
+        self._node.dispatcher.call(self._has_started, answer, None)
+
+    def over(self) -> None:
+        """Hear that the actor's thread ends. In that thread."""
+        self._node.dispatcher.call(self._has_started, None, self._report.exception)
+        self._node.dispatcher.call(self._end, self._report)
 
     def _has_started(self, answer: Any, failure: BaseException | None) -> None:
         if self._answer.done():
@@ -345,6 +311,71 @@ class HostedThread(Hosted):
     def _ask_to_stop(self, *, final: bool) -> None:
         if self.ref is not None:
             self.ref.stop(block=False)
+
+
+class _Insides(pykka.ThreadingActor):
+    """The way to the methods that Pykka keeps for subclasses of its actors, as this is one. Nobody starts it."""
+
+    @staticmethod
+    def run(actor: pykka.ThreadingActor) -> None:
+        """Start the actor's thread."""
+        actor._start_actor_loop()
+
+    @staticmethod
+    def wrap(actor: pykka.ThreadingActor, hosted: HostedThread) -> None:
+        """Wrap the actor's methods, so that `hosted` hears of its start and its end."""
+        ref = ref_to(hosted.path)
+        on_start, handle, loop, fail = actor.on_start, actor._handle_receive, actor._actor_loop, actor._handle_failure
+        take: Callable[..., Envelope[Any]] = actor.actor_inbox.get
+        envelope: Envelope[Any] | None = None  # of the message that the actor handles
+
+        def wrapped_take(*args: Any, **kwargs: Any) -> Envelope[Any]:
+            nonlocal envelope
+            envelope = take(*args, **kwargs)
+            return envelope
+
+        def wrapped_on_start() -> None:
+            answer = cast("object", on_start())
+            if answer is IGNORE:
+                actor.actor_stopped.set()
+            hosted.started(answer)
+
+        def wrapped_handle(message: Any) -> Any:
+            try:
+                check_for_actor(message, actor)
+                return as_answer(actor, ref, message, handle(message))
+            except Exception:
+                raise
+            except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
+                raised = raised_by(error)
+                if not (isinstance(error, SystemExit) and not error.code):
+                    hosted.note(abnormal(raised))
+                if envelope is not None and envelope.reply_to is not None:
+                    reply, envelope.reply_to = envelope.reply_to, None  # Pykka would set it to None
+                    dead = pykka.ActorDeadError(f"{hosted.path} ended while it handled the message: {raised.text}")
+                    dead.__cause__ = error
+                    reply.set_exception((pykka.ActorDeadError, dead, None))
+                actor._stop()
+                return None
+
+        def wrapped_fail(
+            exception_type: type[BaseException] | None, exception_value: Any, traceback: TracebackType | None
+        ) -> None:
+            hosted.note(abnormal(raised_by(exception_value)))
+            fail(exception_type, exception_value, traceback)
+
+        def wrapped_loop() -> None:
+            try:
+                loop()
+            except BaseException as error:  # SystemExit in on_start
+                hosted.note(abnormal(raised_by(error)))
+                actor.actor_stopped.set()
+            hosted.over()
+
+        actor.on_start, actor._handle_receive = wrapped_on_start, wrapped_handle
+        actor._actor_loop, actor._handle_failure = wrapped_loop, wrapped_fail
+        actor.actor_inbox.get = wrapped_take
+        vars(actor)["use_daemon_thread"] = True  # of this actor alone
 
 
 def _limit_s(shutdown_s: Shutdown) -> float | None:
