@@ -684,6 +684,30 @@ def test_a_ledger_folds_when_nothing_is_committed_any_more_or_at_last_anyway(
     assert loop.timers == []
 
 
+def test_a_ledger_does_not_fold_while_another_registrar_of_the_process_commits(
+    path: Path, ledger: tuple[CommitLog, Loop, JournaledStore]
+) -> None:
+    noted, loop, _ = ledger
+    lock = threading.RLock()
+    lock.acquire()
+    store = journaled(path.parent.with_name("another") / path.name)
+    other = CommitLog("other", RegistrarConfig("other"), store, loop, Worker(), lock)  # type: ignore[arg-type]
+    commit(noted, query("a"))
+    for n in range(20):
+        commit(other, query(f"b{n:02}"))
+        loop.advance(0.09)
+    assert segments(path) == ["catalog.journal.1"]
+    loop.advance(0.25)
+    assert (folded(path), len(folded(store.path)), segments(path)) == (["a"], 20, [])
+    commit(noted, query("c"))
+    for n in range(30):
+        commit(other, query(f"d{n:02}"))
+        loop.advance(0.09)
+    assert folded(path) == ["a", "c"], "2 s are the most"
+    other.close(erase=False)
+    noted.close(erase=False)
+
+
 def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room(
     path: Path, ledger: tuple[CommitLog, Loop, JournaledStore], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -30,6 +30,15 @@ _TIDY_AT_LAST_S = 2.0  # after the first
 _TIDY_AGAIN_S = 1.0
 
 
+class _Activity:
+    """The number of commits of all registrars of this process, roughly: they count without a common lock."""
+
+    commits = 0
+
+
+_activity = _Activity()
+
+
 class CommitLog:
     """Commits decisions to the store: changes that must survive a crash now, others a moment later.
 
@@ -156,6 +165,7 @@ class CommitLog:
             self.timed_s += time.perf_counter() - began
             self.timed += 1
         self.count += 1
+        _activity.commits += 1
         if not self._tidying and self.store.wants_tidying():
             self._tidying = True
             self._on_loop(self._tidy_when_quiet)
@@ -187,18 +197,21 @@ class CommitLog:
 
     @on_loop
     def _tidy_when_quiet(self) -> None:
-        """Tidy the store after a pause in the commits, when no thread that waits for one needs the processor."""
+        """Tidy the store after a pause in the commits of this process: no thread then waits for the processor.
+
+        A registrar of a chain makes one commit, and is quiet while the registrars behind it load.
+        """
         self._look(self._loop.time() + _TIDY_AT_LAST_S)
 
     @on_loop
     def _look(self, at_last: float, commits: int = -1) -> None:
         if self._closed:
             return
-        if commits == self.count or self._loop.time() >= at_last:
+        if commits == _activity.commits or self._loop.time() >= at_last:
             with contextlib.suppress(Unavailable):  # the process is stopping, and soon closes this registrar
                 self._workers.submit(self.store.tidy, done=self._tidied, patient=True)
         else:
-            self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self.count)
+            self._loop.call_later(_TIDY_SOON_S, self._look, at_last, _activity.commits)
 
     @on_loop
     def _tidied(self, _result: None, error: BaseException | None) -> None:
