@@ -98,6 +98,22 @@ def test_tree_shows_dependencies_below_what_depends_on_them(state: Path) -> None
     assert depth["cameras/camera"] > depth["maps/map"]
 
 
+def test_tree_draws_one_line_for_each_query_with_its_request_as_it_is(tmp_path: Path) -> None:
+    asked = msgspec.msgpack.encode("[bold]:smile:\x1b[2J")
+    two = Held("q1", "maps", "map", asked, None, "r1", "", 1, 1, Hold.HELD, State.OK)
+    ring = Held("q3", "maps", "map", REQUEST, None, "r1", "r1", 1, 3, Hold.HELD, State.OK)
+    write(tmp_path, "app", two, held("q2", "r2", hold=Hold.OWED))
+    write(tmp_path, "maps", query("q1", "r1"), query("q3", "r1", "maps"), ring)
+
+    assert run("tree", tmp_path).stdout.splitlines() == [
+        "app",
+        r"├── maps/map  '[bold]:smile:\x1b[2J'  held OK",
+        "│   └── maps/map  {'device': '/dev/video0'}  held OK",
+        "│       └── maps/map  {'device': '/dev/video0'}  held OK",
+        "└── cameras/camera  {'device': '/dev/video0'}  owed OK",
+    ]
+
+
 def test_a_catalog_is_read_while_it_is_open(state: Path) -> None:
     store = open_store(state / "cameras" / "catalog.sqlite3", durability="process", on_damage="refuse")
     store.load()

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.tree import Tree
 
 from rr_actors.registrar.model.rows import Held, priority_of
 from rr_actors.registrar.pages import priority_text
@@ -21,14 +17,8 @@ from rr_actors.tools.inspection import Contents, check_state, read_state, readab
 from rr_actors.tools.log_lines import printable
 
 app = typer.Typer()
-_PIPED_WIDTH = 200
 
 StateDir = Annotated[Path | None, typer.Argument(help="The system's state directory. Default: that of --state.")]
-
-
-def _console() -> Console:
-    """Return a console as wide as the terminal, or without a terminal wide enough for every column."""
-    return Console() if sys.stdout.isatty() else Console(width=_PIPED_WIDTH)
 
 
 def _found(state_dir: Path | None, option: Path | None) -> Path:
@@ -75,14 +65,11 @@ def tree(state_dir: StateDir = None, state_option: StateOption = None, watch: Wa
 
 def _show_tree(found: Path) -> None:
     state = read_state(found)
-    console = _console()
-    holders = {name: [held for held in contents.held.values() if not held.parent] for name, contents in state.items()}
-    for name, roots in holders.items():
+    for name, contents in state.items():
+        roots = [held for held in contents.held.values() if not held.parent]
         if roots:
-            shown = Tree(f"[bold]{_text(name)}[/]")
-            for held in sorted(roots, key=lambda held: held.seq):
-                _grow(shown, held, state)
-            console.print(shown)
+            roots.sort(key=lambda held: held.seq)
+            typer.echo("\n".join((typer.style(printable(name), bold=True), *_branches(roots, state))))
     _tell_damage(state)
     if not any(contents.held or contents.queries for contents in state.values()):
         typer.echo("nobody holds anything")
@@ -151,19 +138,24 @@ def _say_held(contents: Contents) -> None:
     say_table(heads, rows, gives_way=("request",), right=("priority",))
 
 
-def _text(text: str) -> str:
-    return escape(printable(text))
+def _branches(
+    queries: Sequence[Held], state: Mapping[str, Contents], before: str = "", way: frozenset[str] = frozenset()
+) -> Iterator[str]:
+    """Yield a line for each held query and, below it, for those of its resource.
 
-
-def _grow(above: Tree, held: Held, state: dict[str, Contents], way: frozenset[str] = frozenset()) -> None:
-    """Add a held query and, below it, its resource's queries. `way`: the queries above, in case damage made a ring."""
-    what = f"{held.registrar}/{held.server}  {readable(held.request)}"
-    branch = above.add(f"{_text(what)}  [dim]{held.hold}[/] {held.state}")
-    provider = state.get(held.registrar)
-    query = provider.queries.get(held.id) if provider else None
-    if provider and query and held.id not in way:
-        for part in provider.parts(query.resource_id):
-            _grow(branch, part, state, way | {held.id})
+    Args:
+        before: what the lines begin with.
+        way: the queries above, in case damage made a ring.
+    """
+    for number, held in enumerate(queries, 1):
+        last = number == len(queries)
+        what = printable(f"{held.registrar}/{held.server}  {readable(held.request)}")
+        yield f"{before}{'└── ' if last else '├── '}{what}  {typer.style(held.hold, dim=True)} {held.state}"
+        provider = state.get(held.registrar)
+        query = provider.queries.get(held.id) if provider else None
+        if provider and query and held.id not in way:
+            below = provider.parts(query.resource_id)
+            yield from _branches(below, state, before + ("    " if last else "│   "), way | {held.id})
 
 
 def _plain(contents: Contents) -> dict[str, Any]:
