@@ -6,6 +6,7 @@ times as many, 1.1 is 1.26 times as much for each. What a start costs, however f
 
 from __future__ import annotations
 
+import itertools
 import math
 import resource
 import subprocess
@@ -21,15 +22,18 @@ from typing import Literal
 import pykka
 
 import rr_actors as rr
+from benchmarks import placement as placement_of
 from benchmarks.measure import time_each
 from benchmarks.table import Row
-from benchmarks.workload import Empty
+from benchmarks.workload import PAYLOAD, Empty
+from benchmarks.yardsticks import pipe_echo, thread_echo
 
 Seconds = dict[str, float]
 """What each step took, by its name."""
 
 _AIM = 1.1
 _LIMIT_S = 600.0
+_IN_TURN = 5
 _SESSIONS = 1_000
 """Sessions in a second, one after another: open a registrar, load, unload, close."""
 
@@ -52,10 +56,10 @@ def in_step(scale: int, times: int) -> list[Row]:
         *_rows("actors", (few, some, many), times, _actors),
         *_rows("registrars", registrars, times, _registrars),
         *_sessions(10 * scale, times),
-        *_rows("registrars in a chain", dear, times, _chain),
+        *_rows("registrars in a chain", managers, times, _on_one_core(_chain)),
         *_beside_one("thread", 10 * scale, times),
         *_beside_one("process", 4 * scale, times),
-        *_rows("parts of a resource", (few, some, many), times, _parts),
+        *_rows("parts of a resource", (few, some, many), times, _on_one_core(_parts)),
         *_rows("clients", dear, times, _clients),
         *_rows("resources", (some, many, 3 * many), times, _inspected),
     ]
@@ -78,15 +82,26 @@ def _rows(what: str, sizes: Sequence[int], times: int, measure: Callable[[int], 
     return rows
 
 
-class _Clock:
-    """Takes the time of one step after another."""
+def _on_one_core(measure: Callable[[int], Seconds]) -> Callable[[int], Seconds]:
+    """Return `measure` on one core, as the threads of one process take turns, and to wake another core takes longer."""
 
-    def __init__(self) -> None:
+    def measured(count: int) -> Seconds:
+        with placement_of.here(placement_of.ONE_CORE):
+            return measure(count)
+
+    return measured
+
+
+class _Clock:
+    """Takes the time of one step after another; with another `clock`, the time of that, as this process's."""
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.taken: Seconds = {}
-        self._last = time.perf_counter()
+        self._clock = clock
+        self._last = clock()
 
     def step(self, name: str) -> None:
-        now = time.perf_counter()
+        now = self._clock()
         self.taken[name], self._last = now - self._last, now
 
 
@@ -160,28 +175,62 @@ class _Link(rr.Manager):
 
 
 def _beside_one(placement: Literal["process", "thread"], count: int, times: int) -> list[Row]:
-    """A load through so many managers that depend on one another, for each of them, beside a chain of one."""
-    one, many = _through(1, placement, 20 * times), _through(count, placement, 4 * times)
-    name = f"a load through a chain of {count:,} managers, each a {placement}, for each"
-    return [Row(name, 1e3 * many / count, "ms", ratio=many / count / one, against="a chain of one", at_most=1.0)]
+    """A load through so many managers that depend on one another, for each of them, beside a chain of one.
 
-
-def _through(count: int, placement: Literal["process", "thread"], times: int) -> float:
+    Beside it, in turns, a bare message takes the same way, and managers that do not depend on one another are asked one
+    after another. To wake what has not run for a while takes longer, whatever it does then.
+    """
+    echo, kind = (pipe_echo, "processes") if placement == "process" else (thread_echo, "threads")
     belows = [*(f"link{number}/link" for number in range(1, count)), ""]
+    with (
+        echo(PAYLOAD) as bare_one,
+        echo(PAYLOAD, count) as bare_many,
+        _loads([""], 1, placement) as one,
+        _loads([""] * count, count, placement) as apart,
+        _loads(belows, 1, placement) as chain,
+    ):
+        bare = (lambda: time_each(bare_one, 1)[0]), (lambda: time_each(bare_many, 1)[0])
+        least = _least_in_turns((*bare, one, apart, chain), 4 * times)
+    rows = [
+        _each(f"a bare message through {count:,} {kind}", count, least[1], least[0]),
+        _each(f"a load from {count:,} managers in {kind}, one after another", count, least[3], least[2]),
+        _each(f"a load through {count:,} managers in {kind}", count, least[4], least[2]),
+    ]
+    loss, bare_loss = least[4] / count / least[2], least[1] / count / least[0]
+    name = f"what a load through {count:,} {kind} takes, of one"
+    return [*rows, Row(name, loss, "times", ratio=loss / bare_loss, against="a bare message", at_most=_AIM)]
+
+
+def _least_in_turns(calls: Sequence[Callable[[], float]], rounds: int) -> list[float]:
+    taken = [[call() for _ in range(_IN_TURN)] for _ in range(rounds) for call in calls]
+    return [min(itertools.chain(*taken[number :: len(calls)])) for number in range(len(calls))]
+
+
+def _each(name: str, count: int, many_s: float, one_s: float) -> Row:
+    return Row(f"{name}, for each", 1e3 * many_s / count, "ms", ratio=many_s / count / one_s, against="one")
+
+
+@contextmanager
+def _loads(belows: Sequence[str], asked: int, placement: Literal["process", "thread"]) -> Iterator[Callable[[], float]]:
+    """A call that loads from so many of these managers, one after another, and returns the seconds; then it unloads."""
     specs = [
         rr.ChildSpec(_Link, id=f"link{number}", args=(below,), placement=placement)
         for number, below in enumerate(belows)
     ]
     with _system(*specs) as (system, _):
         app = system.open_registrar("app")
-        app.load("link0/link", 0, timeout_s=_LIMIT_S).unload(timeout_s=_LIMIT_S)  # connects
-        seconds: list[float] = []
-        for number in range(1, times + 1):
-            start = time.perf_counter()
-            query = app.load("link0/link", number, timeout_s=_LIMIT_S)
-            seconds.append(time.perf_counter() - start)
-            query.unload(timeout_s=_LIMIT_S)
-    return min(seconds)
+        requests = itertools.count()
+
+        def load() -> float:
+            request, start = next(requests), time.perf_counter()
+            queries = [app.load(f"link{number}/link", request, timeout_s=_LIMIT_S) for number in range(asked)]
+            seconds = time.perf_counter() - start
+            for query in queries:
+                query.unload(timeout_s=_LIMIT_S)
+            return seconds
+
+        load()  # connects
+        yield load
 
 
 def _actors(count: int) -> Seconds:
@@ -223,11 +272,11 @@ def _chain(count: int) -> Seconds:
 
         for number in range(count):
             serve(number)
-        clock = _Clock()
+        clock = _Clock(time.process_time)
         query = system.open_registrar("consumer").load("link0/link", 1, timeout_s=_LIMIT_S)
-        clock.step("load")
+        clock.step("load, processor time")
         query.unload(timeout_s=_LIMIT_S)
-        clock.step("unload")
+        clock.step("unload, processor time")
     return clock.taken
 
 
@@ -245,11 +294,11 @@ def _parts(count: int) -> Seconds:
 
         makers["whole"].register_server("whole", load, _nothing)
         makers["part"].register_server("part", lambda request: request, _nothing)
-        clock = _Clock()
+        clock = _Clock(time.process_time)
         query = system.open_registrar("consumer").load("whole/whole", 1, timeout_s=_LIMIT_S)
-        clock.step("load")
+        clock.step("load, processor time")
         query.unload(timeout_s=_LIMIT_S)
-        clock.step("unload")
+        clock.step("unload, processor time")
     return clock.taken
 
 

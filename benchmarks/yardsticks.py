@@ -1,4 +1,4 @@
-"""What the machine itself can do: raw multiprocessing.Pipe echoes in other processes; in this one, an echo between two
+"""What the machine itself can do: raw multiprocessing.Pipe echoes in other processes; in this one, an echo between
 threads, and a Pykka ask."""
 
 from __future__ import annotations
@@ -18,22 +18,31 @@ import pykka
 _ECHO = """
 import sys
 from multiprocessing.connection import Connection
-connection = Connection(int(sys.argv[1]))
+above, *below = [Connection(int(fd)) for fd in sys.argv[1:]]
 try:
     while True:
-        connection.send_bytes(connection.recv_bytes())
+        message = above.recv_bytes()
+        for connection in below:
+            connection.send_bytes(message)
+            message = connection.recv_bytes()
+        above.send_bytes(message)
 except EOFError:
     pass
 """
 
 
 @contextmanager
-def pipe_echo(payload: bytes) -> Iterator[Callable[[], bytes]]:
-    """A call that sends `payload` to another process through a Pipe and waits for it to come back, without pickling."""
-    here, there = multiprocessing.Pipe()
-    fd = there.fileno()
-    process = subprocess.Popen([sys.executable, "-c", _ECHO, str(fd)], pass_fds=[fd])
-    there.close()
+def pipe_echo(payload: bytes, links: int = 1) -> Iterator[Callable[[], bytes]]:
+    """A call that sends `payload` through Pipes to the last of a chain of processes, and waits for it."""
+    here, above = multiprocessing.Pipe()
+    processes: list[subprocess.Popen[bytes]] = []
+    for left in reversed(range(links)):
+        ends = multiprocessing.Pipe() if left else ()
+        fds = [end.fileno() for end in (above, *ends[:1])]
+        processes.append(subprocess.Popen([sys.executable, "-c", _ECHO, *map(str, fds)], pass_fds=fds))
+        for end in (above, *ends[:1]):
+            end.close()
+        above = ends[-1] if ends else above
 
     def echo() -> bytes:
         here.send_bytes(payload)
@@ -43,7 +52,8 @@ def pipe_echo(payload: bytes) -> Iterator[Callable[[], bytes]]:
         yield echo
     finally:
         here.close()
-        process.wait()
+        for process in processes:
+            process.wait()
 
 
 @contextmanager
@@ -60,26 +70,31 @@ def in_turn(operations: list[Callable[[], Any]]) -> Callable[[], Any]:
 
 
 @contextmanager
-def thread_echo(payload: bytes) -> Iterator[Callable[[], Any]]:
-    """A call that gives `payload` to another thread through a SimpleQueue, and waits for it to come back."""
-    there: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-    back: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+def thread_echo(payload: bytes, links: int = 1) -> Iterator[Callable[[], Any]]:
+    """A call that gives `payload` through SimpleQueues to the last of a chain of threads, and waits for it."""
+    there: list[queue.SimpleQueue[bytes | None]] = [queue.SimpleQueue() for _ in range(links)]
+    back: list[queue.SimpleQueue[bytes]] = [queue.SimpleQueue() for _ in range(links)]
 
-    def answer() -> None:
-        while (got := there.get()) is not None:
-            back.put(got)
+    def answer(link: int) -> None:
+        while (got := there[link].get()) is not None:
+            if link + 1 < links:
+                there[link + 1].put(got)
+                got = back[link + 1].get()
+            back[link].put(got)
 
     def echo() -> bytes:
-        there.put(payload)
-        return back.get()
+        there[0].put(payload)
+        return back[0].get()
 
-    thread = threading.Thread(target=answer)
-    thread.start()
+    threads = [threading.Thread(target=answer, args=(link,)) for link in range(links)]
+    for thread in threads:
+        thread.start()
     try:
         yield echo
     finally:
-        there.put(None)
-        thread.join()
+        for link, thread in enumerate(threads):
+            there[link].put(None)
+            thread.join()
 
 
 class _Echo(pykka.ThreadingActor):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tracemalloc
 from typing import Any
 
@@ -97,6 +98,30 @@ def test_to_open_and_close_one_of_many_registrars_takes_as_many_steps_as_one_of_
     many = steps()
     assert many[0] <= few[0] * 1.1
     assert many[1] == few[1], "each load and unload asks whether this thread is deciding"
+
+
+def test_a_load_through_a_long_chain_takes_the_loop_as_many_steps_for_each_link_as_through_a_short_one(
+    system: rr.System, app: rr.Registrar
+) -> None:
+    config = rr.RegistrarConfig(durability="none")
+    links = [system.open_registrar(f"link{number}", config) for number in range(60)]
+    for registrar, below in zip(links, [*links[1:], None], strict=True):
+
+        def load(request: int, registrar: rr.Registrar = registrar, below: rr.Registrar | None = below) -> None:
+            if below is not None:
+                registrar.load(f"{below.name}/link", request)
+
+        serve(registrar, "link", load)
+    app.load("link0/link", 0).unload()  # connects
+
+    def steps(first: int) -> float:
+        def load() -> None:
+            app.load(f"link{first}/link", next(requests))
+
+        return min(steps_on_loop(load) for _ in range(3)) / (len(links) - first)
+
+    requests = itertools.count(1)
+    assert steps(0) <= steps(50) * 1.3  # what waits for 50 ms is written meanwhile, too
 
 
 def test_of_many_registrars_that_share_locks_each_says_that_its_thread_is_deciding(system: rr.System) -> None:
