@@ -28,6 +28,7 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+_AS_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def make_directories(path: str | os.PathLike[str], *, synced: bool = False) -> None:
@@ -128,8 +129,13 @@ class Folder:
         With `to_read` the directory may belong to another user; its files must belong to the same user then.
         """
         real = os.path.realpath(path)
-        fd = os.open(real, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        fd = os.open(real, _AS_DIRECTORY)
         return cls(Path(real), fd, os.fstat(fd).st_uid if to_read else os.geteuid())
+
+    @classmethod
+    def unlinked(cls, path: Path) -> Self:
+        """Open the directory at a path. A link in the place of its last name is not followed: that is an OSError."""
+        return cls(path, os.open(path, _AS_DIRECTORY), os.geteuid())
 
     @classmethod
     def below(cls, top: str | os.PathLike[str], path: Path) -> Self:
@@ -144,8 +150,7 @@ class Folder:
                 inner = folder.path / name
                 if os.path.islink(inner):
                     raise NotAFile(inner, "a symbolic link")
-                flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-                folder = cls(inner, os.open(name, flags, dir_fd=folder.fd), folder.owner)
+                folder = cls(inner, os.open(name, _AS_DIRECTORY, dir_fd=folder.fd), folder.owner)
         return folder
 
     @property
@@ -189,9 +194,8 @@ class Folder:
         """Open or make a directory in this one, with mode 0700; raise NotOurs and change nothing if it is not ours."""
         with contextlib.suppress(FileExistsError):
             os.mkdir(name, 0o700, dir_fd=self.fd)
-        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
         try:
-            fd = os.open(name, flags, dir_fd=self.fd)
+            fd = os.open(name, _AS_DIRECTORY, dir_fd=self.fd)
         except OSError as error:
             error.filename = str(self.path / name)
             raise

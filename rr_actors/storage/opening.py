@@ -132,6 +132,8 @@ def remove_unneeded(path: Path, witness: Witness) -> None:
     if is_missing(path):
         if witness.known() is not None:  # it was removed: the next opening says so
             return
+        if _remove_its_lock(path, witness):
+            return
     elif is_needed(content_of(read_rows(path))):
         return
     store = open_store(path, witness=witness)
@@ -140,6 +142,24 @@ def remove_unneeded(path: Path, witness: Witness) -> None:
         needed = is_needed(store.load())
     finally:
         store.close(erase=not needed)
+
+
+def _remove_its_lock(path: Path, witness: Witness) -> bool:
+    """Remove a catalog that has never committed anything, so that only its lock is there; return whether it is one."""
+    with errors_named(path), Folder.unlinked(path.parent) as folder:
+        lock = CatalogLock(folder, path)
+        reached, is_empty = lock.reached, False
+        try:
+            if reached is None or not (reached.is_made or reached.number):
+                is_empty = not sqlite_store.files_among(folder.names(), path)
+            if is_empty:
+                is_empty = witness.forget(0 if reached is None else reached.epoch)
+        finally:
+            lock.release(remove=is_empty)
+    if is_empty:
+        with contextlib.suppress(OSError):  # something else is in the directory, or it is being opened again
+            path.parent.rmdir()
+    return is_empty
 
 
 def _folder_of(path: Path, witness: Witness | None, *, synced: bool) -> Folder:

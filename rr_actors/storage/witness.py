@@ -52,28 +52,29 @@ class Witness:
 
     def known(self) -> LastOpening | None:
         """Return the catalog at its last opening; None if there was none, or the record cannot be read."""
-        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
+        with self._errors_logged(), _opened(self.state_dir) as place:
             return _read(place, self.registrar)
         return None
 
     def note(self, known: LastOpening, *, synced: bool = False) -> None:
         """Record that the catalog was opened. `synced`: a power cut neither loses the record nor damages it."""
         body = msgspec.json.encode(known)
-        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
+        with self._errors_logged(), _opened(self.state_dir) as place:
             place.write(self.registrar, b"%08x %b\n" % (zlib.crc32(body), body), synced=synced)
             if synced:
-                os.fsync(state.fd)
+                with Folder.at(self.state_dir) as state:
+                    os.fsync(state.fd)
 
     def known_or_spent(self) -> tuple[LastOpening | None, int]:
         """Return what known() does; and if it has no epoch, the highest of all catalogs here that were erased."""
-        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
+        with self._errors_logged(), _opened(self.state_dir) as place:
             known = _read(place, self.registrar)
             return known, 0 if known is not None and known.epoch else _spent(place)
         return None, 0
 
     def forget(self, epoch: int) -> bool:
         """Remove the record, because the catalog is about to be erased; return whether its epoch is noted as spent."""
-        with self._errors_logged(), Folder.at(self.state_dir) as state, state.inner(_PLACE) as place:
+        with self._errors_logged(), _opened(self.state_dir) as place:
             with place.open(_EPOCHS, os.O_RDWR | os.O_CREAT) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)  # another process may be erasing a catalog, too
                 if epoch > _number_in(file):
@@ -100,7 +101,7 @@ def tell_of_missing(state_dir: str | os.PathLike[str]) -> list[str]:
     """Log each recorded catalog that is missing; return the names of their registrars."""
     missing: list[str] = []
     try:
-        with Folder.at(state_dir) as state, state.inner(_PLACE) as place:
+        with _opened(Path(state_dir)) as place:
             for name in sorted(place.names()):
                 known = None if name.startswith(".") else _read(place, name)
                 if known is not None and is_missing(Path(known.path)):
@@ -130,10 +131,27 @@ def missing_text(registrar: str, known: LastOpening) -> str:
     )
 
 
+def _opened(state_dir: Path) -> Folder:
+    """Open or make the directory of the records."""
+    try:
+        place = Folder.unlinked(state_dir / _PLACE)
+    except FileNotFoundError:
+        with Folder.at(state_dir) as state:
+            return state.inner(_PLACE)
+    try:
+        place.tighten(0o077)
+    except BaseException:
+        place.close()
+        raise
+    return place
+
+
 def _spent(place: Folder) -> int:
-    if not place.has(_EPOCHS):
+    try:
+        file = place.open(_EPOCHS)
+    except FileNotFoundError:
         return 0
-    with place.open(_EPOCHS) as file:
+    with file:
         fcntl.flock(file, fcntl.LOCK_SH)
         return _number_in(file)
 
