@@ -265,9 +265,9 @@ class Folder:
         return found
 
     def _check(self, name: str, found: os.stat_result) -> None:
-        for is_kind, kind in _KINDS:
-            if is_kind(found.st_mode):
-                raise NotAFile(self.path / name, kind)
+        if not stat.S_ISREG(found.st_mode):
+            kind = next((kind for is_kind, kind in _KINDS if is_kind(found.st_mode)), "something unknown")
+            raise NotAFile(self.path / name, kind)
         if found.st_uid != self.owner:
             raise NotOurs(self.path / name, self.owner, found.st_uid)
         if found.st_nlink > 1:

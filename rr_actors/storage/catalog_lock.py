@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import io
 import os
 import weakref
 import zlib
@@ -63,7 +62,7 @@ class CatalogLock:
             self._file.close()
             self._take()
         _locks.add(self)
-        self.reached = _read(self._file)[1]
+        self.reached = _read(self._noted)[1]
         self._write(os.getpid())
 
     def note(self, reached: Reached | None, *, needed: bool = False) -> None:
@@ -135,7 +134,7 @@ class CatalogLock:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            pid = _read(file)[0]
+            pid = _read(os.pread(file.fileno(), _LONGEST, 0))[0]
             file.close()
             holder = "another process" if pid is None else "this process" if pid == os.getpid() else f"process {pid}"
             raise CatalogLocked(
@@ -168,9 +167,9 @@ class CatalogLock:
             self._noted, self._size = data, len(data)
 
 
-def _read(file: io.FileIO) -> tuple[int | None, Reached | None]:
+def _read(text: bytes) -> tuple[int | None, Reached | None]:
     """Return the holder's pid and the noted progress; None for one that is missing or damaged."""
-    first, _, second = os.pread(file.fileno(), _LONGEST, 0).decode(errors="replace").partition("\n")
+    first, _, second = text.decode(errors="replace").partition("\n")
     pid = int(first) if first.isascii() and first.isdigit() else None
     noted, _, checksum = second.rstrip("\n").rpartition(" ")
     if f"{zlib.crc32(noted.encode()):08x}" != checksum or not noted:

@@ -17,7 +17,7 @@ from typing import Literal
 
 import msgspec
 
-from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.config import CATALOG_FILE, RegistrarConfig
 from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked, shortened
 from rr_actors.base.folder import Folder, NotAFile, make_directories
 from rr_actors.base.reporting.log import Log
@@ -63,7 +63,7 @@ def remove_catalogs(registrars: Sequence[str], state_dir: str) -> None:
     """Remove those of the registrars' catalogs in the state directory that have nothing that would be missed."""
     for name in registrars:
         try:
-            remove_unneeded(RegistrarConfig(name).catalog_path(state_dir), Witness(state_dir, name))
+            remove_unneeded(Path(state_dir, name, CATALOG_FILE), Witness(state_dir, name))
         except CatalogError as error:  # it is open again already, say
             _log.info("%s: its catalog stays: %s", name, error)
 
@@ -107,7 +107,7 @@ def _open_in_directory(
     with contextlib.ExitStack() as if_not:
         if_not.enter_context(folder)
         _make_private(folder)
-        _make_files_private(folder, [path.with_suffix(".lock").name, *sqlite_store.files_among(folder.names(), path)])
+        _make_files_private(folder, [path.with_suffix(".lock").name])
         lock = CatalogLock(folder, path)
         if_not.callback(lock.release)
         store = _open_locked(folder, path, lock, durability, on_damage, witness)
@@ -127,12 +127,10 @@ def remove_unneeded(path: Path, witness: Witness) -> None:
     Raises:
         CatalogError: as open_store() describes; or the catalog cannot be removed.
     """
-    if not is_there(path):
+    if not os.path.lexists(path.parent) or _remove_its_lock(path, witness) or not is_there(path):
         return
     if is_missing(path):
         if witness.known() is not None:  # it was removed: the next opening says so
-            return
-        if _remove_its_lock(path, witness):
             return
     elif is_needed(content_of(read_rows(path))):
         return
@@ -145,27 +143,34 @@ def remove_unneeded(path: Path, witness: Witness) -> None:
 
 
 def _remove_its_lock(path: Path, witness: Witness) -> bool:
-    """Remove a catalog that has never committed anything, so that only its lock is there; return whether it is one."""
+    """Remove a catalog that has committed nothing, so that its lock alone is there; return whether it is one."""
+    name = path.with_suffix(".lock").name
     with errors_named(path), Folder.unlinked(path.parent) as folder:
+        names = folder.names()
+        if name not in names or sqlite_store.files_among(names, path):
+            return False
         lock = CatalogLock(folder, path)
-        reached, is_empty = lock.reached, False
+        reached, spent = lock.reached, False
         try:
-            if reached is None or not (reached.is_made or reached.number):
-                is_empty = not sqlite_store.files_among(folder.names(), path)
-            if is_empty:
-                is_empty = witness.forget(0 if reached is None else reached.epoch)
+            is_new = reached is None or not (reached.is_made or reached.number)
+            if is_new and not sqlite_store.files_among(folder.names(), path):
+                spent = witness.spend(0 if reached is None else reached.epoch)
         finally:
-            lock.release(remove=is_empty)
-    if is_empty:
+            lock.release(remove=spent)
+    if spent:
         with contextlib.suppress(OSError):  # something else is in the directory, or it is being opened again
-            path.parent.rmdir()
-    return is_empty
+            os.rmdir(path.parent)
+    return spent
 
 
 def _folder_of(path: Path, witness: Witness | None, *, synced: bool) -> Folder:
     """Open or make the directory of a catalog. Below the state directory, no link is followed."""
     parent = path.parent
     top = parent if witness is None else witness.state_dir
+    if parent.parent == top:  # nearly always: then its last name alone could be a link
+        with contextlib.suppress(OSError):  # the rest finds out what is wrong
+            make_directories(parent, synced=synced)
+            return Folder.unlinked(parent)
     is_below = parent.is_relative_to(top) and ".." not in parent.relative_to(top).parts
     if not is_below:  # a location that was chosen
         top = parent
@@ -255,9 +260,7 @@ def _open_locked(
     registrar = "" if witness is None else witness.registrar
     known, spent = (None, 0) if witness is None else witness.known_or_spent()
     try:
-        with errors_named(path):
-            meta, content, left = _read(folder, path, lock.reached, witness)
-            sqlite_store.check_under_wal(folder, path, meta)
+        meta, content, left = _read_locked(folder, path, lock.reached, witness)
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
@@ -298,6 +301,20 @@ class _Left(msgspec.Struct, frozen=True):
     changes: Sequence[Change] = ()
 
 
+def _read_locked(
+    folder: Folder, path: Path, reached: Reached | None, witness: Witness | None
+) -> tuple[sql_tables.Meta, Content, _Left]:
+    """Return what _read() does, of a catalog whose lock the caller has. Make its files private first."""
+    with errors_named(path):
+        files = sqlite_store.files_among(folder.names(), path)
+        if reached is None and not files:
+            return sqlite_store.NONE, content_of(()), _Left()
+        _make_files_private(folder, files)
+        read = _read(folder, path, reached, witness)
+        sqlite_store.check_under_wal(folder, path, read[0])
+        return read
+
+
 def _read(
     folder: Folder, path: Path, reached: Reached | None = None, witness: Witness | None = None
 ) -> tuple[sql_tables.Meta, Content, _Left]:
@@ -307,8 +324,6 @@ def _read(
         reached: the catalog's progress, if it was not closed.
         witness: has the name of the catalog's registrar, if that is known.
     """
-    if reached is None and not sqlite_store.files_among(folder.names(), path):
-        return sqlite_store.NONE, content_of(()), _Left()
     found = journaled_store.read(folder, path)  # first: the file then has the segments that are folded meanwhile
     first, is_new = None, reached is not None and not reached.is_made
     if not sqlite_store.has_file(folder, path):
@@ -394,15 +409,16 @@ def _set_aside(folder: Folder, path: Path) -> Path:
 def _make_private(folder: Folder) -> None:
     """Remove the right of other users to write the directory; refuse one that all users share (sticky bit)."""
     mode = stat.S_IMODE(folder.check_owner().st_mode)
-    if mode & 0o022 and mode & stat.S_ISVTX:
+    if not mode & 0o022:
+        return
+    if mode & stat.S_ISVTX:
         raise CatalogError(
             f"{folder.path}: expected a directory for catalogs that one user writes, got one that all share"
             f" (mode {mode:o}); choose a directory in it as location",
             path=str(folder.path),
         )
     before, after = folder.tighten(0o022)
-    if before != after:
-        _log.info("%s: mode %o tightened to %o", folder.path, before, after)
+    _log.info("%s: mode %o tightened to %o", folder.path, before, after)
 
 
 def _make_files_private(folder: Folder, names: Iterable[str]) -> None:

@@ -75,12 +75,17 @@ class Witness:
     def forget(self, epoch: int) -> bool:
         """Remove the record, because the catalog is about to be erased; return whether its epoch is noted as spent."""
         with self._errors_logged(), _opened(self.state_dir) as place:
-            with place.open(_EPOCHS, os.O_RDWR | os.O_CREAT) as file:
-                fcntl.flock(file, fcntl.LOCK_EX)  # another process may be erasing a catalog, too
-                if epoch > _number_in(file):
-                    os.pwrite(file.fileno(), b"%020d" % epoch, 0)
+            _spend(place, epoch)
             place.discard(self.registrar)
             return True
+        return False
+
+    def spend(self, epoch: int) -> bool:
+        """Note an epoch as spent, if the catalog has no record; return whether that is done."""
+        with self._errors_logged(), _opened(self.state_dir) as place:
+            if not place.has(self.registrar):
+                _spend(place, epoch)
+                return True
         return False
 
     @contextlib.contextmanager
@@ -154,6 +159,13 @@ def _spent(place: Folder) -> int:
     with file:
         fcntl.flock(file, fcntl.LOCK_SH)
         return _number_in(file)
+
+
+def _spend(place: Folder, epoch: int) -> None:
+    with place.open(_EPOCHS, os.O_RDWR | os.O_CREAT) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # another process may be erasing a catalog, too
+        if epoch > _number_in(file):
+            os.pwrite(file.fileno(), b"%020d" % epoch, 0)
 
 
 def _number_in(file: io.FileIO) -> int:
