@@ -93,7 +93,7 @@ def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
     if config.name not in (name, _UNTITLED):
         expected = f"{name!r}, as the registrar is called, or none"
         raise wrong(None, "name", expected, config.name, where=type(config).__name__)
-    return dataclasses.replace(config, name=name)
+    return config if config.name == name else dataclasses.replace(config, name=name)
 
 
 @dataclass(frozen=True)
@@ -174,8 +174,8 @@ class SystemConfig:
 
     def registrar(self, name: str) -> RegistrarConfig:
         """Return the configuration of the registrar called `name`."""
-        found = self.registrars.get(name) or RegistrarConfig(durability=self.durability)
-        return dataclasses.replace(found, name=name)
+        found = self.registrars.get(name)
+        return RegistrarConfig(name, durability=self.durability) if found is None else called(found, name)
 
 
 # -- the values that each key accepts ------------------------------------------------------------------------------

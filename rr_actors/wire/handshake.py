@@ -15,7 +15,6 @@ The key is never sent, and a proof can be neither replayed (nonces) nor reflecte
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import os
 import struct
@@ -124,7 +123,7 @@ class _Handshake:
 
     def _mac(self, role: bytes, acceptor_nonce: bytes, dialler_nonce: bytes) -> bytes:
         text = _MAGIC + _LENGTH.pack(PROTOCOL) + role + acceptor_nonce + dialler_nonce
-        return hmac.new(self._key, text, hashlib.sha256).digest()
+        return hmac.digest(self._key, text, "sha256")
 
 
 class AcceptorHandshake(_Handshake):

@@ -265,6 +265,8 @@ class Node(ProcessNode):
             tried: set[str] = set()
             for _ in range(2):
                 queries = [query_id for query_id in registrar.newest_first() if query_id not in tried]
+                if releases is not None and not queries:
+                    break
                 tried.update(queries)
                 owed = self._owed_to_dormant(registrar, queries)
                 released = _AllDone(self.dispatcher.loop, len(queries) - len(owed), registrar.name)
@@ -299,6 +301,8 @@ class Node(ProcessNode):
 
     def _owed_to_dormant(self, registrar: RegistrarActor, queries: Sequence[str]) -> set[str]:
         """Return the queries at dormant providers, and log them: their release does not end before these are opened."""
+        if not queries:
+            return set()
         with registrar.lock:
             held = registrar.whole().held
             where = {id: held[id].registrar for id in queries if id in held}

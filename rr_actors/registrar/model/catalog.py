@@ -517,6 +517,8 @@ def discard(index: dict[K, Ids], key: K, id: str) -> None:
 
 def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
     """Return the index that add() would make of these pairs. Ids in a dict are not hashed again."""
+    if not ids:
+        return {}
     keys = list(keys)
     if len(ids) > 1 and keys[0] == keys[-1] and keys.count(keys[0]) == len(keys):
         return {keys[0]: dict.fromkeys(ids)}
