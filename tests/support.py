@@ -332,6 +332,15 @@ def wait_respawned(system: rr.System, id: str, old_pid: int) -> int:
     return eventually(new_pid, what=f"{id} respawned after {old_pid}")
 
 
+def connect_threads(registrar: rr.Registrar, server: str, request: object) -> None:
+    """Have a registrar hold something. The registrar's threads have connections to the provider from now on.
+
+    The first call of a thread goes by the link.
+    """
+    registrar.load(server, request)
+    registrar.load(server, request).unload()
+
+
 # -- catalogs on disk ----------------------------------------------------------------------------------------------
 
 

@@ -74,12 +74,16 @@ class Calls:
         """Return the connections of threads to a provider, beside the present link; None if the link is to be used.
 
         There are none before the provider is reconciled over the present link. By then its Peer row is on disk, by
-        which it is found after a crash.
+        which it is found after a crash. The first call goes by the link: to open a connection costs more than one call
+        saves.
         """
         catalog, provider = self.actor.catalog, client.provider
         if catalog.up.get(provider) != client.opened or provider not in catalog.peers:
             return None
         if self.actor.closed or self.dispatcher.closed:  # in a forked child, all of this belongs to the parent
+            return None
+        if client.is_uncalled:
+            client.is_uncalled = False
             return None
         return client.connections
 

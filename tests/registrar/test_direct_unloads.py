@@ -34,6 +34,7 @@ from support import (
     Workshop,
     break_exchanges,
     catalog_path,
+    connect_threads,
     eventually,
     hang,
     kill,
@@ -61,9 +62,9 @@ def shop(start: Callable[..., rr.System], workshop: Workshop, brief: None) -> rr
 
 @pytest.fixture
 def buyer(shop: rr.System) -> rr.Registrar:
-    """A consumer that has a link to it."""
+    """A consumer whose threads have connections to it."""
     app = shop.open_registrar("app")
-    app.load("shop/thing", Order("first"))
+    connect_threads(app, "shop/thing", Order("first"))
     return app
 
 
@@ -124,7 +125,7 @@ class Brief(rr.Manager):
         return None
 
     def hold_briefly(self, provider: int) -> None:
-        self.registrar.load("shop/thing", Order("first"))
+        connect_threads(self.registrar, "shop/thing", Order("first"))
         query = self.registrar.load("shop/thing", Order("wheel"))
         hang(provider)
         with contextlib.suppress(rr.RegistrarDown):
@@ -137,8 +138,13 @@ def test_a_release_of_a_brief_hold_that_its_provider_has_not_read_is_owed_on_dis
 ) -> None:
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)), rr.ChildSpec(Brief, id="brief"))
     system.ref("brief").tell(pid_of(system, "shop"))
-    rows = functools.partial(read_rows, catalog_path(state_dir, "brief"))
-    eventually(lambda: any(isinstance(row, Held) and row.hold is Hold.OWED for row in rows()))
+    path = catalog_path(state_dir, "brief")
+
+    def is_owed() -> bool:
+        held = [row for row in read_rows(path) if isinstance(row, Held) and b"wheel" in row.request]
+        return [row.hold for row in held] == [Hold.OWED]
+
+    eventually(is_owed)
     if end == "kill":
         wait_respawned(system, "brief", kill(system, "brief"))
     else:

@@ -24,6 +24,7 @@ from support import (
     Workshop,
     break_exchanges,
     catalog_path,
+    connect_threads,
     eventually,
     hang,
     kill,
@@ -50,7 +51,7 @@ def parts(start: Start, workshop: Workshop) -> rr.System:
 def builder(parts: rr.System) -> rr.Registrar:
     """A registrar of this process that has a link to the parts: threads have connections of their own beside it."""
     builder = parts.open_registrar("builder")
-    builder.load("parts/thing", Order("keeps the link"))
+    connect_threads(builder, "parts/thing", Order("keeps the link"))
     return builder
 
 
@@ -63,6 +64,12 @@ def builds(builder: rr.Registrar, *names: str, more: Callable[[rr.Query], object
         return "bike"
 
     serve(builder, "bike", load=load)
+
+
+def connect_shop(app: rr.Registrar) -> None:
+    """Have the shop hold a bell. Its threads have connections to the parts from now on."""
+    app.load("shop/thing", Order("first", ("parts/thing:bell",)))
+    app.load("shop/thing", Order("second", ("parts/thing:bell",))).unload()
 
 
 def in_flight(builder: rr.Registrar) -> list[Held]:
@@ -313,7 +320,7 @@ def test_a_holder_killed_while_its_callback_waits_for_a_part_holds_it_once_when_
 ) -> None:
     system = start(shop(workshop, "parts"), shop(workshop, "shop"))
     app = system.open_registrar("app")
-    app.load("shop/thing", Order("first", ("parts/thing:bell",)))  # its threads have connections from now on
+    connect_shop(app)
     workshop.shut("load wheel")
     future = app.load("shop/thing", Order("bike", ("parts/thing:wheel",)), block=False)
     workshop.wait("load wheel")
@@ -334,7 +341,7 @@ def test_a_holder_killed_when_its_callback_has_its_part_holds_each_part_once_whe
 ) -> None:
     system = start(shop(workshop, "parts"), shop(workshop, "shop"))
     app = system.open_registrar("app")
-    app.load("shop/thing", Order("first", ("parts/thing:bell",)))
+    connect_shop(app)
     workshop.shut("made bike")
     future = app.load("shop/thing", Order("bike", ("parts/thing:wheel",)), block=False)
     workshop.wait("made bike")
@@ -381,7 +388,7 @@ class Member(rr.Manager):
         self.work.step(f"load {request} {self.registrar.name}")
         if request.startswith("end"):
             return request
-        return self.registrar.load(f"{self.next_one}/link", request).response
+        return self.registrar.load(f"{self.next_one}/link", request.removeprefix("via ")).response
 
 
 def ring(start: Start, workshop: Workshop, size: int) -> rr.System:
@@ -390,6 +397,7 @@ def ring(start: Start, workshop: Workshop, size: int) -> rr.System:
     system = start(*specs)
     for n in range(size):
         system.registrar(f"m{n}").load(f"m{(n + 1) % size}/link", "end")
+        system.registrar(f"m{n}").load(f"m{n}/link", "via end").unload()  # the first call of a thread takes the link
     return system
 
 

@@ -68,6 +68,7 @@ class ProviderLink:
     Attributes:
         link: the present one; `opened` is the number of the Fetch that opened the last one.
         connections: those of threads, beside the link; they may be used as Calls.connections_to() says.
+        is_uncalled: whether no thread has asked for one of them yet, and opening one takes a handshake.
         undescribed: the servers whose types have been asked for, or have to be, and have not come yet.
     """
 
@@ -91,6 +92,7 @@ class ProviderLink:
         self.undescribed: set[str] = set()
         self.checksums: dict[str, int] = {}  # by server, those of the types that are known (Loaded.types)
         self.connections: ThreadConnections[Exchange] = ThreadConnections(self._dial_for_thread)
+        self.is_uncalled = False
         self._side: dict[type[Any], Callable[[Any], None]] = {  # messages of the provider that are not decided
             Described: self._take_types,
             Progressed: functools.partial(self._registrar.listeners.hear, provider),
@@ -245,6 +247,7 @@ class ProviderLink:
         self._known = None
         self.link = link
         self.connections = ThreadConnections(self._dial_for_thread)
+        self.is_uncalled = transport is self._node.transport
         self._asked = False
         self._reconciled = False
         self._described.clear()
