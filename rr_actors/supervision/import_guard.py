@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-from typing import cast
 
 from rr_actors.base import pickling
 from rr_actors.base.errors import UsageError
@@ -38,9 +37,11 @@ def check_children_can_import(spec: ChildSpec, path: str, what: str) -> None:
         UsageError: a module that such a process needs is being imported now.
         NotSerializable: the ChildSpec cannot be pickled. (It is pickled only while a module is being imported.)
     """
+    inner = spec.actor_class_or_manager
+    if spec.placement != "process" and not isinstance(inner, Supervisor):  # no process imports anything
+        return
     if not (now := in_progress()):
         return
-    inner = spec.actor_class_or_manager
     if spec.placement == "process":
         for module in sorted(pickling.modules_of(spec, f"the ChildSpec of {path}")):
             # The import of "a.b.c" imports "a" and "a.b", too.
@@ -68,7 +69,7 @@ def check_no_child_imports(what: str) -> None:
 
 def _is_initializing(module: object) -> bool:
     try:  # not by getattr: it would load a lazy module
-        spec = cast("dict[str, object]", object.__getattribute__(module, "__dict__")).get("__spec__")
+        attributes: dict[str, object] = object.__getattribute__(module, "__dict__")
     except AttributeError:
         return False
-    return getattr(spec, "_initializing", False) is True
+    return getattr(attributes.get("__spec__"), "_initializing", False) is True
