@@ -100,7 +100,7 @@ class SqliteStore:
         if self.is_made:
             self.note_outside()
         self._content: Content | None = content  # as read at the opening; None once returned or out of date
-        self._wal = files_of(path)[1]  # SQLite fills it again from its beginning: its size is not that of its content
+        self._wal = f"{path.name}-wal"  # SQLite fills it again from its beginning: its size is not that of its content
         self._pages = 0  # an estimate of the pages written since the last copy
         self._tidying = threading.Lock()
 
@@ -238,7 +238,7 @@ class SqliteStore:
 
     def _wal_bytes(self) -> int:
         try:
-            return os.stat(self._wal.name, dir_fd=self.folder.fd, follow_symlinks=False).st_size
+            return os.stat(self._wal, dir_fd=self.folder.fd, follow_symlinks=False).st_size
         except OSError:  # it is not there
             return 0
 
@@ -279,7 +279,7 @@ class SqliteStore:
                     self._close_file()
                     if erase:
                         self._erase()
-                    elif settled and self.is_made and not self.folder.has(self._wal.name):
+                    elif settled and self.is_made and not self.folder.has(self._wal):
                         self._lock.note(None)
                 finally:
                     self._lock.release(remove=erase)

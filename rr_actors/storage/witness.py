@@ -49,17 +49,18 @@ class Witness:
         self.registrar = registrar
         self.formerly = formerly
         self.state_dir = Path(state_dir)
+        self._place = self.state_dir / _PLACE
 
     def known(self) -> LastOpening | None:
         """Return the catalog at its last opening; None if there was none, or the record cannot be read."""
-        with self._errors_logged(), _opened(self.state_dir) as place:
+        with self._errors_logged(), _opened(self._place) as place:
             return _read(place, self.registrar)
         return None
 
     def note(self, known: LastOpening, *, synced: bool = False) -> None:
         """Record that the catalog was opened. `synced`: a power cut neither loses the record nor damages it."""
         body = msgspec.json.encode(known)
-        with self._errors_logged(), _opened(self.state_dir) as place:
+        with self._errors_logged(), _opened(self._place) as place:
             place.write(self.registrar, b"%08x %b\n" % (zlib.crc32(body), body), synced=synced)
             if synced:
                 with Folder.at(self.state_dir) as state:
@@ -67,14 +68,14 @@ class Witness:
 
     def known_or_spent(self) -> tuple[LastOpening | None, int]:
         """Return what known() does; and if it has no epoch, the highest of all catalogs here that were erased."""
-        with self._errors_logged(), _opened(self.state_dir) as place:
+        with self._errors_logged(), _opened(self._place) as place:
             known = _read(place, self.registrar)
             return known, 0 if known is not None and known.epoch else _spent(place)
         return None, 0
 
     def forget(self, epoch: int) -> bool:
         """Remove the record, because the catalog is about to be erased; return whether its epoch is noted as spent."""
-        with self._errors_logged(), _opened(self.state_dir) as place:
+        with self._errors_logged(), _opened(self._place) as place:
             _spend(place, epoch)
             place.discard(self.registrar)
             return True
@@ -82,7 +83,7 @@ class Witness:
 
     def spend(self, epoch: int) -> bool:
         """Note an epoch as spent, if the catalog has no record; return whether that is done."""
-        with self._errors_logged(), _opened(self.state_dir) as place:
+        with self._errors_logged(), _opened(self._place) as place:
             if not place.has(self.registrar):
                 _spend(place, epoch)
                 return True
@@ -96,7 +97,7 @@ class Witness:
             _log.warning(
                 "%s: what is known of the catalog of %s cannot be read or written: %s; if that catalog is removed or"
                 " replaced, nobody will notice",
-                self.state_dir / _PLACE,
+                self._place,
                 self.registrar,
                 error,
             )
@@ -106,7 +107,7 @@ def tell_of_missing(state_dir: str | os.PathLike[str]) -> list[str]:
     """Log each recorded catalog that is missing; return the names of their registrars."""
     missing: list[str] = []
     try:
-        with _opened(Path(state_dir)) as place:
+        with _opened(Path(state_dir, _PLACE)) as place:
             for name in sorted(place.names()):
                 known = None if name.startswith(".") else _read(place, name)
                 if known is not None and is_missing(Path(known.path)):
@@ -136,13 +137,13 @@ def missing_text(registrar: str, known: LastOpening) -> str:
     )
 
 
-def _opened(state_dir: Path) -> Folder:
+def _opened(path: Path) -> Folder:
     """Open or make the directory of the records."""
     try:
-        place = Folder.unlinked(state_dir / _PLACE)
+        place = Folder.unlinked(path)
     except FileNotFoundError:
-        with Folder.at(state_dir) as state:
-            return state.inner(_PLACE)
+        with Folder.at(path.parent) as state:
+            return state.inner(path.name)
     try:
         place.tighten(0o077)
     except BaseException:
@@ -152,11 +153,9 @@ def _opened(state_dir: Path) -> Folder:
 
 
 def _spent(place: Folder) -> int:
-    try:
-        file = place.open(_EPOCHS)
-    except FileNotFoundError:
+    if not place.has(_EPOCHS):
         return 0
-    with file:
+    with place.open(_EPOCHS) as file:
         fcntl.flock(file, fcntl.LOCK_SH)
         return _number_in(file)
 
@@ -174,6 +173,8 @@ def _number_in(file: io.FileIO) -> int:
 
 
 def _read(place: Folder, name: str) -> LastOpening | None:
+    if not place.has(name):  # nearly always, and an error costs more
+        return None
     try:
         checksum, _, body = place.read(name).partition(b" ")
     except FileNotFoundError:

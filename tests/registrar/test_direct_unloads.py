@@ -115,6 +115,16 @@ def test_what_is_held_briefly_is_loaded_and_unloaded_and_never_on_disk(
     assert held_on_disk(state_dir) == before
 
 
+def test_the_first_call_over_a_link_goes_by_the_link_and_the_second_opens_a_connection(shop: rr.System) -> None:
+    app = shop.open_registrar("app")
+    app.load("shop/thing", Order("first"))
+    query = app.load("shop/thing", Order("second"))
+    connections = actor_of(app).clients["shop"].connections
+    assert connections.idle == []
+    query.unload()
+    assert len(connections.idle) == 1
+
+
 class Brief(rr.Manager):
     """Holds something, and releases something else while the provider hangs, whose pid is the message."""
 

@@ -21,6 +21,7 @@ from rr_actors.base.errors import CatalogDamaged, CatalogLocked
 from rr_actors.base.folder import Folder
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, ServedQuery, rows_of
 from rr_actors.registrar.model.store import Store
+from rr_actors.storage import opening
 from rr_actors.storage.catalog_lock import Reached
 from rr_actors.storage.opening import Durability, open_store, read_rows, remove_unneeded
 from rr_actors.storage.witness import LastOpening, Witness, tell_of_missing
@@ -375,6 +376,16 @@ def test_the_epochs_of_a_catalog_that_is_lost_are_not_used_again(
     store = open_store(path, witness=witness, on_damage="aside")
     assert store.epoch == 4
     store.close()
+
+
+def test_a_catalog_that_has_committed_nothing_is_removed_without_being_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, witness = tmp_path / "app" / "catalog.sqlite3", Witness(tmp_path, "app")
+    open_store(path, witness=witness).close()
+    monkeypatch.setattr(opening, "open_store", None)
+    remove_unneeded(path, witness)
+    assert not path.parent.exists()
 
 
 def test_a_catalog_with_a_row_is_not_removed_nor_one_that_is_open(tmp_path: Path) -> None:

@@ -8,9 +8,19 @@ from pathlib import Path
 
 import pytest
 
+import rr_actors as rr
+from rr_actors.supervision import import_guard
+from rr_actors.supervision.core.specs import ChildSpec
+from rr_actors.supervision.import_guard import check_children_can_import
 from support import REPOSITORY
 
 LIMIT_S = 30.0
+
+
+class Empty(rr.Actor):
+    pass
+
+
 CLASSES = """
 import rr_actors as rr
 
@@ -170,3 +180,8 @@ print(system.open_registrar("app").load("cameras/camera", "one").response)
     ran = run(tmp_path, "import app; app.system.stop()", app=start, classes=CLASSES)
     assert ran.stdout.splitlines() == ["open one"], ran.stderr
     assert "refused in a child process of rr_actors that is importing 'app'" in ran.stderr
+
+
+def test_a_child_in_a_thread_of_this_process_needs_no_look_at_what_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(import_guard, "in_progress", None)
+    check_children_can_import(ChildSpec(Empty, id="one", placement="thread"), "root/one", "start_child()")
