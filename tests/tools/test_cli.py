@@ -114,6 +114,13 @@ def test_tree_draws_one_line_for_each_query_with_its_request_as_it_is(tmp_path: 
     ]
 
 
+def test_tree_draws_its_lines_of_what_the_output_can_show(state: Path) -> None:
+    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
+    command = [sys.executable, "-m", "rr_actors", "tree", str(state)]
+    ran = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert ran.stdout.splitlines() == ["app", "`-- cameras/camera  {'device': '/dev/video0'}  held OK"], ran.stderr
+
+
 def test_a_catalog_is_read_while_it_is_open(state: Path) -> None:
     store = open_store(state / "cameras" / "catalog.sqlite3", durability="process", on_damage="refuse")
     store.load()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -69,7 +70,8 @@ def _show_tree(found: Path) -> None:
         roots = [held for held in contents.held.values() if not held.parent]
         if roots:
             roots.sort(key=lambda held: held.seq)
-            typer.echo("\n".join((typer.style(printable(name), bold=True), *_branches(roots, state))))
+            lines = (typer.style(printable(name), bold=True), *_branches(roots, state, _guides()))
+            typer.echo("\n".join(lines))
     _tell_damage(state)
     if not any(contents.held or contents.queries for contents in state.values()):
         typer.echo("nobody holds anything")
@@ -138,8 +140,31 @@ def _say_held(contents: Contents) -> None:
     say_table(heads, rows, gives_way=("request",), right=("priority",))
 
 
+class _Guides(NamedTuple):
+    """What a line of a tree begins with: at a branch, at the last branch, and below each of them."""
+
+    branch: str = "├── "
+    last: str = "└── "
+    beside: str = "│   "
+    below: str = "    "
+
+
+def _guides() -> _Guides:
+    """Return the guides that the output can show."""
+    drawn = _Guides()
+    try:
+        "".join(drawn).encode(sys.stdout.encoding or "utf-8")  # an io.StringIO has none
+    except UnicodeEncodeError:
+        return _Guides("+-- ", "`-- ", "|   ")
+    return drawn
+
+
 def _branches(
-    queries: Sequence[Held], state: Mapping[str, Contents], before: str = "", way: frozenset[str] = frozenset()
+    queries: Sequence[Held],
+    state: Mapping[str, Contents],
+    guides: _Guides,
+    before: str = "",
+    way: frozenset[str] = frozenset(),
 ) -> Iterator[str]:
     """Yield a line for each held query and, below it, for those of its resource.
 
@@ -148,14 +173,14 @@ def _branches(
         way: the queries above, in case damage made a ring.
     """
     for number, held in enumerate(queries, 1):
-        last = number == len(queries)
+        guide, space = (guides.last, guides.below) if number == len(queries) else (guides.branch, guides.beside)
         what = printable(f"{held.registrar}/{held.server}  {readable(held.request)}")
-        yield f"{before}{'└── ' if last else '├── '}{what}  {typer.style(held.hold, dim=True)} {held.state}"
+        yield f"{before}{guide}{what}  {typer.style(held.hold, dim=True)} {held.state}"
         provider = state.get(held.registrar)
         query = provider.queries.get(held.id) if provider else None
         if provider and query and held.id not in way:
             below = provider.parts(query.resource_id)
-            yield from _branches(below, state, before + ("    " if last else "│   "), way | {held.id})
+            yield from _branches(below, state, guides, before + space, way | {held.id})
 
 
 def _plain(contents: Contents) -> dict[str, Any]:
