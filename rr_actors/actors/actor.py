@@ -424,16 +424,17 @@ class BaseActor(pykka.Actor):
         try:
             self._dispatcher.call(self._ended, self._on_exit, self._report, self._stop_replies)
         except Unavailable:  # the loop has ended
-            _confirm(self._stop_replies)
+            for reply in self._stop_replies:
+                reply.set(None)
 
     @staticmethod
     def _ended(on_exit: OnExit | None, report: ExitReport, stop_replies: list[pykka.Future[Any]]) -> None:
-        try:
-            _confirm(stop_replies)  # first: on_exit may end this process, and an answer to another would be lost
+        with contextlib.ExitStack() as steps:  # the last one is the first; each is done, whatever another one raises
+            steps.callback(release)
             if on_exit is not None:
-                on_exit(report)
-        finally:
-            release()
+                steps.callback(on_exit, report)
+            for reply in stop_replies:  # before on_exit: that may end this process, and an answer would be lost
+                steps.callback(reply.set, None)
 
     def _vanish(self) -> None:
         if running.get(self.actor_urn) is self.actor_ref:
@@ -455,11 +456,6 @@ class BaseActor(pykka.Actor):
         mine = getattr(type(self), hook.__name__)
         if mine is not hook:  # go to the loop only if a subclass has overridden the hook
             await Await(mine(self, *args), on_loop=True)
-
-
-def _confirm(stop_replies: list[pykka.Future[Any]]) -> None:
-    for reply in stop_replies:
-        reply.set(None)
 
 
 class LoopActor(BaseActor):

@@ -565,6 +565,21 @@ def test_all_stops_are_answered_before_the_exit_callback_which_may_end_the_proce
     assert [stop.get(timeout=5) for stop in stops] == [True, True]
 
 
+def test_an_answer_to_a_stop_that_cannot_be_set_keeps_the_end_from_nobody(
+    dispatcher: Dispatcher, caplog: pytest.LogCaptureFixture
+) -> None:
+    exits, gate = Calls(), Gate()
+    with caplog.at_level(logging.ERROR, "rr_actors"):
+        ref: Any = dispatcher.run(Echo.launch(on_exit=exits))
+        ref.tell(gate)
+        stops = [ref.stop(block=False) for _ in range(3)]
+        stops[1].set(True)  # as a program may do
+        gate.open()
+        assert [report.reason for report in exits.wait()] == ["normal"]
+        assert [stop.get(timeout=5) for stop in stops] == [True, True, True]
+        eventually(lambda: "Full" in caplog.text)
+
+
 def test_an_exit_callback_that_raises_is_logged(dispatcher: Dispatcher, caplog: pytest.LogCaptureFixture) -> None:
     def on_exit(_report: ExitReport) -> None:
         raise ValueError("deaf")
