@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import json
+import multiprocessing
 import os
 import signal
 import socket
@@ -49,6 +50,28 @@ def say_environment(child: Inherited) -> int:
 
 
 _PRINTS = "import json, os; print(json.dumps(dict(os.environ)))"
+
+
+def say_process(child: Inherited) -> int:
+    """Say what multiprocessing knows of this process, and how a process of its own ends."""
+    own, parent = multiprocessing.current_process(), multiprocessing.parent_process()
+    assert parent is not None
+    grandchild = multiprocessing.Process(target=os._exit, args=(7,))
+    grandchild.start()
+    grandchild.join()
+    _say(
+        child.control,
+        name=own.name,
+        key=bytes(own.authkey).hex(),
+        parent=(parent.name, parent.pid),
+        children=len(multiprocessing.active_children()),
+        method=multiprocessing.get_start_method(),
+        thread=threading.main_thread().native_id,
+        grandchild=(grandchild.name.rpartition(":")[2], grandchild.exitcode),
+        standard_input=sys.stdin.read(),
+        excepthook=sys.excepthook is sys.__excepthook__,
+    )
+    return 0
 
 
 def raise_at_once(child: Inherited) -> int:

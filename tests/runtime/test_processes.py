@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import multiprocessing
 import multiprocessing.spawn
 import os
 import signal
@@ -67,6 +68,11 @@ def test_a_child_runs_its_entry_in_a_process_group_of_its_own(spawner: Spawner) 
         assert (said["name"], said["size"]) == ("cameras", 5)
 
 
+def test_a_large_payload_arrives_whole(spawner: Spawner) -> None:
+    with started(spawner, payload=bytes(5_000_000)) as child:
+        assert hear(child.control)["size"] == 5_000_000
+
+
 def test_a_child_finds_its_parents_surroundings(
     spawner: Spawner, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -93,6 +99,23 @@ def test_a_child_and_its_programs_have_the_environment_that_the_parent_has_now(
         said = hear(child.control)
     assert said["own"] == dict(os.environ)
     assert said["of_program"] == dict(os.environ)
+
+
+def test_a_child_is_a_process_of_multiprocessing(spawner: Spawner) -> None:
+    with started(spawner, "support_children:say_process", name="cameras") as child:
+        said = hear(child.control)
+    parent = multiprocessing.current_process()
+    assert said == {
+        "name": "cameras",
+        "key": bytes(parent.authkey).hex(),
+        "parent": [parent.name, os.getpid()],
+        "children": 0,
+        "method": "forkserver",
+        "thread": child.pid,
+        "grandchild": ["1", 7],
+        "standard_input": "",
+        "excepthook": True,
+    }
 
 
 def test_the_exit_code_is_what_the_entry_returns(spawner: Spawner) -> None:

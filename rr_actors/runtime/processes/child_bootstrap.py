@@ -11,8 +11,8 @@ import contextlib
 import errno
 import gc
 import importlib
+import itertools
 import logging
-import multiprocessing.forkserver
 import os
 import select
 import signal
@@ -23,25 +23,28 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Sequence
-from multiprocessing import resource_tracker, util
+from multiprocessing import process, resource_tracker, util
+from multiprocessing.context import ForkServerProcess
 from multiprocessing.reduction import ForkingPickler
-from types import TracebackType
 from typing import Any, NoReturn
 
 from rr_actors.base import pickling
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime import garbage, interpreter
 from rr_actors.runtime.processes import fork_server, lifeline
-from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, call_by_name
+from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, Launch
 
 # Private parts of the standard library; the same in Python 3.11, 3.12 and 3.13.
-_SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
 _TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
+_ParentProcess: Any = vars(process)["_ParentProcess"]
+_set_start_method: Callable[[str], None] = vars(sys.modules["multiprocessing.context"])["_force_start_method"]
+_close_stdin: Callable[[], None] = vars(util)["_close_stdin"]
+_forget_parents_finalizers: Callable[[], None] = vars(process.BaseProcess)["_after_fork"]
+_renew_native_id: Callable[[threading.Thread], None] = vars(threading.Thread)["_set_native_id"]
 _run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
 _clear_exit_handlers: Callable[[], None] = vars(atexit)["_clear"]
 _end_multiprocessing: Callable[[], None] = vars(util)["_exit_function"]
 _FINALIZERS: Any = weakref.finalize
-_serve_one: Callable[..., int] = vars(multiprocessing.forkserver)["_serve_one"]
 
 PRELOAD = (
     "rr_actors.supervision.child_main",
@@ -56,46 +59,76 @@ _AT_EXIT_S = 5.0
 """The longest time for the handlers that were registered with atexit."""
 _REQUEST_S = 5.0  # the longest wait for a request that is connected already
 _RETRY_S = 0.02  # before the next attempt to accept a connection
+_FEWEST_FDS = 4  # of a request: its data, its status, its control channel and its lifeline
 _FDS = 16  # more descriptors than a request has
 _SAY_WHY = "rr_actors.supervision.child_main:could_not_begin"
 
 
-def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int, family: int) -> NoReturn:
-    """Run a child process from its first step to its end, on its main thread."""
+def enter(data: int, control: socket.socket, life: int, environment: bytes) -> NoReturn:
+    """Run a child process from its launch message to its end, on its main thread.
+
+    Args:
+        data: the pipe with the launch message.
+        environment: the environment_block() that this process has.
+    """
+    try:
+        launch = fork_server.read_launch(data)
+    except EOFError:  # the sender has ended or given the child up, so a traceback would not help anyone
+        os._exit(1)
     code = 1
-    sys.excepthook = _Hook.before
-    control, life = _SERVER._inherited_fds
-    end = socket.socket(fileno=control)
     try:
         os.setpgid(0, 0)
-        lifeline.mark(family)
+        lifeline.mark(launch.family)
         signal.pthread_sigmask(signal.SIG_SETMASK, [])
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        # The parent decides what a ^C means. Not SIG_IGN: programs that this process starts would inherit that.
-        signal.signal(signal.SIGINT, _ignore)
-        _set_environment(environment)
-        lifeline.hold(life, parent_pid)
-        os.close(_SERVER._forkserver_alive_fd)  # /dev/null here: the server's launcher has the real one
-        _forget_false_tracker()
-        pickling.adopt_main()
-        ForkingPickler.reducer_override = pickling.of_main_by_value
-        code = call_by_name(entry, Inherited(name, payload, end))
+        _be_process_of_multiprocessing(launch, data)
+        _take_surroundings(launch, environment)
+        lifeline.hold(life, launch.parent_pid)
+        code = _called_by_name(launch.entry, Inherited(launch.name, launch.payload, control))
     except SystemExit as left:
         code = left.code if isinstance(left.code, int) else int(left.code is not None)
     except BaseException as error:
-        if not (_say_why(end, error) and wanted_by(error)):
-            traceback.print_exc()
+        _report(control, error)
     finally:
         leave(code)
 
 
-def _set_environment(environment: dict[str, str]) -> None:
+def _be_process_of_multiprocessing(launch: Launch, sentinel: int) -> None:
+    """Give multiprocessing what its own launch of a child would have given it."""
+    own: Any = ForkServerProcess(name=launch.name)
+    own._parent_pid, own._parent_name = launch.parent_pid, launch.parent_name
+    own.authkey = launch.authkey
+    multiprocessing: Any = process
+    multiprocessing._current_process = own
+    multiprocessing._parent_process = _ParentProcess(launch.parent_name, launch.parent_pid, sentinel)
+    multiprocessing._process_counter = itertools.count(1)
+    multiprocessing._children = set()
+    multiprocessing.ORIGINAL_DIR = launch.original_dir
+    _renew_native_id(threading.main_thread())
+    _forget_parents_finalizers()
+
+
+def _take_surroundings(launch: Launch, environment: bytes) -> None:
+    sys.path, sys.argv = launch.sys_path, launch.sys_argv
+    if launch.directory is not None:
+        os.chdir(launch.directory)
+    if launch.environment != environment:
+        _set_environment(launch.environment)
+
+
+def _set_environment(block: bytes) -> None:
     """Give this process its parent's environment. Most of it is inherited: to set a variable anew copies memory."""
-    for name in os.environ.keys() - environment.keys():
-        del os.environ[name]
+    environment = dict(variable.split(b"=", 1) for variable in block.split(b"\0") if variable)
+    for name in os.environb.keys() - environment.keys():
+        del os.environb[name]
     for name, value in environment.items():
-        if os.environ.get(name) != value:
-            os.environ[name] = value
+        if os.environb.get(name) != value:
+            os.environb[name] = value
+
+
+def _report(control: socket.socket, error: BaseException) -> None:
+    """Tell the parent why this child cannot begin, and show the error unless it only says what is wanting."""
+    if not (_say_why(control, error) and wanted_by(error)):
+        traceback.print_exc()
 
 
 def _say_why(control: socket.socket, error: BaseException) -> bool:
@@ -103,23 +136,16 @@ def _say_why(control: socket.socket, error: BaseException) -> bool:
     if isinstance(error, pickling.CUT_OFF) or control.fileno() < 0:
         return False
     with contextlib.suppress(Exception):
-        call_by_name(_SAY_WHY, control, error)
+        _called_by_name(_SAY_WHY, control, error)
         return True
     return False
 
 
-class _Hook:
-    before = sys.excepthook
-    """The hook for unhandled errors, here and in the programs of children."""
-
-
-def _show_unless_cut_off(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Show an unhandled error, but not that of an incomplete launch message (sys.excepthook until enter()).
-
-    The sender of that message has ended or given the child up, so a traceback would not help anyone.
-    """
-    if not isinstance(error, pickling.CUT_OFF):
-        _Hook.before(kind, error, trace)
+def _called_by_name(function: str, *arguments: Any) -> Any:
+    """Call the function "module:function"; import its module in this process, if the fork server has not."""
+    module, _, name = function.partition(":")
+    found = sys.modules.get(module) or importlib.import_module(module)
+    return getattr(found, name)(*arguments)
 
 
 def leave(code: int) -> NoReturn:
@@ -157,16 +183,6 @@ def _ignore(*_: object) -> None:
     pass
 
 
-def _forget_false_tracker() -> None:
-    """Forget /dev/null in the place of a resource tracker, if the parent had none: the child may start its own."""
-    if _TRACKER._fd is None:
-        return
-    os.set_inheritable(_TRACKER._fd, False)
-    if os.fstat(_TRACKER._fd).st_rdev == os.stat(os.devnull).st_rdev:
-        os.close(_TRACKER._fd)
-        _TRACKER._fd = None
-
-
 # -- the fork server's main program ----------------------------------------------------------------------------------
 
 
@@ -202,9 +218,10 @@ def serve(listener: int, alive: int, address: int, errors: int, preload: Sequenc
 
     atexit.register(clean_up)
     os.register_at_fork(after_in_child=leave_handlers)
+    _prepare_for_children()
+    forking = _Forking(listener, alive)
     garbage.share()
-    _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
-    _Forking(listener, alive).run()
+    forking.run()
     leave(0)  # an orderly end of the interpreter would take 4 ms more, for which System.stop() waits
 
 
@@ -214,6 +231,14 @@ def _preload(module: str) -> None:
     except (Exception, SystemExit):
         sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
         traceback.print_exc()
+
+
+def _prepare_for_children() -> None:
+    """Do once what each child would do."""
+    _set_start_method("forkserver")
+    _close_stdin()
+    pickling.adopt_main()
+    ForkingPickler.reducer_override = pickling.of_main_by_value
 
 
 def _show_errors(errors: int) -> None:
@@ -240,11 +265,14 @@ class _Forking:
         self._own = [alive, self._wake, wake]
         self._statuses: dict[int, int] = {}  # the pipe for the exit code of each child
         self._spare = -1  # without a descriptor left, a connection could not even be refused
-        self._signals = {
-            signal.SIGCHLD: signal.signal(signal.SIGCHLD, _ignore),
-            signal.SIGINT: signal.signal(signal.SIGINT, signal.SIG_IGN),
-        }
+        self._signals = {signal.SIGCHLD: signal.signal(signal.SIGCHLD, _ignore)}
+        # The parent decides what a ^C means. Not SIG_IGN: programs that a child starts would inherit that.
+        self._signals[signal.SIGINT] = _ignore
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+            self._signals[signal.SIGTERM] = signal.SIG_DFL
         signal.set_wakeup_fd(wake)
+        self._environment = fork_server.environment_block()
 
     def run(self) -> None:
         """Serve until the pipe `alive` closes."""
@@ -300,16 +328,17 @@ class _Forking:
 
     def _fork(self, client: socket.socket) -> int:
         client.settimeout(_REQUEST_S)
-        _, fds, flags, _ = socket.recv_fds(client, 1, _FDS, socket.MSG_CMSG_CLOEXEC)
+        kind, fds, flags, _ = socket.recv_fds(client, 1, _FDS, socket.MSG_CMSG_CLOEXEC)
         try:
             if flags & socket.MSG_CTRUNC:
                 raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
-            if not fds:
+            if len(fds) < _FEWEST_FDS:
                 raise ConnectionResetError(errno.ECONNRESET, os.strerror(errno.ECONNRESET))
-            data, status, *inherited = fds
+            data, status, *trackers, control, life = fds
             pid = os.fork()
             if pid == 0:
-                self._be_child(client, data, status, inherited)
+                _TRACKER._fd = trackers[0] if kind == fork_server.TRACKED else None  # a child may start its own
+                self._be_child(client, data, status, control, life)
             self._statuses[pid] = status
             fds.remove(status)
             return pid
@@ -317,21 +346,28 @@ class _Forking:
             for fd in fds:
                 os.close(fd)
 
-    def _be_child(self, client: socket.socket, data: int, status: int, inherited: list[int]) -> NoReturn:
-        code = 1
+    def _be_child(self, client: socket.socket, data: int, status: int, control: int, life: int) -> NoReturn:
         try:
-            client.close()
-            self._listener.close()
-            unused = [*self._own, status, *self._statuses.values()]
-            if self._spare >= 0:
-                unused.append(self._spare)
-            code = _serve_one(data, inherited, unused, self._signals)
-        except BaseException as error:
-            if not (_say_why(socket.socket(fileno=inherited[-2]), error) and wanted_by(error)):
-                sys.excepthook(type(error), error, error.__traceback__)
-                sys.stderr.flush()
+            end = socket.socket(fileno=control)
+            try:
+                client.close()
+                self._leave_to_server(status)
+                enter(data, end, life, self._environment)
+            except BaseException as error:
+                _report(end, error)
         finally:
-            os._exit(code)
+            os._exit(1)
+
+    def _leave_to_server(self, status: int) -> None:
+        """Close what is the server's, in a child, and let signals have their usual effects."""
+        signal.set_wakeup_fd(-1)
+        for number, handler in self._signals.items():
+            signal.signal(number, handler)
+        self._listener.close()
+        for fd in (*self._own, status, *self._statuses.values()):
+            os.close(fd)
+        if self._spare >= 0:
+            os.close(self._spare)
 
 
 def _forget_exit_handlers() -> None:

@@ -4,13 +4,13 @@ A fork server is a small process without threads that has imported the package a
 them and reports their exit codes (rr_actors/runtime/processes/child_bootstrap.py). Server and client are this package's
 own: multiprocessing.forkserver's server ends when it cannot fork, and its client ties the server to a resource tracker
 and to this process's default start method, and does not use the server that a child inherits. The parent's __main__ is
-not run again in the child: all that a child needs travels by value.
+not run again in the child: all that a child needs travels by value, in a launch message of this package's own. To run
+multiprocessing's launch code takes more steps in each child, and each page that they touch is copied.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import os
 import signal
@@ -21,12 +21,11 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from importlib.machinery import PathFinder
-from multiprocessing import process, reduction
-from multiprocessing.context import ForkServerProcess, set_spawning_popen
-from typing import Any
+from multiprocessing import process
 
 import msgspec
 
+from rr_actors.base import pickling
 from rr_actors.base.errors import UsageError, readable
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes import lifeline
@@ -46,7 +45,10 @@ _IN_FROZEN = "--rr-actors-fork-server"
 """The first argument of a frozen program that is started as a fork server; the code to run is the second."""
 _WORDS = 2_000  # the most characters of a server's last words
 _LONGEST_VARIABLE = 128 * 1024 - 1  # bytes of "name=value" that the kernel gives a program
-_SIGNED = struct.Struct("q")  # process ids, numbers of errors and exit codes
+_SIGNED = struct.Struct("q")  # process ids, numbers of errors, exit codes and lengths
+TRACKED = b"t"
+"""A request whose third descriptor is that of a resource tracker; another request has none."""
+_PLAIN = b"p"
 
 
 class Inherited(msgspec.Struct, frozen=True):
@@ -127,13 +129,12 @@ class ForkServer:
         with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
             status_r, status_w = _pipe(on_failure, theirs)
             data_r, data_w = _pipe(theirs, on_failure)
-            null = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
-            theirs.callback(os.close, null)
             tracker = _tracker()
+            kind, trackers = (_PLAIN, ()) if tracker is None else (TRACKED, (tracker,))
             with socket.socket(socket.AF_UNIX) as client:
                 client.settimeout(max(0.001, deadline - time.monotonic()))
                 client.connect(f"/proc/self/fd/{self._address}")
-                socket.send_fds(client, [b"f"], [data_r, status_w, null, null if tracker is None else tracker, *fds])
+                socket.send_fds(client, [kind], [data_r, status_w, *trackers, *fds])
                 if not lifeline.is_readable(client.fileno(), deadline - time.monotonic()):
                     raise TimeoutError("the fork server did not answer in time")
                 pid = read_signed(client.fileno())
@@ -235,13 +236,18 @@ def signed(number: int) -> bytes:
 
 def read_signed(fd: int) -> int:
     """Read a number from a pipe; raise EOFError if the writing process has ended before. Blocks."""
-    data = b""
-    while len(data) < _SIGNED.size:
-        more = os.read(fd, _SIGNED.size - len(data))
-        if not more:
+    return _SIGNED.unpack(_read(fd, _SIGNED.size))[0]
+
+
+def _read(fd: int, size: int) -> bytes:
+    data = bytearray(size)
+    rest = memoryview(data)
+    while rest:
+        count = os.readv(fd, [rest])
+        if not count:
             raise EOFError("nobody is left to write to this pipe")
-        data += more
-    return _SIGNED.unpack(data)[0]
+        rest = rest[count:]
+    return bytes(data)
 
 
 def _interpreter(call: str, fds: Sequence[int], words: int) -> subprocess.Popen[bytes]:
@@ -296,36 +302,63 @@ rr_actors/runtime/processes/child_bootstrap.py.
 """
 
 
-# -- the launch message: written by the parent, run by the child -----------------------------------------------------
+# -- the launch message: written by the parent, read by the child ----------------------------------------------------
+
+
+class Launch(msgspec.Struct, frozen=True):
+    """The call that a child makes, and its parent's surroundings.
+
+    Attributes:
+        entry: the function to call, "module:function".
+        payload: not part of the pickle, which may then be a plain one.
+        original_dir: the working directory at the parent's first import of multiprocessing.
+        directory: the working directory; None if it is gone.
+        environment: an environment_block().
+    """
+
+    entry: str
+    name: str
+    family: int
+    parent_pid: int
+    parent_name: str
+    authkey: bytes
+    sys_path: list[str]
+    sys_argv: list[str]
+    original_dir: str | None
+    directory: str | None
+    environment: bytes
+    payload: bytes = b""
 
 
 def launch_message(entry: str, payload: bytes, name: str, family: int) -> bytes:
-    """Return the message for a child's data pipe: the parent's surroundings, and the call to make."""
-    surroundings: dict[str, Any] = {
-        "name": name,
-        "authkey": process.current_process().authkey,
-        "sys_path": _sys_path(),
-        "sys_argv": sys.argv,
-        "orig_dir": _ORIGINAL_DIR,
-    }
+    """Return the message for a child's data pipe, which read_launch() reads."""
+    directory: str | None = None
     with contextlib.suppress(OSError):  # the working directory may be gone
-        surroundings["dir"] = os.getcwd()
-    arguments = (entry, payload, name, dict(os.environ), os.getpid(), family)
-    child = ForkServerProcess(
-        target=call_by_name, args=("rr_actors.runtime.processes.child_bootstrap:enter", *arguments), name=name
+        directory = os.getcwd()
+    parent = process.current_process()
+    launch = Launch(
+        entry=entry,
+        name=name,
+        family=family,
+        parent_pid=os.getpid(),
+        parent_name=parent.name,
+        authkey=bytes(parent.authkey),  # multiprocessing's class refuses to be pickled
+        sys_path=_sys_path(),
+        sys_argv=sys.argv,
+        original_dir=_ORIGINAL_DIR,
+        directory=directory,
+        environment=environment_block(),
     )
-    message = io.BytesIO()
-    spawning: Any = child
-    set_spawning_popen(spawning)  # allows the authkey to be pickled, on this thread
-    try:
-        reduction.dump(surroundings, message)
-        reduction.dump(child, message)
-    finally:
-        set_spawning_popen(None)
-    return message.getvalue()
+    pickled = pickling.dumps(launch, f"the surroundings of {name}")
+    return b"".join((signed(len(pickled)), pickled, signed(len(payload)), payload))
 
 
-def call_by_name(function: str, *arguments: Any) -> Any:
-    """Call the function "module:function", and import its module in this process, which is the child for an entry."""
-    module, _, name = function.partition(":")
-    return getattr(importlib.import_module(module), name)(*arguments)
+def read_launch(fd: int) -> Launch:
+    """Read a launch_message() from a pipe; raise EOFError if its writer has ended before. Blocks."""
+    launch: Launch = pickling.loads(_read(fd, read_signed(fd)))
+    return msgspec.structs.replace(launch, payload=_read(fd, read_signed(fd)))
+
+
+def environment_block() -> bytes:
+    """Return this process's environment, as bytes that are equal for equal environments of the same order."""
+    return b"\0".join([b"%b=%b" % variable for variable in os.environb.items()])
