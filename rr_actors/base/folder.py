@@ -33,9 +33,11 @@ _AS_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 def make_directories(path: str | os.PathLike[str], *, synced: bool = False) -> None:
     """Make a directory and its missing parents, each with mode 0700. `synced`: a power cut does not lose them."""
+    if os.path.isdir(path):  # mostly: a process of a running system finds all that it needs
+        return
     missing: list[Path] = []
     at = Path(path)
-    with contextlib.suppress(OSError):  # it is there, or its parent is not
+    with contextlib.suppress(OSError):  # its parent is not there
         os.mkdir(at, 0o700)
         if synced:
             _sync(at.parent)
@@ -110,13 +112,12 @@ class Folder:
     a file of another thread that has got the same number. A thread that passes `fd` on must hold the folder meanwhile.
 
     Attributes:
-        path: the directory's path when it was opened.
         fd: the descriptor; -1 once it is closed.
         owner: the user to whom the directory and its files must belong.
     """
 
-    def __init__(self, path: Path, fd: int, owner: int) -> None:
-        self.path = path
+    def __init__(self, path: str, fd: int, owner: int) -> None:
+        self._path = path  # no Path: a child process would not need one, and each part of that copies memory
         self.fd = fd
         self.owner = owner
         self._close = weakref.finalize(self, os.close, fd)
@@ -128,13 +129,15 @@ class Folder:
 
         With `to_read` the directory may belong to another user; its files must belong to the same user then.
         """
-        real = os.path.realpath(path)
-        fd = os.open(real, _AS_DIRECTORY)
-        return cls(Path(real), fd, os.fstat(fd).st_uid if to_read else os.geteuid())
+        folder = cls.unlinked(os.path.realpath(path))
+        if to_read:
+            folder.owner = os.fstat(folder.fd).st_uid
+        return folder
 
     @classmethod
-    def unlinked(cls, path: Path) -> Self:
+    def unlinked(cls, path: str | os.PathLike[str]) -> Self:
         """Open the directory at a path. A link in the place of its last name is not followed: that is an OSError."""
+        path = os.fspath(path)
         return cls(path, os.open(path, _AS_DIRECTORY), os.geteuid())
 
     @classmethod
@@ -147,17 +150,22 @@ class Folder:
         folder = cls.at(top)
         for name in path.relative_to(top).parts:
             with folder:
-                inner = folder.path / name
+                inner = f"{folder._path}/{name}"
                 if os.path.islink(inner):
-                    raise NotAFile(inner, "a symbolic link")
+                    raise NotAFile(Path(inner), "a symbolic link")
                 folder = cls(inner, os.open(name, _AS_DIRECTORY, dir_fd=folder.fd), folder.owner)
         return folder
+
+    @property
+    def path(self) -> Path:
+        """The directory's path when it was opened."""
+        return Path(self._path)
 
     @property
     def place(self) -> Place:
         """Where the directory is."""
         found = os.fstat(self.fd)
-        return Place(str(self.path), found.st_dev, found.st_ino)
+        return Place(self._path, found.st_dev, found.st_ino)
 
     def close(self) -> None:
         """Close the descriptor. A second call does nothing."""
@@ -194,12 +202,13 @@ class Folder:
         """Open or make a directory in this one, with mode 0700; raise NotOurs and change nothing if it is not ours."""
         with contextlib.suppress(FileExistsError):
             os.mkdir(name, 0o700, dir_fd=self.fd)
+        path = f"{self._path}/{name}"
         try:
             fd = os.open(name, _AS_DIRECTORY, dir_fd=self.fd)
         except OSError as error:
-            error.filename = str(self.path / name)
+            error.filename = path
             raise
-        folder = Folder(self.path / name, fd, self.owner)
+        folder = Folder(path, fd, self.owner)
         try:
             folder.tighten(0o077)
         except BaseException:

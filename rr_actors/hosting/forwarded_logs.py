@@ -34,18 +34,21 @@ _AS_IT_IS = (
 
 
 class Forwarder(logging.Handler):
-    """The handler of a child's records that have no other. It writes to standard error what it cannot send.
+    """The handler of a child's records that have no other. It writes to standard error what it cannot send."""
 
-    Args:
-        path: the child's, "root/cameras".
-        send: sends an event up, from any thread; returns False if that is not possible any more.
-    """
+    _last: logging.Handler | None
+    _path: str
+    _send: Callable[[dict[str, Any]], bool]
 
-    def __init__(self, path: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        super().__init__()
-        self._last = logging.lastResort
-        self._path = path
-        self._send = send
+    def begin(self, path: str, send: Callable[[dict[str, Any]], bool]) -> None:
+        """Replace logging's last resort.
+
+        Args:
+            path: the child's, "root/cameras".
+            send: sends an event up, from any thread; returns False if that is not possible any more.
+        """
+        self._last, self._path, self._send = logging.lastResort, path, send
+        logging.lastResort = self  # pyright: ignore[reportAttributeAccessIssue] - a handler is what it is
 
     def emit(self, record: logging.LogRecord) -> None:
         """Send a record."""
@@ -58,6 +61,9 @@ class Forwarder(logging.Handler):
             self._last.handle(record)
 
 
+_forwarder = Forwarder()  # made with its locks in the fork server, and not in each child
+
+
 def levels() -> dict[str, int]:
     """Return the levels that were set for loggers of this process, by name; the root logger's is ""."""
     root = logging.getLogger()
@@ -68,7 +74,7 @@ def levels() -> dict[str, int]:
 
 def begin(path: str, levels: dict[str, int], send: Callable[[dict[str, Any]], bool]) -> None:
     """Send up the records of this process from now on, and set these levels for its loggers."""
-    logging.lastResort = Forwarder(path, send)  # pyright: ignore[reportAttributeAccessIssue] - a handler is what it is
+    _forwarder.begin(path, send)
     logging.basicConfig = _configure_if_asked
     for name, level in levels.items():
         logger = logging.getLogger(name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Awaitable, Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -109,16 +108,16 @@ class ProcessNode(abc.ABC):
         self.info = info
         self.path = path
         self.config = info.config
-        self.directory = Directory(Path(info.run_dir), keeps=True, place=info.place)
+        self.directory = Directory(info.run_dir, keeps=True, place=info.place)
         try:
-            self.watched = Watched(Path(info.run_dir))
+            self.watched = Watched(info.run_dir)
             self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
         except BaseException:
             self.directory.close()
             raise
         self.local = LocalTransport()
         self.transport = UnixTransport(
-            Path(info.run_dir),
+            info.run_dir,
             info.key,
             {**messages, **CODECS},
             frame_limit_bytes=info.config.frame_limit_bytes,

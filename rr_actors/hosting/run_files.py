@@ -8,7 +8,6 @@ import mmap
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from rr_actors.base.errors import CatalogError, ConfigError
 from rr_actors.base.folder import Folder, Place
@@ -40,22 +39,22 @@ class Watched:
         ConfigError: the file cannot be made there.
     """
 
-    def __init__(self, run_dir: Path) -> None:
-        self._run_dir = run_dir
+    def __init__(self, run_dir: str | os.PathLike[str]) -> None:
+        self._run_dir = os.fspath(run_dir)
         self._file: os.stat_result
         self.level = self._open()
 
     def _open(self) -> mmap.mmap:
         try:
-            with Folder.at(self._run_dir) as run, run.open(_NAME, os.O_RDWR | os.O_CREAT) as file:
+            with Folder.unlinked(self._run_dir) as run, run.open(_NAME, os.O_RDWR | os.O_CREAT) as file:
                 os.ftruncate(file.fileno(), 1)
                 self._file = os.fstat(file.fileno())
                 return mmap.mmap(file.fileno(), 1)
         except OSError as error:
-            path = self._run_dir / _NAME
+            path = f"{self._run_dir}/{_NAME}"
             advice = wanted_by(error) or "remove it, or choose another state_dir"
             text = f"cannot use {path}: {error.strerror or error}: {advice}"
-            raise ConfigError(text, file=str(path), key="state_dir") from error
+            raise ConfigError(text, file=path, key="state_dir") from error
 
     def restore(self) -> None:
         """Make the file again if it was removed, or use the one that another process has made.
@@ -64,7 +63,7 @@ class Watched:
             ConfigError: the file cannot be made.
         """
         with contextlib.suppress(OSError):  # the file is gone
-            if os.path.samestat(os.lstat(self._run_dir / _NAME), self._file):
+            if os.path.samestat(os.lstat(f"{self._run_dir}/{_NAME}"), self._file):
                 return
         wanted = self.level[0]
         self.level = self._open()

@@ -408,8 +408,9 @@ def _leave_all_in_child() -> None:
     if _process.dispatcher is not None:
         _process.dispatcher._abandon()  # pyright: ignore[reportPrivateUsage]  # same file, of the same process
     _process.__init__()
-    _left.extend([leave(running) for running, leave in list(_running.items())])
-    _running.clear()
+    if _running:
+        _left.extend([leave(running) for running, leave in list(_running.items())])
+        _running.clear()
 
 
 def _close_at_exit() -> None:

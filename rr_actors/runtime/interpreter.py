@@ -111,6 +111,8 @@ _PATCHERS = {
 def patched() -> str:
     """Say what gevent or eventlet has replaced of what this package's threads and processes need; "" if nothing."""
     for patcher, (patch, parts) in _PATCHERS.items():
+        if patcher not in sys.modules:
+            continue
         if found := [part for part in parts if _source(*_PATCHED[part]).partition(".")[0] == patcher]:
             return (
                 f"{patcher} has patched {', '.join(found)} in process {os.getpid()}: no event loop can run there in a "

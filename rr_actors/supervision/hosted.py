@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pykka
 
-from rr_actors.actors.actor import IGNORE, NOT_FROZEN, BaseActor, ExitReport, Ignore, OnExit, is_frozen
+from rr_actors.actors.actor import IGNORE, NOT_FROZEN, Actor, BaseActor, ExitReport, Ignore, OnExit, is_frozen
 from rr_actors.actors.messaging import exit_reports
 from rr_actors.actors.messaging.exit_reports import abnormal
 from rr_actors.actors.refs import ref_to
@@ -62,7 +62,8 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
     if is_frozen(cls):
         raise invalid(where, "actor_class_or_manager", NOT_FROZEN, cast("object", cls))
     if not issubclass(cls, Manager):
-        declared = [name for base in cls.__mro__ for name, found in vars(base).items() if is_a(found, Declared)]
+        own = [base for base in cls.__mro__ if base not in Actor.__mro__]
+        declared = [name for base in own for name, found in vars(base).items() if is_a(found, Declared)]
         if declared:  # nobody would ever reach them
             expected = f"a subclass of rr_actors.Manager, as {declared[0]} is declared with @rr.server"
             raise invalid(where, "actor_class_or_manager", expected, cast("object", cls))

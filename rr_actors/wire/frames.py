@@ -6,7 +6,6 @@ goodbye of a side that closes on purpose: an end of the stream without it means 
 
 from __future__ import annotations
 
-import functools
 import struct
 from typing import Any, Generic, TypeVar
 
@@ -31,13 +30,18 @@ GOODBYE = _pack_length(0)
 _NOT_ENCODED = (TypeError, OverflowError, UnicodeEncodeError, RecursionError)
 
 
-@functools.cache
+_decoders: dict[int, tuple[Any, msgspec.msgpack.Decoder[Any]]] = {}  # by the identity of the types, which it keeps
+
+
 def decoder_of(messages: Any) -> msgspec.msgpack.Decoder[Any]:
     """Return the decoder of these message types, a class or a union, which all connections share.
 
-    Some take milliseconds to be made. So a fork server makes those that its children need (child_main.py).
+    Some take milliseconds to be made. So a fork server makes those that its children need (child_main.py). They are
+    found by identity: to hash a union goes through all its types, whose memory a child would copy.
     """
-    return msgspec.msgpack.Decoder(messages)
+    if (made := _decoders.get(id(messages))) is None:
+        made = _decoders[id(messages)] = messages, msgspec.msgpack.Decoder(messages)
+    return made[1]
 
 
 class FrameReader(Generic[T]):

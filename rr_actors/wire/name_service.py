@@ -142,8 +142,8 @@ class Directory:
         place: the state directory. Nothing is made while it is not in its place.
     """
 
-    def __init__(self, run_dir: Path, *, keeps: bool = False, place: Place | None = None) -> None:
-        self.run_dir = Path(run_dir)
+    def __init__(self, run_dir: str | os.PathLike[str], *, keeps: bool = False, place: Place | None = None) -> None:
+        self._run_dir = os.fspath(run_dir)
         self._place = place
         self._keeps = keeps
         self._draft = f".{os.urandom(4).hex()}."
@@ -155,10 +155,15 @@ class Directory:
     def _open(self) -> Folder:
         if self._place is not None:
             self._place.check()
-        with _named_errors("make", self.run_dir / "names"):
-            make_directories(self.run_dir)
-            with Folder.at(self.run_dir) as run:
+        with _named_errors("make", f"{self._run_dir}/names"):
+            make_directories(self._run_dir)
+            with Folder.unlinked(self._run_dir) as run:
                 return run.inner("names")
+
+    @property
+    def run_dir(self) -> Path:
+        """The directory that this one is in."""
+        return Path(self._run_dir)
 
     def close(self) -> None:
         """Close the directory: later look-ups find nothing, and writes fail."""
@@ -207,7 +212,7 @@ class Directory:
         if not name or name[0] == "." or "/" in name:
             raise UsageError(f"{name!r} is not a name for the directory: use registrar_key or actor_key", name=name)
         self._written[name] = content
-        with _named_errors("write", f"{self.run_dir}/names/{name}"):
+        with _named_errors("write", f"{self._run_dir}/names/{name}"):
             try:
                 self._write(name, content)
             except FileNotFoundError:

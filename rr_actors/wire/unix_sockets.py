@@ -10,7 +10,6 @@ import re
 import socket
 import stat
 import struct
-from pathlib import Path
 
 import msgspec
 
@@ -129,8 +128,8 @@ class SocketDir:
     uses it holds the Folder until it is done: another one may find the directory removed and open it anew meanwhile.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._path = os.fspath(path)  # of a StateDir.run_dir, which is a real path
         self._folder: Folder | None = None
         self._closed = False
 
@@ -147,9 +146,8 @@ class SocketDir:
         except OSError as error:
             unbound.close()
             why = wanted_by(error) or error.strerror or error
-            raise ConfigError(
-                f"cannot make the socket {self._path / name}: {why}", file=str(self._path / name)
-            ) from error
+            file = f"{self._path}/{name}"
+            raise ConfigError(f"cannot make the socket {file}: {why}", file=file) from error
         except BaseException:
             unbound.close()
             raise
@@ -169,7 +167,7 @@ class SocketDir:
             connected.setblocking(False)
             folder = self._opened()
             if not self.has(name):
-                raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._path / name))
+                raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), f"{self._path}/{name}")
             connected.connect(_address(folder, name))
         except BaseException:
             connected.close()
@@ -204,10 +202,10 @@ class SocketDir:
 
     def _opened(self) -> Folder:
         if self._closed:
-            raise FileNotFoundError(errno.ENOENT, "closed: its process is ending", str(self._path))
+            raise FileNotFoundError(errno.ENOENT, "closed: its process is ending", self._path)
         folder = self._folder
         if folder is None or not folder.is_there():  # not opened yet; or removed, and perhaps made again
-            folder = self._folder = Folder.at(self._path)
+            folder = self._folder = Folder.unlinked(self._path)
         return folder
 
 

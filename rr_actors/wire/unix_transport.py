@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import socket
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, cast
 
 from rr_actors.base.errors import RrError, Unavailable, UsageError
@@ -55,7 +55,7 @@ class UnixTransport:
 
     def __init__(
         self,
-        socket_dir: Path,
+        socket_dir: str | os.PathLike[str],
         key: bytes,
         codecs: Mapping[str, Any],
         *,

@@ -66,7 +66,7 @@ def test_a_directory_that_is_made_again_is_found_by_both(
 def test_two_that_open_it_at_once_leave_no_descriptor(
     run: Path, sockets: SocketDir, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    both, open_at = threading.Barrier(2, timeout=10), Folder.at
+    both, open_at = threading.Barrier(2, timeout=10), Folder.unlinked
 
     def at(*args: Any) -> Folder:
         folder = open_at(*args)
@@ -76,7 +76,7 @@ def test_two_that_open_it_at_once_leave_no_descriptor(
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(str(run / "a.sock"))
         listening.listen()
-        monkeypatch.setattr(Folder, "at", at)
+        monkeypatch.setattr(Folder, "unlinked", at)
         other = Background(lambda: connect(sockets))
         connect(sockets)
         other.result()
