@@ -221,6 +221,18 @@ def test_what_a_load_callback_has_reported_stands_beside_the_load_that_waits(
 
 
 @needs_chromium
+def test_the_page_lists_the_busiest_servers_first(app: rr.Registrar, shop: rr.System, tab: Tab) -> None:
+    app.register_server("idle", lambda request: request, lambda request, response: None)
+    app.load("shop/thing", Order("lamp"))
+    assert [row["server"] for row in loads()["servers"]] == ["app/idle", "shop/thing"]
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.clicks("Loads", role="link")
+        tab.sees("table", "app/idle")
+        assert tab.do(tab.locate('td[data-head="server"]').all_inner_texts()) == ["shop/thing", "app/idle"]
+
+
+@needs_chromium
 def test_a_request_that_is_html_is_shown_as_text_among_the_loads(
     app: rr.Registrar, shop: rr.System, tab: Tab, workshop: Workshop
 ) -> None:

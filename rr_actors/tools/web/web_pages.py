@@ -515,7 +515,8 @@ class LoadsPage(Page):
         ask = partial(self.watch.link.ask, timeout_s=_ASK_S)
         found = ask(ListLoads(limit=_WAITING))
         waiting = [waiting_cells(ask, row) for row in found.rows]
-        return waiting, found.total, [loads_cells(row) for row in found.servers]
+        busiest_first = sorted(found.servers, key=lambda row: (row.loading, row.loads), reverse=True)
+        return waiting, found.total, [loads_cells(row) for row in busiest_first]
 
 
 def _table(caption: str, heads: Sequence[str], rows: Sequence[Sequence[str]], *, left: Sequence[int]) -> str:
