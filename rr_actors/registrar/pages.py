@@ -83,6 +83,7 @@ class ResourceRow(msgspec.Struct, frozen=True):
             if it could not be unloaded, the reason.
         holders: the first 20 queries on it; `holder_count`: how many there are.
         parts: the ids of the first 20 queries that it depends on; `part_count`: how many there are.
+        part_resources: the ids of the resources that those are on, of those that are loaded.
         priority: the highest of its holders; None: all have it on standby, or nobody holds it.
         revoked: its holders are letting it go, because its owner has revoked it, or one of its parts is revoked.
     """
@@ -101,6 +102,7 @@ class ResourceRow(msgspec.Struct, frozen=True):
     part_count: int
     priority: int | None = 0
     revoked: bool = False
+    part_resources: list[str] = []
 
     @property
     def name(self) -> str:
@@ -387,7 +389,9 @@ def _with_part(text: str, ids: Iterable[str]) -> list[str]:
 
 
 def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[ResourceRow]:
-    def around(catalog: Catalog, resource: Resource) -> tuple[list[HolderRow], int, list[str], int, int | None, bool]:
+    def around(
+        catalog: Catalog, resource: Resource
+    ) -> tuple[list[HolderRow], int, list[str], int, int | None, bool, list[str]]:
         queries, parts = catalog.holders.get(resource.id, ()), catalog.parts_of(resource.id)
         first = [catalog.queries[id] for id in itertools.islice(queries, HOLDERS_SHOWN)]
         unheard = [len(catalog.notices_on.get(query.id, ())) for query in first]
@@ -397,7 +401,8 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         ]
         priority = priority_of(catalog.priority_of(resource.id))
         shown = list(reversed(parts))[:HOLDERS_SHOWN]
-        return holders, len(queries), shown, len(parts), priority, resource.id in catalog.revocations
+        below = [catalog.held[id].resource_id for id in shown if id in catalog.held]
+        return holders, len(queries), shown, len(parts), priority, resource.id in catalog.revocations, below
 
     neighbours = _read(actor, lambda catalog: [around(catalog, resource) for resource in resources])
     rows: list[ResourceRow] = []

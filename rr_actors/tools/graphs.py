@@ -67,11 +67,13 @@ def _nested(rows: list[ChildRow]) -> dict[str, Any]:
 def edges_of(resources: Collection[ResourceRow], mark: str) -> list[tuple[str, str]]:
     """Return pairs of a holder and the id of the resource that it holds.
 
-    A holder is the id of a resource, or `mark` and the name of a registrar that holds for itself.
+    A holder is the id of a resource, or `mark` and the name of a registrar that holds for itself. A row lists its first
+    holders only: others of them list the resource as their part.
     """
     known = {resource.id for resource in resources}
     found: dict[tuple[str, str], None] = {}
     for resource in resources:
+        found.update(dict.fromkeys((resource.id, part) for part in resource.part_resources if part in known))
         for holder in resource.holders:
             above = holder.parent if holder.parent in known else mark + holder.origin
             found[above, resource.id] = None

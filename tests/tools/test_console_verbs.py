@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.pages import ResourceRow
+from rr_actors.registrar.pages import HOLDERS_SHOWN, ResourceRow
 from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
@@ -754,6 +754,15 @@ def test_a_graph_is_drawn_for_mermaid_and_graphviz(app: rr.Registrar, of: str) -
     assert dot.count("{") == dot.count("}") or of != "tree"
     assert ('"root" -> "root/shop"' in dot) == (of != "dependencies")
     assert ('"holder app" -> ' in dot) == (of != "tree")
+
+
+def test_a_graph_has_all_resources_that_hold_one_also_if_they_are_many(app: rr.Registrar) -> None:
+    for number in range(HOLDERS_SHOWN + 5):
+        app.load("shop/thing", Order(f"room {number}", ("shop/thing:lamp",)))
+
+    (lamp,) = [row["id"] for row in json.loads(said("resources", "lamp", "--json")) if row["holder_count"] > 1]
+
+    assert said("graph", "--of", "dependencies", "--format", "dot").count(f'-> "{lamp}"') == HOLDERS_SHOWN + 5
 
 
 def test_registrars_with_names_alike_have_boxes_of_their_own() -> None:
