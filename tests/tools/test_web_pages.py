@@ -67,6 +67,16 @@ def test_the_tree_shows_the_children_and_the_chosen_ones_history(shop: rr.System
         assert page.url.partition("token=")[2] not in tab.page.url
 
 
+def test_a_button_that_takes_something_away_has_the_colour_of_what_is_bad(shop: rr.System, tab: Tab) -> None:
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.sees(".rr-panel", "kill -9", "stop", "restart")
+        script = "[...document.querySelectorAll('.rr-panel .q-btn')].map((one) => getComputedStyle(one).color)"
+        kill_9, stop, restart = tab.do(tab.page.evaluate(script))
+        assert kill_9 == stop != restart
+
+
 def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.System, tab: Tab) -> None:
     pid = pid_of(shop, "shop")
     with shop.serve_web() as page:
@@ -615,7 +625,7 @@ def test_from_300_resources_on_the_graph_shows_servers_opens_them_and_shows_one_
         clicks_node(tab, "#lenses/lens", "lens 111 more", "lens 77", "camera 151 1 ERROR")
         clicks_node(tab, lens.id, "lens 77", "camera 77", "@app")
         assert "camera 151" not in titles(tab)
-        tab.sees(".rr-note", "all above and below it")
+        tab.sees(".rr-note", "those above and below it")
         tab.sees(".rr-rows", "ERROR: dark")
         lenses.send_status(lens.id, rr.Status("WARNING", "dim"))
         sees_drawn(tab, "! lens 77", "! camera 77")

@@ -88,7 +88,8 @@ body { --q-primary: light-dark(#1565c0, #7db9f5) !important; --q-negative: #b71c
 .rr-events-box { display: flex; flex-direction: column-reverse; max-height: 17em; overflow-y: auto; }
 .rr-row-bad .ag-cell { color: var(--rr-bad); } .rr-row-warm .ag-cell { color: var(--rr-amber); }
 .rr-rows, .rr-events { font: 12px/1.45 monospace; white-space: pre-wrap; overflow-wrap: anywhere; width: 100%; }
-.rr-line { display: flex; gap: 10px; align-items: baseline; } .rr-line.rr-red { color: var(--rr-bad); }
+.rr-line { display: flex; flex-wrap: wrap; gap: 2px 10px; align-items: baseline; }
+.rr-line.rr-red, .rr-harmful { color: var(--rr-bad); }
 .rr-line.rr-bold { font-weight: 700; } .rr-line.rr-dim { color: var(--rr-dim); }
 .rr-line.rr-yellow { color: var(--rr-amber); }
 .rr-line .q-btn { flex: none; white-space: nowrap; overflow-wrap: normal; }
@@ -375,10 +376,11 @@ class _Panel:
         elif isinstance(command, commands.Revoke):
             question = f"Revoke {self._title.text}? Its holders have {command.grace_s:g} s to release it."
             carry_out = partial(self._page.ask_first, question, "revoke it", carry_out)
-        self._asking(name, carry_out)
+        self._asking(name, carry_out, harmful=not isinstance(command, commands.Restart))
 
-    def _asking(self, name: str, do: Callable[[], Awaitable[None]]) -> None:
-        button = ui.button(name, on_click=do).props("dense no-caps outline")
+    def _asking(self, name: str, do: Callable[[], Awaitable[None]], *, harmful: bool = False) -> None:
+        button = ui.button(name, on_click=do, color=None if harmful else "primary").props("dense no-caps outline")
+        button.classes("rr-harmful" if harmful else "")
         button.bind_enabled_from(self._page, "at", backward=lambda at: at is None)
 
 
@@ -586,7 +588,7 @@ class ResourcesPage(Page):
         if self._graph is not None:
             self._graph.options.clear()
             self._graph.options.update(self._options(self._seen()))
-        how = ": the chosen one, with all above and below it" if self._focus else ": a click opens a server"
+        how = ": the chosen one, with those above and below it" if self._focus else ": a click opens a server"
         said = f"{moment.total:,} resource{'' if moment.total == 1 else 's'}{how * grouped}"
         self._said.text = "" if moment.stale is None else said  # they are not counted yet
         self._back.set_visibility(grouped and bool(self._focus or self._opened))
