@@ -247,11 +247,23 @@ def records_of(records: list[Record], child: str) -> list[Record]:
     """Return the records of the child of a path or id, and of all below it; with "" all of them.
 
     Raises:
-        NotFound: there is no such child among them, or several have the id.
+        NotFound: there is no such child among them or above them, or several have the id.
     """
     if not child:
         return records
-    paths = {record.path for record in records}
+    paths = {path for record in records for path in _with_parents(record.path)}  # a root has no record of its own
     if (found := child_meant(child, paths)) is None:
         raise no_child(child, paths)
-    return [record for record in records if f"{record.path}/".startswith(f"{found}/")]
+    return records_below(records, found)
+
+
+def records_below(records: list[Record], path: str) -> list[Record]:
+    """Return the records of the child at this path, and of all below it; none if none is kept."""
+    return [record for record in records if f"{record.path}/".startswith(f"{path}/")]
+
+
+def _with_parents(path: str) -> Iterator[str]:
+    """Yield a path, then those of the supervisors above it."""
+    while path:
+        yield path
+        path = path.rpartition("/")[0]

@@ -470,6 +470,15 @@ def test_history_tells_why_a_child_ended(shop: rr.System) -> None:
     assert "exited" in said("events", "--event", "exited")
 
 
+def test_the_history_of_the_root_is_that_of_all_below_it(shop: rr.System, state_dir: Path) -> None:
+    assert "root/shop" in said("history", "root")
+    assert said("status", "root").startswith("root: running\n")
+    assert rr_actors("logs", "root").stderr == "no log lines of root\n"
+
+    shop.stop()
+    assert "root/shop" in said("history", "root", "--state", state_dir)
+
+
 def test_after_a_tree_has_given_up_its_exits_are_still_shown_and_looking_counts_nothing(
     start: Start, state_dir: Path
 ) -> None:

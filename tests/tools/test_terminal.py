@@ -98,6 +98,7 @@ def shop(start: Start, workshop: Workshop) -> rr.System:
 
 def test_the_tree_shows_the_children_and_the_chosen_ones_history(shop: rr.System, state_dir: Path) -> None:
     async def scene(person: Person) -> None:
+        await person.sees(lambda: "started       shop" in person.chosen)  # the root has the history of all
         await person.chooses("  shop")
         await person.sees(lambda: "running, pid" in person.chosen and "started" in person.chosen)
         assert str(pid_of(shop, "shop")) in person.chosen

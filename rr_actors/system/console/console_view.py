@@ -32,7 +32,7 @@ from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.pages import Page, ResourceRow, Wanted, What
 from rr_actors.registrar.registrar import Registrar, Usages, page
 from rr_actors.runtime.processes.lifeline import stopped
-from rr_actors.supervision.event_history import Record, TreeLog, records_of
+from rr_actors.supervision.event_history import Record, TreeLog, records_below, records_of
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import ClientRegistrars
@@ -122,7 +122,7 @@ class View:
         records = self._log.records()
         if path and self.system.ended is None:
             with contextlib.suppress(NotFound, Unavailable):
-                path = self.path_of(path)
+                return records_below(records, self.path_of(path))
         return records_of(records, path)
 
     def path_of(self, child: str) -> str:
