@@ -56,6 +56,8 @@ def server_target(server: object, node: Node) -> ServerId:
         return parse_server(server)
     except InvalidName as error:
         text = error.message
+        if inspect.isroutine(server):
+            text += ": a method that names a server has @rr.server"
         with contextlib.suppress(InvalidName):  # a server's id or another text that is no name
             text += _meant(check_name(server), node)
         raise InvalidName(text, name=error.name) from None

@@ -30,6 +30,12 @@ _FOUND = 20
 
 _VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
 
+CONDITIONS = (
+    "FATAL", "ERROR", "unload_failed", "revoked", "WARNING", "loading", "resuming", "queued", "unloading", "pausing",
+    "paused", "UPDATE", "OK",
+)  # fmt: skip
+"""What a ResourceRow.condition may be, the worst first."""
+
 _TAKEN = frozenset(("loaded", "pausing", "paused", "resuming"))  # phases of which a revocation says more
 
 _Row = TypeVar("_Row", Resource, Held)

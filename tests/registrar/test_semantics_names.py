@@ -74,6 +74,8 @@ def test_a_server_without_its_registrar_is_refused_with_the_one_that_was_probabl
     assert caught.value.name == "map"
     with pytest.raises(rr.InvalidName, match="'provider' is a registrar, name its server, too"):
         app.load("provider", 1)
+    with pytest.raises(rr.InvalidName, match=r"got method .*: a method that names a server has @rr.server"):
+        app.load(app.resources, 1)
 
 
 def test_taking_a_registrars_name_twice_is_an_error_and_leaves_the_first_untouched(

@@ -327,6 +327,9 @@ def test_lists_are_chosen_sorted_and_printed_as_names_for_other_commands(app: rr
     assert said("resources", "-o", "name", "--status", "OK").splitlines() == names[1:]
     assert [row["id"] for row in json.loads(said("resources", "-o", "json", "--status", "OK"))] == [first.resource_id]
     assert rr_actors("resources", "--holder", "nobody").stderr == "no resource matches\n"
+    told = refused(2, "resources", "--status", "nonsense")
+    assert "--status: expected one of OK, UPDATE," in told
+    assert "got 'nonsense'" in told
     for name in names:
         assert name in said("why", name)
     assert set(said("ps", "-o", "name").splitlines()) == {"root", "root/shop"}

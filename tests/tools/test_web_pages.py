@@ -925,6 +925,15 @@ def test_without_a_system_the_command_says_so_and_ends(tmp_path: Path) -> None:
     assert len(ran.stderr.splitlines()) == 1
 
 
+def test_a_host_that_is_not_this_machines_is_named() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors", "web", "--lab", "--host", "192.0.2.1"], capture_output=True, text=True
+    )
+    assert ran.returncode == 2
+    assert ran.stderr.startswith("rr-actors: 192.0.2.1:0: cannot be listened at (")
+    assert ran.stderr.endswith("; choose another --host\n")
+
+
 @pytest.mark.slow
 def test_a_port_that_is_taken_is_named(start: Start) -> None:
     system = start()

@@ -26,11 +26,6 @@ from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.terminal.child_logs import line_texts
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_of
 
-WORST = (
-    "FATAL", "ERROR", "unload_failed", "revoked", "WARNING", "loading", "resuming", "queued", "unloading", "pausing",
-    "paused", "UPDATE", "OK",
-)  # fmt: skip
-"""The states of resources, the worst first."""
 LOOK_S = 10.0  # for the answer to a question
 _HISTORY = 100  # records
 _LOGGED = 50  # lines of a child's log

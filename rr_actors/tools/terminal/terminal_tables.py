@@ -15,13 +15,13 @@ import msgspec
 
 from rr_actors.base.names import named, short_id
 from rr_actors.hosting.streams import StreamRow
-from rr_actors.registrar.pages import LoadRow, QueryRow, ResourceRow
+from rr_actors.registrar.pages import CONDITIONS, LoadRow, QueryRow, ResourceRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
 from rr_actors.tools.explanations import age_text, bytes_text, loads_cells, rate_text, readers_text, waiting_cells
 from rr_actors.tools.process_usage import BUCKETS, RateWatch, Usage, UsageWatch
-from rr_actors.tools.terminal.terminal_rows import LOOK_S, STATE_STYLES, WORST, Asks, Listed, Row, Window, joined
+from rr_actors.tools.terminal.terminal_rows import LOOK_S, STATE_STYLES, Asks, Listed, Row, Window, joined
 
 _SORTED = 5000  # rows: of more, the first ones are sorted
 _NAME = 26  # cells that stay for a name
@@ -197,7 +197,7 @@ def _registrar(row: c.RegistrarRow, loads: float | None, columns: Sequence[_Colu
 
 _OF_RESOURCES: tuple[_Column[ResourceRow], ...] = (
     _Column("state", 11, lambda row: row.condition,
-            lambda row: -WORST.index(row.condition)),
+            lambda row: -CONDITIONS.index(row.condition)),
     _Column("holders", 9, lambda row: str(row.holder_count), lambda row: row.holder_count),
     _Column("priority", 10, lambda row: row.needed, lambda row: -1001 if row.priority is None else row.priority),
     _Column("id", 10, lambda row: short_id(row.id)),

@@ -19,7 +19,7 @@ from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotRunning, RrError, UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.base.names import short_ids
 from rr_actors.hosting.forwarded_logs import LogLine
-from rr_actors.registrar.pages import LoadRow, ResourceRow
+from rr_actors.registrar.pages import CONDITIONS, LoadRow, ResourceRow
 from rr_actors.supervision.event_history import Record, left_records, records_of
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
@@ -240,6 +240,9 @@ def _show_resources(
     output: str | None,
     as_json: bool,
 ) -> None:
+    known = {one.lower() for one in CONDITIONS}
+    if wrong := [one for one in status or () if one.lower() not in known]:
+        raise UsageError(f"--status: expected one of {', '.join(reversed(CONDITIONS))}, got {shown(wrong[0])}")
     chooses = bool(status or holder or sort_by)
     with _client(state) as client:
         page = client.resources(registrar, match, sys.maxsize if chooses else limit)

@@ -14,10 +14,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from typing import Any
 
 from rr_actors.base.names import named
-from rr_actors.registrar.pages import ResourceRow
+from rr_actors.registrar.pages import CONDITIONS, ResourceRow
 from rr_actors.system.console.console_questions import Find, ListResources
 from rr_actors.tools.graphs import edges_of
-from rr_actors.tools.terminal.terminal_rows import WORST
 from rr_actors.tools.web.watch import Moment
 
 Chart = dict[str, Any]
@@ -162,7 +161,7 @@ def _may_hold(above: str, below: str, drawn: Mapping[str, ResourceRow]) -> bool:
 
 def _counted(name: str, states: Mapping[str, int], more: str) -> tuple[str, str]:
     """Return the text and the state of a server: lines such as "camera", "400", "3 ERROR", and the worst state."""
-    there = [state for state in WORST if states.get(state)]
+    there = [state for state in CONDITIONS if states.get(state)]
     bad = [f"{states[state]:,} {state}" for state in there if state != "OK"]
     total = " ".join(filter(None, (f"{sum(states.values()):,}", more)))
     return "\n".join([name, total, *bad]), there[0] if there else "OK"
@@ -306,14 +305,14 @@ def rows_of_server(ask: _Ask, server: str, states: Mapping[str, int]) -> list[Re
         RrError: the system did not answer.
     """
     found: dict[str, ResourceRow] = {}
-    for match in [state for state in WORST if states.get(state) and state != "OK"] + [server]:
+    for match in [state for state in CONDITIONS if states.get(state) and state != "OK"] + [server]:
         page = ask(ListResources(match, registrar=server.partition("/")[0]), _LOOK_S)
         found = {row.id: row for row in page.rows if row.server == server} | found
     return sorted(found.values(), key=_badness)[:_OPENED]
 
 
 def _badness(row: ResourceRow) -> int:
-    return WORST.index(row.condition)
+    return CONDITIONS.index(row.condition)
 
 
 def neighbours_of(ask: _Ask, id: str) -> list[ResourceRow]:
