@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -75,7 +75,7 @@ def test_a_server_without_its_registrar_is_refused_with_the_one_that_was_probabl
     with pytest.raises(rr.InvalidName, match="'provider' is a registrar, name its server, too"):
         app.load("provider", 1)
     with pytest.raises(rr.InvalidName, match=r"got method .*: a method that names a server has @rr.server"):
-        app.load(app.resources, 1)
+        app.load(cast("Any", app.resources), 1)
 
 
 def test_taking_a_registrars_name_twice_is_an_error_and_leaves_the_first_untouched(
