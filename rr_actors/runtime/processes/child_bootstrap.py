@@ -51,8 +51,12 @@ PRELOAD = (
     "rr_actors.system.system",
     "rr_actors.system.console.connected_client",
     "rr_actors.actors.timers",
+    "tempfile",
 )
-"""What a fork server imports before it forks: the modules of all public names, so that no child imports any."""
+"""What a fork server imports before it forks: the modules of all public names, so that no child imports any.
+
+And tempfile, with random, shutil and what these need: many programs import them, at 5 ms in each child.
+"""
 
 _LEAVE_GRACE_S = 2.0
 _AT_EXIT_S = 5.0
