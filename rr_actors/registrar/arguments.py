@@ -9,7 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, MethodType
 from typing import Any, TypedDict, TypeVar, cast
 
 import msgspec
@@ -56,7 +56,7 @@ def server_target(server: object, node: Node) -> ServerId:
         return parse_server(server)
     except InvalidName as error:
         text = error.message
-        if inspect.isroutine(server):
+        if is_a(server, (FunctionType, MethodType)):
             text += ": a method that names a server has @rr.server"
         with contextlib.suppress(InvalidName):  # a server's id or another text that is no name
             text += _meant(check_name(server), node)
