@@ -336,7 +336,7 @@ class _Forking:
         try:
             if flags & socket.MSG_CTRUNC:
                 raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
-            if len(fds) < _FEWEST_FDS:
+            if len(fds) < _FEWEST_FDS + (kind == fork_server.TRACKED):
                 raise ConnectionResetError(errno.ECONNRESET, os.strerror(errno.ECONNRESET))
             data, status, *trackers, control, life = fds
             pid = os.fork()

@@ -153,8 +153,6 @@ def _may_hold(above: str, below: str, drawn: Mapping[str, ResourceRow]) -> bool:
     holders = drawn[below].holders
     if above in drawn:
         return below in drawn[above].part_resources or any(holder.parent == above for holder in holders)
-    if drawn[below].holder_count > len(holders):
-        return True
     origin = above.strip("@#").partition("/")[0]
     return any(holder.origin == origin and bool(holder.parent) != above.startswith("@") for holder in holders)
 
