@@ -33,7 +33,8 @@ class EventFilter:
         kinds: kinds of events.
         child: a child's id or path; the events of all below it are wanted, too.
         server: a registrar, or "registrar/server".
-        texts: each of them is in the line, or in a name of a resource that its status has reached.
+        texts: each of them is in what a line says of its event (kind, subject, how), or in the name of a resource that
+            its status has reached. The clock, the number of times and the reach are not searched.
     """
 
     kinds: frozenset[str] = frozenset()
@@ -72,7 +73,8 @@ class EventFilter:
             return False
         if self.server and not any(f"{server}/".startswith(f"{self.server}/") for server in list(line.servers)):
             return False
-        return all(text in str(line) or any(text in name for name in list(line.names)) for text in self.texts)
+        said = (line.said, *line.names.copy())
+        return all(any(text in one for one in said) for text in self.texts)
 
 
 @dataclass
@@ -119,6 +121,11 @@ class EventLine:
             return cls(event.at, event.event, name, how, "", {server}, {name: None}, heard)
         how = f"{facts.get('message', '')}: {facts.get('why', '')}".strip(": ")
         return cls(event.at, event.event, str(facts.get("to", "")), how)
+
+    @property
+    def said(self) -> str:
+        """The event in words: its kind, its subject and how; without the clock, the times and the reach."""
+        return " ".join(filter(None, (self.kind, self.subject, self.how)))
 
     @property
     def reach(self) -> str:

@@ -419,7 +419,7 @@ def _amount(name: str, number: float | None) -> str:
 def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what happens, until Ctrl-C.")] = False,
     event: Annotated[list[str] | None, typer.Option(help="Only events of this kind; may be repeated.")] = None,
-    about: Annotated[str, typer.Option(help="Only those with this text in their line.")] = "",
+    about: Annotated[str, typer.Option(help="Only those with this text in their kind, subject or words.")] = "",
     child: Annotated[
         str, typer.Option(help="Only of this child and all below it.", autocompletion=_completing(_children))
     ] = "",

@@ -1,0 +1,54 @@
+"""The lines of events for people, and the filter that chooses among them."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from rr_actors.system.console.console_messages import Event
+from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines
+
+THIRTEEN = time.mktime((2026, 11, 28, 13, 13, 13, 0, 0, -1))
+"""13:13:13 of the local day: each pair of digits of the clock is 13."""
+
+
+def loaded(lamp: str, at: float = THIRTEEN) -> Event:
+    return Event(0, at, "loaded", {"server": "shop/thing", "request": f'"lamp {lamp}"'})
+
+
+def chosen(wanted: EventFilter, *events: Event) -> list[str]:
+    lines = EventLines()
+    for event in events:
+        lines.take(event)
+    return [line.subject for line in lines.lines(wanted)]
+
+
+@pytest.mark.parametrize("wanted", [EventFilter.parse("lamp 13"), EventFilter.of(text="13")], ids=["typed", "option"])
+def test_a_filter_does_not_search_the_clock(wanted: EventFilter) -> None:
+    assert chosen(wanted, *map(loaded, ("12", "13", "14"))) == ['shop/thing "lamp 13"']
+
+
+def test_a_filter_does_not_search_how_often_an_event_came() -> None:
+    line = EventLine.of(loaded("4"))
+    line.times = 13
+
+    assert "(13 times)" in str(line)
+    assert not EventFilter.parse("13").accepts(line)
+    assert not EventFilter.parse("times").accepts(line)
+
+
+def test_a_filter_does_not_search_the_reach_of_a_status() -> None:
+    facts = {"server": "shop/thing", "request": '"lamp"', "detail": "ERROR: dim", "heard_by": "app"}
+    line = EventLine.of(Event(0, THIRTEEN, "status", facts))
+    line.names.update(dict.fromkeys(f'shop/set "{number}"' for number in "abcdefghijklm"))
+
+    assert "13 resources" in str(line)
+    assert not EventFilter.parse("13").accepts(line)
+    assert EventFilter.parse("dim").accepts(line)
+    assert EventFilter.parse("set").accepts(line)  # a resource that the status has reached
+
+
+@pytest.mark.parametrize("text", ["loaded", "lamp", "shop/thing"])
+def test_a_filter_searches_the_kind_the_subject_and_how(text: str) -> None:
+    assert chosen(EventFilter.parse(text), loaded("4")) == ['shop/thing "lamp 4"']
