@@ -18,8 +18,17 @@ from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import Catalog, Server
-from rr_actors.registrar.model.messages import Fetch, Load, Loaded, LoadRefused, Reprioritise, Reprioritised, Unload
-from rr_actors.registrar.model.rows import STANDBY, Phase, State
+from rr_actors.registrar.model.messages import (
+    Fetch,
+    Fetched,
+    Load,
+    Loaded,
+    LoadRefused,
+    Reprioritise,
+    Reprioritised,
+    Unload,
+)
+from rr_actors.registrar.model.rows import STANDBY, Hold, Phase, State
 from support import eventually
 
 
@@ -256,6 +265,8 @@ class Lamps(rr.Manager):
     def _note(self, what: str) -> None:
         with (self.folder / "calls").open("a") as calls:
             calls.write(what + "\n")
+        with (self.folder / "attempts").open("a") as attempts:
+            attempts.write(f"{what} {rr.current().attempt}\n")
         deadly = self.folder / what
         if deadly.exists() and (left := int(deadly.read_text())):
             deadly.write_text(str(left - 1))
@@ -292,7 +303,9 @@ def test_a_pause_or_resumption_that_a_crash_interrupts_runs_again(tmp_path: Path
         eventually(is_(lamps, "loaded"), timeout=30)
         calls = (tmp_path / "calls").read_text().split()
     expected = {"pause": ["load", "pause", "pause", "resume"], "resume": ["load", "pause", "resume", "resume"]}
+    attempts = (tmp_path / "attempts").read_text().splitlines()
     assert calls[:4] == expected[killed]
+    assert [line for line in attempts if line.startswith(killed)][:2] == [f"{killed} 1", f"{killed} 2"]
 
 
 def test_a_resumption_that_kills_its_process_three_times_is_given_up(tmp_path: Path) -> None:
@@ -520,6 +533,21 @@ def test_a_resumption_that_waits_for_a_part_does_not_begin_for_what_is_lost(comm
     ]
     assert (world.phase(), refused) == (phase, ["next"])
     assert not any(isinstance(it, e.StartResume) for it in effects + world.tell(Reprioritised("part", 0), "parts"))
+
+
+def test_a_load_that_waits_for_a_resumption_is_answered_after_it_also_over_a_new_link() -> None:
+    again = Resting()
+    again.catalog.waiting.clear()  # as in the next process, which does not know who waits
+    listed = [it.message for it in again.tell(Fetch("app", True)) if isinstance(it, e.SendReply)]
+    rows = [row for message in listed if isinstance(message, Fetched) for row in message.queries]
+    assert [(row.query_id, row.waits) for row in rows] == [("q", False), ("next", True)]
+    asking = Catalog("app")
+    for command in (c.AskProvider("next", "p", "cam", b"front", "", 1), c.Reconcile("p", rows[1:], "event")):
+        decision = decide(asking, [(command, None)])
+        decision.close()
+    assert asking.held["next"].hold is Hold.PENDING
+    assert not any(isinstance(it, e.LoadResolved) for it in decision.effects)
+    assert any(isinstance(it, e.SendRequest) and isinstance(it.message, Load) for it in decision.effects)
 
 
 def test_a_resumption_that_waits_for_a_part_does_not_begin_for_what_nobody_holds() -> None:

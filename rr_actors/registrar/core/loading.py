@@ -158,16 +158,16 @@ def _load_again(decision: Decision, message: Load, query: ServedQuery) -> None:
     resource = catalog.resources[query.resource_id]
     if resource.id in catalog.recovering:
         park(decision, resource.id, message)
-    elif is_busy(catalog, resource) or (query.priority > STANDBY and _is_to_run(resource)):
+    elif is_busy(catalog, resource) or is_to_run(query, resource):
         decision.note(catalog.waiting, query.id, resource.id)
         _look_for_ring(decision, message, resource)
     else:
         decision.cause(SendReply(query.origin, loaded(catalog, query.id, resource)))
 
 
-def _is_to_run(resource: Resource) -> bool:
-    """Return whether a resource is paused, or about to be, and is resumed for who needs it."""
-    return resource.phase in RESTING and resource.state is not State.FATAL
+def is_to_run(query: ServedQuery, resource: Resource) -> bool:
+    """Return whether a resource is paused, or about to be, and is resumed for this query."""
+    return resource.phase in RESTING and query.priority > STANDBY and resource.state is not State.FATAL
 
 
 def _look_for_ring(decision: Decision, message: Load, resource: Resource) -> None:

@@ -8,6 +8,7 @@ from operator import attrgetter
 from msgspec.structs import replace
 
 from rr_actors.registrar.core.holding import asked_anew, end_release, load_of, loaded, lose
+from rr_actors.registrar.core.loading import is_to_run
 from rr_actors.registrar.core.notices import drop_notice, drop_parked, send_notices_to
 from rr_actors.registrar.core.priorities import follow, tell, tell_unsent
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, released
@@ -82,7 +83,7 @@ def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
         tell(decision, held)
     if held is None:
         _take_back(decision, registrar, query)
-    elif held.hold is Hold.PENDING and query.response is not None:
+    elif held.hold is Hold.PENDING and query.response is not None and not query.waits:  # else its Load is sent again
         decision.put_here(replace(held, state=State(query.state)))
         loaded(decision, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
@@ -241,7 +242,8 @@ def fetch(decision: Decision, message: Fetch) -> None:
         resource = catalog.resources[query.resource_id]
         unanswered = resource.id in catalog.moving or query.id in catalog.waiting
         response = None if unanswered else resource.response or b""
-        place = (query.parent, query.attempt, query.seq, str(resource.state), query.priority, query.own)
+        waits = resource.id in catalog.recovering or is_to_run(query, resource)
+        place = (query.parent, query.attempt, query.seq, str(resource.state), query.priority, query.own, waits)
         row = FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
         more = len(row.request) + len(response or b"")
         if rows and (len(rows) == _CHUNK or size + more > _CHUNK_BYTES):

@@ -48,7 +48,7 @@ from rr_actors.base.values.canonical import Codec, encode, shown_plain, text_of_
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.hosting.streams import Publisher, StreamNews
-from rr_actors.registrar.core.callback_runs import running
+from rr_actors.registrar.core.callback_runs import deaths_of, running
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.fields import annotated_types, by_fields, field_names, hints_of
 from rr_actors.registrar.engine.monitor import RegistrarBase
@@ -89,6 +89,8 @@ class Role(msgspec.Struct, frozen=True, eq=False):
         reports: whether it may report progress.
         patient: whether it waits for a free thread however many do so; else it is refused then.
         in_order: whether the callbacks of one resource run one after another.
+        counted: the name under which core/callback_runs.py counts the processes that died in its runs; "" for a load or
+            unload, whose rows count their runs themselves.
     """
 
     name: str
@@ -97,17 +99,18 @@ class Role(msgspec.Struct, frozen=True, eq=False):
     reports: bool = False
     patient: bool = False
     in_order: bool = False
+    counted: str = ""
 
 
 LOAD = Role("load", ("request",), LOADING, reports=True)
 UNLOAD = Role("unload", ("request", "response"), UNLOADING, patient=True)
-STATUS = Role("status", ("request", "status"), in_order=True)
-RECOVER = Role("recover", ("request", "response"), LOADED, reports=True, patient=True)
+STATUS = Role("status", ("request", "status"), in_order=True, counted="status")
+RECOVER = Role("recover", ("request", "response"), LOADED, reports=True, patient=True, counted="recover")
 UPGRADE = Role("upgrade", ("request", "response"))
 USAGE = Role("usage", ("request", "response"), patient=True)
-PROBE = Role("probe", ("request", "response"), patient=True)
-PAUSE = Role("pause", ("request", "response"), PAUSING, patient=True)
-RESUME = Role("resume", ("request", "response"), RESUMING, patient=True)
+PROBE = Role("probe", ("request", "response"), patient=True, counted="health")
+PAUSE = Role("pause", ("request", "response"), PAUSING, patient=True, counted="pause")
+RESUME = Role("resume", ("request", "response"), RESUMING, patient=True, counted="resume")
 ROLES = {role.name: role for role in (LOAD, UNLOAD, STATUS, RECOVER, UPGRADE, USAGE, PROBE, PAUSE, RESUME)}
 
 
@@ -123,7 +126,8 @@ class Current(msgspec.Struct, frozen=True):
             load was withdrawn or given up after a crash. Nothing, a part or all of the resource may have been loaded.
     """
 
-    # `_registrar` is the actor of the serving registrar.
+    # `_registrar` is the actor of the serving registrar. `_run` is the number of the run in decisions: of a load,
+    # a recovery, a pause or a resumption its load's, of an unload its own.
 
     resource_id: str
     attempt: int
@@ -131,6 +135,7 @@ class Current(msgspec.Struct, frozen=True):
     server: str
     _registrar: RegistrarBase
     _role: Role
+    _run: int
     interrupted: bool = False
     _request: bytes = b""
 
@@ -177,7 +182,7 @@ class Current(msgspec.Struct, frozen=True):
         if phase is None or not self._role.reports:
             what = f"{self._registrar.name}/{self.server}: stopping in its {self._role.name} callback"
             raise UsageError(f"{what}: only load and recover callbacks have it")
-        return self._registrar.stop_event(self.resource_id, phase, self.attempt)
+        return self._registrar.stop_event(self.resource_id, phase, self._run)
 
     @property
     def loaded(self) -> threading.Event:
@@ -238,6 +243,10 @@ def serving(current: Current) -> RegistrarBase:
     return current._registrar  # pyright: ignore[reportPrivateUsage]  # same file
 
 
+def _run_of(current: Current) -> int:
+    return current._run  # pyright: ignore[reportPrivateUsage]  # same file
+
+
 def _role_of(current: Current) -> Role:
     return current._role  # pyright: ignore[reportPrivateUsage]  # same file
 
@@ -286,7 +295,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
         return
     with serving(me).lock:
         catalog = serving(me).whole()
-        is_running = running(catalog, me.resource_id, phase, me.attempt) is not None
+        is_running = running(catalog, me.resource_id, phase, _run_of(me)) is not None
         if not is_running or (phase is LOADED and me.resource_id not in catalog.recovering) or not waits_for(me):
             return
     name = serving(me).name
@@ -626,7 +635,7 @@ class ServerActor:
     @on_loop
     def start_recover(self, resource: Resource, reload: bool) -> None:
         """Ask the recover callback whether the resource lives, or load the resource again."""
-        run = self._runs[LOAD if reload or self.spec.recover is None else RECOVER]
+        run = self._runs[LOAD] if reload or self.spec.recover is None else None
         self._submit(RECOVER, resource, resource.attempt, functools.partial(self._recover_ended, resource), run=run)
 
     def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
@@ -832,16 +841,19 @@ class ServerActor:
         self,
         role: Role,
         resource: Resource,
-        attempt: int,
+        number: int,
         done: Done,
         *more: Any,
         run: Callback | None = None,
         at_once: Callable[[Any], bool] | None = None,
     ) -> None:
-        holder = self.registrar.catalog.holder_of(resource.id)
+        catalog = self.registrar.catalog
+        holder = catalog.holder_of(resource.id)
         interrupted = role is UNLOAD and resource.response is None
-        facts = resource.id, attempt, holder, self.spec.name, self.registrar, role, interrupted, resource.request
-        current = Current(*facts)
+        counts = role.counted and run is None  # else a reload, whose attempts the row counts
+        attempt = deaths_of(catalog, role.counted, resource.id) + 1 if counts else number
+        place = resource.id, attempt, holder, self.spec.name, self.registrar
+        current = Current(*place, role, number, interrupted, resource.request)
         run = self._runs[role] if run is None else run
         workers = self.registrar.workers
         if self.registrar.node.watched.level[0] > 1:
@@ -927,7 +939,7 @@ async def _heeding(current: Current, answer: Awaitable[Any]) -> Any:
     if role.phase is None or not role.reports or task is None:
         return await answer
     cancel = functools.partial(_cancel, asyncio.get_running_loop(), task)
-    serving(current).stop_event(current.resource_id, role.phase, current.attempt, cancel)
+    serving(current).stop_event(current.resource_id, role.phase, _run_of(current), cancel)
     return await answer
 
 
@@ -952,7 +964,7 @@ def _end_run(current: Current) -> bool:
     role = _role_of(current)
     if role.phase is None or not role.reports:
         return False
-    return serving(current).end_run(current.resource_id, role.phase, current.attempt)
+    return serving(current).end_run(current.resource_id, role.phase, _run_of(current))
 
 
 def _is_over(current: Current) -> bool:

@@ -88,7 +88,10 @@ class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
-    """One query in Fetched. `response` is None while its resource is loading, or being unloaded."""
+    """One query in Fetched. `response` is None while its resource is loading, or being unloaded.
+
+    `waits`: the resource is being recovered, or is still to be resumed for this query: a load is answered after that.
+    """
 
     query_id: str
     server: str
@@ -101,6 +104,7 @@ class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
     state: str
     priority: Int64 = 0
     own: bool = False
+    waits: bool = False
 
 
 class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
