@@ -67,6 +67,7 @@ from rr_actors.registrar.engine.server import (
     status_callback_of,
 )
 from rr_actors.registrar.engine.status import Status, message_text
+from rr_actors.registrar.links.remote_calls import for_handles
 from rr_actors.registrar.load_groups import Group, GroupWays, LoadWanted, Queries, wanted
 from rr_actors.registrar.loads import CALL_TIMEOUT_S, Calls, Loads, LoadWays, Unloads, UnloadWays, settle
 from rr_actors.registrar.model import commands as c
@@ -394,6 +395,7 @@ class Consumer(abc.ABC):
         block: bool = True,
     ) -> pykka.Future[None] | None: ...
 
+    @for_handles(repeatable=False)
     def unload(
         self,
         query_or_id: Query | ResourceInfo | str,
@@ -446,6 +448,7 @@ class Consumer(abc.ABC):
         self, server: str, *, timeout_s: float | None = 30.0, block: bool
     ) -> pykka.Future[None] | None: ...
 
+    @for_handles(repeatable=False)
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Release everything that this registrar holds at one server ("registrar/server"), newest first.
 
@@ -465,6 +468,7 @@ class Consumer(abc.ABC):
     @overload
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool) -> pykka.Future[None] | None: ...
 
+    @for_handles(repeatable=False)
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Release everything that this registrar holds for itself, newest first. Its resources keep their dependencies.
 
@@ -648,10 +652,12 @@ class Registrar(Consumer):
             self._actor.commit_rows([Put(StoredServer(name, stored))])
         return kept if known is None else 0
 
+    @for_handles(repeatable=False)
     def _register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
         self._register_spec(pickling.loads(blob), stored=blob)
 
+    @for_handles(repeatable=False)
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
         """Remove a server: release all queries on it, send its holders FATAL, unload its resources.
 
@@ -671,6 +677,7 @@ class Registrar(Consumer):
         start = functools.partial(self._actor.servers.unregister, name)
         self._calls.finish(self._calls.start(start), limit_s, f"unregistering {self.name}/{name}")
 
+    @for_handles(repeatable=False)
     def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
         """Send a status of a resource served here to all its holders. Return when it is on disk.
 
@@ -691,6 +698,7 @@ class Registrar(Consumer):
         what = f"status for {target_id(query_or_resource_id)}"
         self._calls.command(lambda ticket: c.SetStatus(resource, new_id(), state, text, ticket, own), what)
 
+    @for_handles(repeatable=False)
     def revoke(
         self,
         query_or_resource_id: Query | ResourceInfo | str,
@@ -723,6 +731,7 @@ class Registrar(Consumer):
         target, limit_s = target_id(query_or_resource_id), time_limit(timeout_s)
         self._unloads.revoke(target, message_text(why), seconds, limit_s)
 
+    @for_handles(repeatable=False)
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
     ) -> None:
@@ -833,6 +842,7 @@ class Registrar(Consumer):
             return self, context.resource_id
         raise UsageError(f"parent: expected rr.current() or a resource id, got {type(context).__name__}")
 
+    @for_handles(repeatable=False)
     def _load(
         self, server: str, request: bytes, parent: str = "", options: LoadOptions = DEFAULTS, *, timeout_s: float | None
     ) -> Query:
@@ -840,6 +850,7 @@ class Registrar(Consumer):
         limited = replace(options, timeout_s=time_limit(timeout_s))
         return self._loads.wait(parse_server(server), request, parent, limited)
 
+    @for_handles(repeatable=False)
     def _load_all(
         self, requests: Sequence[LoadWanted], parent: str, options: LoadOptions, *, timeout_s: float | None
     ) -> Queries:
@@ -851,6 +862,7 @@ class Registrar(Consumer):
 
     # -- looking -------------------------------------------------------------------------------------------------
 
+    @for_handles(repeatable=True)
     def queries(self) -> list[Query]:
         """Return every query that this registrar holds, with the dependencies of its resources, oldest first."""
         return self._calls.call(self._queries_now)
@@ -859,6 +871,7 @@ class Registrar(Consumer):
         held = [row for row in self._held_now() if row.hold is Hold.HELD]
         return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
 
+    @for_handles(repeatable=True)
     def fetch_state(self, query_or_id: Query | str) -> str:
         """Return the state of the last status of a query that this registrar holds: "OK", "WARNING" ...
 
@@ -867,6 +880,7 @@ class Registrar(Consumer):
         """
         return str(self._calls.call(self._held_row, target_id(query_or_id)).state)
 
+    @for_handles(repeatable=True)
     def fetch_priority(self, query_or_id: Query | str) -> int | None:
         """Return the priority of a query that this registrar holds; None: on standby.
 
@@ -875,6 +889,7 @@ class Registrar(Consumer):
         """
         return priority_of(self._calls.call(self._held_row, target_id(query_or_id)).priority)
 
+    @for_handles(repeatable=False)
     def set_priority(self, query_or_id: Query | str, priority: int | None) -> None:
         """Give a query that this registrar holds a priority, as `query.priority = 5` does.
 
@@ -894,6 +909,7 @@ class Registrar(Consumer):
             raise UnknownQuery(f"query {shortened(id)}: {self.name} does not hold it any more", query_id=id)
         return row
 
+    @for_handles(repeatable=True)
     def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
         """Ask a provider for all queries that this registrar holds there, as the provider's catalog has them.
 
@@ -919,6 +935,7 @@ class Registrar(Consumer):
         held = Held(row.query_id, *place, Hold.HELD, State(row.state), row.priority, row.own)
         return self._views.seen(held)
 
+    @for_handles(repeatable=True)
     def children(self, query: Query | ResourceInfo | str) -> list[Query]:
         """Return the queries that a resource depends on, oldest first.
 
@@ -955,6 +972,7 @@ class Registrar(Consumer):
             held = [catalog.held[id] for id in reversed(parts)]
         return [self._views.of(row) for row in held]
 
+    @for_handles(repeatable=True)
     def resources(self) -> list[ResourceInfo]:
         """Return every resource served here, with its state, response and holders."""
         return [self._info(*row) for row in self._calls.call(self._resources_now)]
@@ -980,6 +998,7 @@ class Registrar(Consumer):
         """Return every open stream of the resources served here, by server, request and name."""
         return [row.info for row in self._page(_ALL_STREAMS).streams]
 
+    @for_handles(repeatable=False)
     def usage(self, *, of: Iterable[str] | None = None, timeout_s: float = 5.0) -> Usages:
         """Return what each loaded resource served here uses now, as the usage callback of its server says.
 
@@ -1034,6 +1053,7 @@ class Registrar(Consumer):
         served = [(row, self._actor.servers.get(row.server)) for row in loaded]
         return [(row, server) for row, server in served if server is not None and server.spec.usage is not None]
 
+    @for_handles(repeatable=True)
     def clients(self) -> list[str]:
         """Return the servers ("registrar/server") where this registrar holds something."""
         rows = self._calls.call(self._held_now)
@@ -1049,14 +1069,17 @@ class Registrar(Consumer):
             catalog = self._actor.whole()
             return len(catalog.held), [catalog.held[id] for id in catalog.unsettled]
 
+    @for_handles(repeatable=True)
     def servers(self) -> list[str]:
         """Return the servers registered here, as "registrar/server"."""
         return sorted(f"{self.name}/{name}" for name in self._calls.call(self._actor.servers.names))
 
+    @for_handles(repeatable=True)
     def owed(self) -> list[str]:
         """Return the ids of released queries whose provider does not know it yet."""
         return [row.id for row in self._calls.call(self._unsettled_now)[1] if row.hold is Hold.OWED]
 
+    @for_handles(repeatable=True)
     def stats(self) -> dict[str, int]:
         """Return counts of the present, and of events since the registrar was opened.
 
@@ -1085,12 +1108,14 @@ class Registrar(Consumer):
             **actor.commit_counts(),
         }
 
+    @for_handles(repeatable=True)
     def _page(self, wanted: Wanted) -> Page:
         """Return a few of this registrar's resources or queries as text, for tools that show the system."""
         return page_of(self._actor, wanted)
 
     # -- status --------------------------------------------------------------------------------------------------
 
+    @for_handles(repeatable=False)
     def on_status(self, server: str, callback: StatusCallback) -> None:
         """Call `callback(status)` for every query that this registrar holds at that server, now and later.
 
@@ -1101,6 +1126,7 @@ class Registrar(Consumer):
 
     # -- the catalog ---------------------------------------------------------------------------------------------
 
+    @for_handles(repeatable=False)
     def save_catalog(self) -> None:
         """Write all changes into the catalog's SQLite file.
 
@@ -1109,6 +1135,7 @@ class Registrar(Consumer):
         """
         self._calls.call(self._actor.save)
 
+    @for_handles(repeatable=False)
     def load_catalog(self) -> None:
         """Read the catalog from disk again, as after a restart.
 

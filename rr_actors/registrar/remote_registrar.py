@@ -12,7 +12,7 @@ import functools
 import inspect
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import pykka
 from msgspec.structs import replace
@@ -26,7 +26,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import ROLES, ServerSpec, log_unread_types
-from rr_actors.registrar.links.remote_calls import HandleLine
+from rr_actors.registrar.links.remote_calls import HandleLine, is_for_handles
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries
 from rr_actors.registrar.queries import Holder, Query, held_by, read_as
 from rr_actors.registrar.registrar import Registrar
@@ -35,7 +35,6 @@ from rr_actors.runtime.time_limits import time_limit
 logger = Log("rr_actors.registrar")
 
 T = TypeVar("T")
-F = TypeVar("F", bound=Callable[..., Any])
 
 CALL_TIMEOUT_S = 30.0
 _GRACE_S = 10.0
@@ -323,7 +322,7 @@ def _without_own(options: LoadOptions) -> LoadOptions:
     return replace(options, codec=None, parent=None, loop=None)
 
 
-def _called_there(method: F) -> F:
+def _called_there(method: Callable[..., Any]) -> Callable[..., Any]:
     """Return a method for RegistrarHandle that has a method of Registrar called in the registrar's process."""
     signature = inspect.signature(method)
 
@@ -333,9 +332,18 @@ def _called_there(method: F) -> F:
         bound.apply_defaults()  # sent, too: while a call waits to be sent, its timeout_s gets less
         return self._ask(method.__name__, *bound.args[1:], **bound.kwargs)  # pyright: ignore[reportPrivateUsage]  # same file
 
-    return cast("F", call)
+    return call
 
 
+def _calls_there(handle: type[T]) -> type[T]:
+    """Have a handle call each method of Registrar there that is declared for handles."""
+    for name, method in vars(Registrar).items():
+        if is_for_handles(name) and name not in vars(handle):
+            setattr(handle, name, _called_there(method))
+    return handle
+
+
+@_calls_there
 class RegistrarHandle(Registrar):
     """A registrar of another process, from System.registrar(). A worker of that process runs each call.
 
@@ -403,25 +411,3 @@ class RegistrarHandle(Registrar):
             if is_a(one, Query):
                 held_by(one, self)
         return got
-
-    children = _called_there(Registrar.children)
-    clients = _called_there(Registrar.clients)
-    fetch_priority = _called_there(Registrar.fetch_priority)
-    fetch_queries = _called_there(Registrar.fetch_queries)
-    fetch_state = _called_there(Registrar.fetch_state)
-    load_catalog = _called_there(Registrar.load_catalog)
-    on_status = _called_there(Registrar.on_status)
-    owed = _called_there(Registrar.owed)
-    queries = _called_there(Registrar.queries)
-    resources = _called_there(Registrar.resources)
-    revoke = _called_there(Registrar.revoke)
-    save_catalog = _called_there(Registrar.save_catalog)
-    send_status = _called_there(Registrar.send_status)
-    set_priority = _called_there(Registrar.set_priority)
-    servers = _called_there(Registrar.servers)
-    stats = _called_there(Registrar.stats)
-    unregister_server = _called_there(Registrar.unregister_server)
-    update_response = _called_there(Registrar.update_response)
-    usage = _called_there(Registrar.usage)
-    _page = _called_there(Registrar._page)
-    _register_stored = _called_there(Registrar._register_stored)

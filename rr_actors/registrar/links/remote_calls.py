@@ -11,7 +11,8 @@ from __future__ import annotations
 import asyncio
 import functools
 import itertools
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 
@@ -58,19 +59,36 @@ class CallRaised(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 HandleMessage = CallMethod | Returned | CallRaised
 
-_ASKING = frozenset(
-    {
-        *("_page", "children", "clients", "fetch_priority", "fetch_queries", "fetch_state", "owed", "queries"),
-        *("resources", "servers", "stats", "usage"),
-    }
-)
-"""The methods that change nothing, and may be called again."""
+_repeatable: dict[str, bool] = {}
+"""The methods of a Registrar that a handle may call; whether each may be called again if the process dies meanwhile."""
 
-METHODS = _ASKING | {
-    *("load_catalog", "on_status", "revoke", "save_catalog", "send_status", "set_priority", "unload", "unload_all"),
-    *("unload_client", "unregister_server", "update_response", "_load", "_load_all", "_register_stored"),
-}
-"""The methods of a Registrar that a handle calls."""
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def for_handles(*, repeatable: bool) -> Callable[[F], F]:
+    """Declare a method of a Registrar as one that a handle calls in the registrar's process.
+
+    Args:
+        repeatable: the method changes nothing and runs no code of users, so a call is sent again if the process dies
+            during it.
+    """
+
+    def declare(method: F) -> F:
+        _repeatable[method.__name__] = repeatable
+        return method
+
+    return declare
+
+
+def is_for_handles(name: str) -> bool:
+    """Return whether a handle may call the method of this name."""
+    return name in _repeatable
+
+
+def is_repeatable(name: str) -> bool:
+    """Return whether a call of the method is sent again if the process dies during it."""
+    return _repeatable.get(name, False)
+
 
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
@@ -114,7 +132,7 @@ class Door:
             done(b"", error)
 
     def _call(self, message: CallMethod) -> bytes:
-        if message.method not in METHODS:
+        if not is_for_handles(message.method):
             raise Unavailable(f"registrar handle: no method {message.method!r}")
         args, kwargs = pickling.loads(message.body)
         if message.late_s and kwargs.get("timeout_s") is not None:
@@ -301,7 +319,7 @@ class HandleLine:
         for call in self._open.values():
             error = RegistrarDown(text, registrar=self._registrar, status="down")
             if not call.answer.done():
-                call.answer.set_exception(_Coming(error) if call.method in _ASKING else error)
+                call.answer.set_exception(_Coming(error) if is_repeatable(call.method) else error)
 
     def close(self) -> None:
         """Close the link and cancel all calls. On the loop."""

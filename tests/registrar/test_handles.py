@@ -1,0 +1,75 @@
+"""A handle has every method of a registrar: the registrar's class declares which of them are called in its process."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.registrar.links.remote_calls import is_for_handles, is_repeatable
+from rr_actors.registrar.remote_registrar import RegistrarHandle
+from tests.support import LIMIT_S
+
+
+class Far(rr.Manager):
+    @rr.server("thing")
+    def make(self, name: str) -> str:
+        return name
+
+
+@pytest.fixture
+def handle(system: rr.System) -> rr.Registrar:
+    system.supervisor().start_child(rr.ChildSpec(Far, id="far"))
+    return system.registrar("far")
+
+
+def _used(name: str, seen: set[str]) -> set[str]:
+    """Return the attributes of `self` that a method of Registrar uses, with those of the methods that it calls."""
+    method: Any = inspect.getattr_static(rr.Registrar, name, None)
+    code = method.fget if isinstance(method, property) else method
+    if name in seen or not inspect.isfunction(code):
+        return {name}
+    seen.add(name)
+    own = set(re.findall(r"\bself\.(\w+)", inspect.getsource(code)))
+    return own.union(*(_used(one, seen) for one in own if one not in vars(RegistrarHandle) and not is_for_handles(one)))
+
+
+def _public(of: type) -> list[str]:
+    return [name for name in vars(of) if not name.startswith("_") and name != "close"]
+
+
+def test_a_method_is_declared_for_handles_or_needs_nothing_that_a_handle_lacks(
+    system: rr.System, handle: rr.Registrar
+) -> None:
+    lacking = set(vars(system.open_registrar("app"))) - set(vars(handle))
+    assert lacking
+
+    undeclared = [name for name in _public(rr.Registrar) if name not in vars(RegistrarHandle)]
+    assert not [name for name in undeclared if _used(name, set()) & lacking], "@for_handles is missing there"
+
+
+def test_a_call_of_a_handle_is_answered_by_the_registrar(system: rr.System, handle: rr.Registrar) -> None:
+    with system.open_registrar("app").load("far/thing", "a", timeout_s=LIMIT_S) as query:
+        (resource,) = handle.resources()
+        assert resource.holders == ("app",)
+        assert handle.children(resource) == []
+        assert handle.servers() == ["far/thing"]
+        assert handle.clients() == handle.queries() == handle.owed() == handle.streams() == []
+        assert handle.usage() == {}
+        assert handle.stats()["resources"] == 1
+        handle.send_status(resource, rr.Status(rr.State.WARNING, "dim"))
+        assert query.wait_status("WARNING", timeout_s=LIMIT_S).message == "dim"
+
+
+@pytest.mark.parametrize("name", ["usage", "send_status", "unload", "set_priority", "_load"])
+def test_a_call_that_changes_something_or_runs_code_of_users_is_not_repeatable(name: str) -> None:
+    assert is_for_handles(name)
+    assert not is_repeatable(name)
+
+
+def test_a_handle_calls_nothing_else() -> None:
+    assert not is_for_handles("close")
+    assert not is_for_handles("__reduce__")
