@@ -985,7 +985,11 @@ class StreamReader:
             raw = connected.recv(_PACKET_BYTES, socket.MSG_DONTWAIT)
             packet = _packet.decode(raw) if raw else None
             body = packet and packet.body
-            make = self._parcels.claim(body, self._line) if isinstance(body, Parcel) else None
+            make = None
+            if isinstance(body, Parcel):
+                claim = self._parcels.hold(body, self._line)
+                claim.arm()
+                make = claim.open
         except BlockingIOError:
             return None
         except (OSError, msgspec.MsgspecError, Lie):

@@ -21,6 +21,7 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import interpreter
+from rr_actors.runtime.group_limits import group_limit
 from rr_actors.runtime.processes.control_groups import CONTROLLERS, ControlGroups
 from rr_actors.supervision.core.specs import ChildSpec
 from rr_actors.system.system import System
@@ -110,8 +111,7 @@ def _control_groups() -> Iterator[Finding]:
         "tasks": ("pids.max", "pids.max", _FEW_CHILDREN * _CHILD_THREADS, ""),
     }
     for what, (new, old, little, unit) in limits.items():
-        found = [int(text) for folder in _groups() for file in (new, old) if (text := _read(folder / file)).isdigit()]
-        least = min(found, default=2**62)
+        least = 2**62 if (limit := group_limit(new, old)) is None else limit
         shown = "no limit" if least >= 2**60 else f"{least // 2**20} MiB" if unit else str(least)
         yield _judge(
             f"control group: {what}",
@@ -132,14 +132,6 @@ def _program_groups() -> Iterator[Finding]:
         todo="to freeze and limit programs, give the system a writable group of version 2 with cpu and memory: "
         "Delegate=yes and DelegateSubgroup=system in its systemd unit",
     )
-
-
-def _groups() -> Iterator[Path]:
-    for line in _read(Path("/proc/self/cgroup")).splitlines():
-        _, controllers, path = line.split(":", 2)
-        top = Path("/sys/fs/cgroup", controllers)
-        below = top / path.lstrip("/")
-        yield from (folder for folder in (below, *below.parents) if folder.is_relative_to(top))
 
 
 def _shared_memory() -> Iterator[Finding]:

@@ -1,252 +1,59 @@
 """Large values between two processes of one machine: in shared memory, beside their connection.
 
 Each end of a connection that sends large values makes one segment, a memfd. It has no name: the kernel frees it with
-the last process that has it. The segment is as long as the limit, but takes memory only where it was written. A message
-carries a Parcel, which says where in the segment its value is. The other end opens the descriptor once, by
-/proc/PID/fd, maps the segment, and makes the value from the bytes there. Buffers are not copied at that end: the value
-has the slot until it is collected. Then that end sets the slot's byte in the head of the segment to FREE, and the
-segment's owner may use the slot again.
+the last process that has it. The segment is as long as the limit, but takes memory only where it was written, and
+address space as far as it is used. A message carries a Parcel, which says where in the segment its value is. The other
+end opens the descriptor by /proc/PID/fd, maps the segment, and makes the value from the bytes there. Buffers are not
+copied at that end: the value has the slot until it is collected (rr_actors/wire/shared_values.py).
 
-The owner reads nothing from the segment but these bytes. A segment lives as long as its connection, or the last value
-in it. Where a segment cannot be had, the value goes through the connection.
+The owner reads nothing from the segment but the bytes of its head, by which the other end frees slots. A segment lives
+as long as its connection, or the last value in it. Where a segment cannot be had, the value goes through the
+connection.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import fcntl
 import mmap
 import os
+import resource
 import stat
 import struct
 import sys
 import threading
 import time
 import weakref
-from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import msgspec
 
-from rr_actors.base import pickling
-from rr_actors.base.errors import MailboxFull, Unavailable, text_of
+from rr_actors.base.errors import MailboxFull, Unavailable, few, text_of
 from rr_actors.base.pickling import Bytes, Large
 from rr_actors.base.scarcity import wanted_by
+from rr_actors.runtime.group_limits import memory_bytes
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES
+from rr_actors.wire.segment_slots import PAGE_BYTES, USED, Head, Slot, Slots
+from rr_actors.wire.shared_values import Claim
 
-PAGE_BYTES = mmap.PAGESIZE  # 16 KiB or 64 KiB on some ARM machines
 IDLE_S = 5.0
 """How long a segment is unused until its free pages are given back to the machine."""
 
-FREE, USED = 0, 1
+HEAD_BYTES = max(PAGE_BYTES, 64 * 1024)
+"""The length of a segment's head, which has a byte for each number of a slot."""
 
 _KEY = struct.Struct("<Q")
-_SLOTS = range(_KEY.size, PAGE_BYTES)  # the numbers of slots are the places of their bytes in the head
+_NUMBERS = range(_KEY.size, HEAD_BYTES)  # the numbers of slots are the places of their bytes in the head
 _ALIGNED = 64
+_MAPPED_BYTES = 64 << 20  # of a segment at first; then twice as many
 _PIECE_BYTES = 16 << 20  # given back at a time, which takes the loop some milliseconds
 _PIECE_S = 0.02
 _CHUNK_BYTES = 1 << 20  # copied at a time, so that other threads of this process get their turns
 _SEALS = "F_SEAL_SHRINK", "F_SEAL_GROW", "F_SEAL_SEAL"
-
-
-# -- which bytes of a segment are in use, without any I/O --------------------------------------------------------------
-#
-# A slot is a run of whole pages that holds one value. A page is cold until it is written for the first time, and again
-# after it was given back to the machine; only pages that are not cold take memory.
-
-
-class Intervals:
-    """A set of numbers, as sorted intervals with gaps between them."""
-
-    __slots__ = ("_ends", "_starts", "total")
-
-    def __init__(self, start: int, end: int) -> None:
-        self._starts = [start]
-        self._ends = [end]
-        self.total = end - start
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        return iter(list(zip(self._starts, self._ends, strict=True)))
-
-    def first_fit(self, size: int) -> int | None:
-        """Return the start of the first interval that has `size` numbers."""
-        for start, end in zip(self._starts, self._ends, strict=True):
-            if end - start >= size:
-                return start
-        return None
-
-    def count(self, start: int, end: int) -> int:
-        """Return how many numbers from `start` to before `end` are in the set."""
-        first = bisect_right(self._ends, start)
-        last = bisect_left(self._starts, end)
-        return sum(min(self._ends[i], end) - max(self._starts[i], start) for i in range(first, last))
-
-    def add(self, start: int, end: int) -> None:
-        """Add the numbers from `start` to before `end`."""
-        first = bisect_left(self._ends, start)  # the intervals that touch the new one
-        last = bisect_right(self._starts, end)
-        own = [start, end] if first == last else [min(start, self._starts[first]), max(end, self._ends[last - 1])]
-        self._replace(first, last, own)
-
-    def remove(self, start: int, end: int) -> None:
-        """Remove the numbers from `start` to before `end`."""
-        first = bisect_right(self._ends, start)
-        last = bisect_left(self._starts, end)
-        if first >= last:
-            return
-        rest = [self._starts[first], start] if self._starts[first] < start else []
-        if self._ends[last - 1] > end:
-            rest += [end, self._ends[last - 1]]
-        self._replace(first, last, rest)
-
-    def _replace(self, first: int, last: int, bounds: list[int]) -> None:
-        self.total -= sum(self._ends[first:last]) - sum(self._starts[first:last])
-        self.total += sum(bounds[1::2]) - sum(bounds[::2])
-        self._starts[first:last] = bounds[::2]
-        self._ends[first:last] = bounds[1::2]
-
-
-class Slot(msgspec.Struct, frozen=True):
-    """A run of pages for one value. `fresh`: how many of its bytes were cold."""
-
-    number: int
-    start: int
-    end: int
-    fresh: int
-
-
-class Head(Protocol):
-    """The bytes at the start of a segment, of which each slot's number has one: FREE or USED."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, number: int, /) -> int: ...
-
-    def __setitem__(self, number: int, mark: int, /) -> None: ...
-
-
-class Slots:
-    """The slots of one segment, as its owner knows them.
-
-    A slot has the number that take() gave it, and one more for each holder that share() lets have it. The one who has a
-    number sets its byte in the head to FREE. The slot is free when all of its numbers are.
-
-    Attributes:
-        used: the slots that hold a value, by each of their numbers.
-        holders: who has the numbers that share() gave.
-
-    Args:
-        head: the bytes that both ends set.
-        start, end: the bytes of the segment that slots may have; multiples of PAGE_BYTES.
-        numbers: the numbers that slots may have.
-    """
-
-    def __init__(self, head: Head, start: int, end: int, numbers: range) -> None:
-        self.used: dict[int, Slot] = {}
-        self.holders: dict[int, object] = {}
-        self._head = head
-        self._shares: dict[int, int] = {}
-        self._size = end - start
-        self._free = Intervals(start, end)
-        self._cold = Intervals(start, end)
-        self._numbers = [*reversed(numbers)]
-
-    @property
-    def resident(self) -> int:
-        """How many bytes take memory."""
-        return self._size - self._cold.total
-
-    def take(self, size: int, room: int) -> Slot | None:
-        """Return a slot of at least `size` bytes, of which at most `room` are cold; None if there is none.
-
-        The first gap that is long enough is used, so the same pages are used again.
-        """
-        self.collect()
-        size = -(-size // PAGE_BYTES) * PAGE_BYTES
-        start = self._free.first_fit(size)
-        if start is None or not self._numbers:
-            return None
-        fresh = self._cold.count(start, start + size)
-        if fresh > room:
-            return None
-        self._cold.remove(start, start + size)
-        self._free.remove(start, start + size)
-        number = self._numbers.pop()
-        slot = self.used[number] = Slot(number, start, start + size, fresh)
-        self._head[number] = USED
-        return slot
-
-    def share(self, number: int, holder: object, most_bytes: int) -> int | None:
-        """Return another number of a slot, for a holder of its own; None if that is one too many.
-
-        A holder may have two values, and more while those that it has are less than `most_bytes`.
-        """
-        self.collect()
-        has = self.numbers_of(holder)
-        if len(has) >= 2 and sum(self.used[own].end - self.used[own].start for own in has) >= most_bytes:
-            return None
-        if not self._numbers:
-            return None
-        slot, other = self.used[number], self._numbers.pop()
-        self.used[other], self.holders[other] = slot, holder
-        self._shares[slot.start] = self._shares.get(slot.start, 0) + 1
-        self._head[other] = USED
-        return other
-
-    def numbers_of(self, holder: object) -> list[int]:
-        """Return the numbers that a holder has."""
-        return [number for number, other in self.holders.items() if other is holder]
-
-    def free(self, number: int) -> None:
-        """Set a number free for the one that has it."""
-        self._head[number] = FREE
-
-    def take_back(self, holder: object) -> None:
-        """Set free all that a holder has: it has ended."""
-        for number in self.numbers_of(holder):
-            self.free(number)
-
-    def collect(self) -> None:
-        """Make the slots free of which all numbers have been set free. Their pages stay warm."""
-        for number in [number for number in self.used if self._head[number] == FREE]:
-            self._give_back(number)
-
-    def _give_back(self, number: int) -> None:
-        slot = self.used.pop(number)
-        self.holders.pop(number, None)
-        self._numbers.append(number)
-        if shares := self._shares.pop(slot.start, 0):
-            if shares > 1:
-                self._shares[slot.start] = shares - 1
-        else:
-            self._free.add(slot.start, slot.end)
-
-    def cool(self, most: int) -> list[tuple[int, int]]:
-        """Make at most `most` free bytes cold; return those that were not, for the caller to give back."""
-        self.collect()
-        warm: list[tuple[int, int]] = []
-        for start, end in self._free:
-            for cold_start, cold_end in self._cold:
-                if start < cold_end and cold_start < end:
-                    if start < cold_start:
-                        warm.append((start, cold_start))
-                    start = cold_end
-            if start < end:
-                warm.append((start, end))
-        cooled: list[tuple[int, int]] = []
-        for start, end in warm:
-            end = min(end, start + most)
-            if start < end:
-                self._cold.add(start, end)
-                cooled.append((start, end))
-                most -= end - start
-        return cooled
-
-
-# -- segments ----------------------------------------------------------------------------------------------------------
 
 
 class Parcel(msgspec.Struct, frozen=True, array_like=True):
@@ -285,32 +92,36 @@ def places_in(parcel: Parcel, head: Head) -> list[int]:
     """Return where each part of a value in a segment begins, and where the last ends; raise Lie if it cannot be there.
 
     Args:
-        head: the bytes of the whole segment.
+        head: the bytes of the segment, as far as they are mapped.
     """
     places = _places(parcel.start, parcel.lengths)
     if (
         not parcel.lengths
         or min(parcel.lengths) < 0
-        or parcel.start < PAGE_BYTES
         or places[-1] > len(head)
-        or parcel.slot not in _SLOTS
+        or parcel.slot not in _NUMBERS
         or head[parcel.slot] != USED
     ):
         raise Lie("it sent a value that is not in its segment")
     return places
 
 
+def _mapped_bytes(needed: int, before: int, most: int) -> int:
+    """Return how much of a segment is mapped when so much is needed, and so much was mapped before."""
+    return min(most, max(needed, 2 * before, _MAPPED_BYTES))
+
+
 class Segments:
     """The segments of one process, which have one limit together. From any thread.
 
     Args:
-        limit_bytes: the memory that they may take; 0: there are none. Default: a quarter of the machine's.
+        limit_bytes: the memory that they may take; 0: there are none. Default: a quarter of what this process may have.
         frame_limit_bytes: the length of the longest message.
     """
 
     def __init__(self, limit_bytes: int | None = None, frame_limit_bytes: int = FRAME_LIMIT_BYTES) -> None:
         if limit_bytes is None:
-            limit_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4
+            limit_bytes = memory_bytes() // 4
         self.limit_bytes = limit_bytes
         self.frame_limit_bytes = frame_limit_bytes
         self._lock = threading.RLock()
@@ -349,9 +160,18 @@ class Segments:
         """Make a segment that the process `pid` can open; raise OSError if that is impossible. With the lock."""
         if not self.limit_bytes or not can_open(pid):
             raise OSError("the other process cannot open segments of this one")
-        owned = _Owned(self.limit_bytes)
+        owned = _Owned(self.limit_bytes, pid)
         self._owned.add(owned)
         return owned
+
+    def in_use(self) -> str:
+        """Say how many bytes of values are in use, by which processes."""
+        with self.bookkeeping():
+            sizes: dict[int, int] = {}
+            for owned in self._owned:
+                sizes[owned.pid] = sizes.get(owned.pid, 0) + owned.in_use()
+        most = sorted(((size, pid) for pid, size in sizes.items() if size), reverse=True)
+        return few(f"{size} by process {pid}" for size, pid in most) or "none"
 
     def give_back(self, most: int = sys.maxsize) -> int:
         """Give the free pages of all segments back to the machine, at most so many bytes; return how many it were."""
@@ -386,20 +206,28 @@ class Segments:
 
 
 class _Owned:
-    """A segment of this process, for one connection. Its methods are called with the lock, but for write()."""
+    """A segment of this process, for one connection. Its methods are called with the lock, but for write() and lend().
+
+    Attributes:
+        pid: the process at the other end.
+        bytes: the length of the segment.
+    """
 
     fd = -1
 
-    def __init__(self, limit_bytes: int) -> None:
-        self.bytes = PAGE_BYTES + -(-limit_bytes // PAGE_BYTES) * PAGE_BYTES
+    def __init__(self, limit_bytes: int, pid: int) -> None:
+        longest = resource.getrlimit(resource.RLIMIT_FSIZE)[0]  # of any file, also of a memfd
+        limit_bytes = limit_bytes if longest < 0 else min(limit_bytes, longest // PAGE_BYTES * PAGE_BYTES - HEAD_BYTES)
+        self.pid = pid
+        self.bytes = HEAD_BYTES + -(-limit_bytes // PAGE_BYTES) * PAGE_BYTES
         self.key = int.from_bytes(os.urandom(_KEY.size), "little")
         self.fd = fd = os.memfd_create("rr_actors", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(fd, self.bytes)
         for seal in _SEALS:
             fcntl.fcntl(fd, fcntl.F_ADD_SEALS, getattr(fcntl, seal))
-        self.map = mmap.mmap(fd, self.bytes)
-        _KEY.pack_into(self.map, 0, self.key)
-        self.slots = Slots(self.map, PAGE_BYTES, self.bytes, _SLOTS)
+        self._map = head = mmap.mmap(fd, _mapped_bytes(HEAD_BYTES, 0, self.bytes))
+        _KEY.pack_into(head, 0, self.key)
+        self.slots = Slots(head, HEAD_BYTES, self.bytes, _NUMBERS)
 
     def __del__(self) -> None:
         """Close the descriptor: no thread writes any more."""
@@ -409,14 +237,40 @@ class _Owned:
     def write(self, slot: Slot, part: Bytes, at: int) -> None:
         """Write a part of a value to its place; raise OSError if the machine has no memory for it."""
         rest = memoryview(part)
+        mapped = None if slot.fresh else self._map_to(slot.end)
         while rest:
             chunk = rest[:_CHUNK_BYTES]
-            if slot.fresh:  # a system call reports that there is no memory; a write to the map would kill
+            if mapped is None:  # a system call reports that there is no memory; a write to the map would kill
                 written = os.pwrite(self.fd, chunk, at)
             else:
                 written = len(chunk)
-                self.map[at : at + written] = chunk
+                mapped[at : at + written] = chunk
             rest, at = rest[written:], at + written
+
+    def _map_to(self, end: int) -> mmap.mmap | None:
+        """Return a map of the segment up to this byte; None if there is no address space for it."""
+        mapped = self._map
+        if len(mapped) < end:
+            try:
+                mapped = mmap.mmap(self.fd, _mapped_bytes(end, len(mapped), self.bytes))
+            except (OSError, MemoryError):
+                return None
+            if len(self._map) < len(mapped):  # else another thread was faster
+                self._map = mapped  # the map before lives as long as the values that use it
+        return mapped
+
+    def lend(self, slot: Slot, places: Sequence[int], lengths: Sequence[int]) -> memoryview:
+        """Return the memory of a slot, which is in use until nothing uses the memory any more."""
+        if (mapped := self._map_to(slot.end)) is None:
+            raise OSError(errno.ENOMEM, "there is no address space for the segment")
+        claim = Claim(mapped, slot.number, places, lengths, self, shared=False)
+        claim.arm()
+        return claim.memory()
+
+    def in_use(self) -> int:
+        """Return how many bytes of the segment have values."""
+        self.slots.collect()
+        return sum(slot.end - slot.start for slot in {slot.start: slot for slot in self.slots.used.values()}.values())
 
     def discard(self, slot: Slot) -> None:
         """Free a slot that could not be written, and give its pages back."""
@@ -427,7 +281,11 @@ class _Owned:
         """Give free pages back to the machine, at most so many bytes; return how many it were."""
         pieces = self.slots.cool(most)
         for start, end in pieces:
-            self.map.madvise(mmap.MADV_REMOVE, start, end - start)
+            if end <= len(self._map):
+                self._map.madvise(mmap.MADV_REMOVE, start, end - start)
+            else:
+                with contextlib.suppress(OSError), mmap.mmap(self.fd, end - start, offset=start) as piece:
+                    piece.madvise(mmap.MADV_REMOVE)
         return sum(end - start for start, end in pieces)
 
 
@@ -438,7 +296,8 @@ class Parcels:
         self._segments = segments
         self._pid = pid
         self._owned: _Owned | None = None
-        self._theirs: tuple[int, int, mmap.mmap] | None = None  # descriptor, key, map
+        self._theirs: tuple[int, int, int] | None = None  # the descriptor, key and length of the other end's segment
+        self._map: mmap.mmap | None = None  # of that
         self._closed = False
 
     def pack(self, value: bytes | Large) -> bytes | Parcel:
@@ -463,18 +322,13 @@ class Parcels:
             return body
         if why is not None:
             raise Unavailable(f"{len(body)} bytes need a segment of shared memory: {wanted_by(why)}") from why
-        limit = self._segments.limit_bytes
+        limit, segments = self._segments.limit_bytes, self._segments.in_use()
         raise MailboxFull(
-            f"no segment of shared memory has room for {len(body)} bytes: the limit is {limit} (segments_limit_bytes), "
-            f"and the process {self._pid} has {self._in_use()} bytes of values in use",
+            f"no segment of shared memory has room for {len(body)} bytes for process {self._pid}: the limit is {limit} "
+            f"(segments_limit_bytes); bytes in use: {segments}",
             name=str(self._pid),
             limit=limit,
         )
-
-    def _in_use(self) -> int:
-        with self._segments.bookkeeping():
-            used = () if self._owned is None else self._owned.slots.used.values()
-            return sum(slot.end - slot.start for slot in used)
 
     def _parcel(self, value: Large) -> Parcel | None:
         if (found := self._room_for(value)) is None:
@@ -500,10 +354,10 @@ class Parcels:
             if slot.fresh:  # a system call reports that there is no memory; a write to the map would kill
                 os.posix_fallocate(owned.fd, slot.start, slot.end - slot.start)
             _write_parts(owned, slot, value)
-            _, start, end = _places(0, parcel.lengths)
-            memory = _owner_of(owned.map, slot.number, slot.start, end, owned)
+            places = _places(slot.start, parcel.lengths)
+            memory = owned.lend(slot, places, parcel.lengths)
         self._segments.used()
-        return parcel, memory[start:][: parcel.lengths[1]]
+        return parcel, memory[places[1] - slot.start :][: parcel.lengths[1]]
 
     @contextlib.contextmanager
     def _discarded_at_errors(self, owned: _Owned, slot: Slot) -> Generator[None]:
@@ -542,6 +396,11 @@ class Parcels:
         if owned is not None:
             owned.slots.free(parcel.slot)
 
+    def may_share(self, holder: object, most_bytes: int) -> bool:
+        """Return whether share() would return a parcel. Raises OSError like take."""
+        with self._segments.bookkeeping():
+            return self._own().slots.may_share(holder, most_bytes)
+
     def share(self, parcel: Parcel, holder: object, most_bytes: int) -> Parcel | None:
         """Return a parcel of this end for one more holder, who frees it for itself.
 
@@ -549,11 +408,14 @@ class Parcels:
         Raises OSError like take.
         """
         with self._segments.bookkeeping():
-            if (owned := self._owned) is None:
-                raise OSError("the connection is closed")
-            if (number := owned.slots.share(parcel.slot, holder, most_bytes)) is None:
+            if (number := self._own().slots.share(parcel.slot, holder, most_bytes)) is None:
                 return None
             return msgspec.structs.replace(parcel, slot=number)
+
+    def _own(self) -> _Owned:
+        if self._owned is None:
+            raise OSError("the connection is closed")
+        return self._owned
 
     def take_back(self, holder: object) -> None:
         """Free all that a holder has: it has ended."""
@@ -561,52 +423,67 @@ class Parcels:
             if (owned := self._owned) is not None:
                 owned.slots.take_back(holder)
 
-    def claim(self, parcel: Parcel, shared_by: object = None) -> Callable[[], Any]:
+    def claim(self, parcel: Parcel) -> Callable[[], Any]:
         """Return a function that makes the value of a parcel that has arrived. Unused, it frees the slot.
 
         The function raises Unavailable if this process can have no map of the segment.
+
+        Raises:
+            Lie: the other end does not tell the truth: close the connection.
+        """
+        try:
+            claim = self.hold(parcel)
+        except (OSError, MemoryError) as error:
+            why = f"a value of {len(parcel)} bytes cannot be read: {wanted_by(error) or text_of(error)}"
+            return lambda: _raise(Unavailable(why))
+        claim.arm()
+        return claim.open
+
+    def hold(self, parcel: Parcel, shared_by: object = None) -> Claim:
+        """Return the claim on the value of a parcel that has arrived, which is not armed yet.
 
         Args:
             shared_by: the connection, if others have the value, too. The value is read-only then, and keeps this
                 object: while the connection is open, the other end knows that the value is in use.
 
         Raises:
+            OSError, MemoryError: this process can have no map of the segment. FileNotFoundError, ProcessLookupError:
+                the other end has ended, or has closed the segment.
             Lie: the other end does not tell the truth: close the connection.
         """
-        try:
-            mapped = self._map(parcel)
-        except (OSError, MemoryError) as error:
-            why = f"a value of {len(parcel)} bytes cannot be read: {wanted_by(error) or text_of(error)}"
-            return lambda: _raise(Unavailable(why))
+        mapped = self._mapped(parcel)
         places = places_in(parcel, mapped)
-        view = _owner_of(mapped, parcel.slot, parcel.start, places[-1] - parcel.start, shared_by)
-        if shared_by is not None:
-            view = view.toreadonly()
-        parts = [view[start - parcel.start :][:length] for start, length in zip(places, parcel.lengths, strict=False)]
-        return lambda: pickling.loads_large(parts[0], parts[1:])
+        return Claim(mapped, parcel.slot, places, parcel.lengths, shared_by, shared=shared_by is not None)
 
-    def _map(self, parcel: Parcel) -> mmap.mmap:
+    def _mapped(self, parcel: Parcel) -> mmap.mmap:
+        """Return a map of the other end's segment that is long enough for a parcel, unless that lies."""
+        if parcel.start < HEAD_BYTES:
+            raise Lie("it sent a value that is in the head of its segment")
+        needed = max(HEAD_BYTES, min(_places(parcel.start, parcel.lengths)[-1], parcel.segment_bytes))
+        segment, before = (parcel.fd, parcel.key, parcel.segment_bytes), 0
         if self._theirs is not None:
-            fd, key, mapped = self._theirs
-            if (fd, key, len(mapped)) == (parcel.fd, parcel.key, parcel.segment_bytes):
-                return mapped
-            raise Lie("it sent a value in another segment than before")
+            if segment != self._theirs:
+                raise Lie("it sent a value in another segment than before")
+            assert self._map is not None
+            before = len(self._map)
+            if needed <= before:
+                return self._map
         path = f"/proc/{self._pid}/fd/{parcel.fd}"
         found = os.stat(path)
-        if not stat.S_ISREG(found.st_mode) or found.st_size != parcel.segment_bytes or found.st_size < PAGE_BYTES:
+        if not stat.S_ISREG(found.st_mode) or found.st_size != parcel.segment_bytes or found.st_size < HEAD_BYTES:
             raise Lie("what it sent as a segment is none")
         with Path(path).open("r+b", buffering=0) as file:
             _check_sealed(file.fileno())
-            mapped = mmap.mmap(file.fileno(), parcel.segment_bytes)
+            mapped = mmap.mmap(file.fileno(), _mapped_bytes(needed, before, parcel.segment_bytes))
         if _KEY.unpack_from(mapped)[0] != parcel.key:
             raise Lie("it sent a value in a segment that it does not have")
-        self._theirs = parcel.fd, parcel.key, mapped
+        self._map, self._theirs = mapped, segment
         return mapped
 
     def close(self) -> None:
         """Close the segments: the connection is lost. Values that were received stay as they are."""
         self._closed = True
-        self._owned = self._theirs = None
+        self._owned = self._theirs = self._map = None
 
 
 def _write_parts(owned: _Owned, slot: Slot, value: Large) -> None:
@@ -626,33 +503,28 @@ def _check_sealed(fd: int) -> None:
         raise Lie("it sent a file that is no segment")
 
 
-def _owner_of(mapped: mmap.mmap, slot: int, start: int, size: int, keeps: object) -> memoryview:
-    """Return the bytes of a slot. When nothing uses them any more, the slot is free."""
-    import ctypes  # three modules and 2 ms that most programs do without
-
-    # An object with a buffer, which can have a finalizer, between the map and the value.
-    array = (ctypes.c_ubyte * size).from_buffer(mapped, start)
-    weakref.finalize(array, _free, mapped, slot, os.getpid(), keeps).atexit = False
-    return pickling.raw(array)
-
-
-def _free(mapped: mmap.mmap, slot: int, pid: int, _: object) -> None:
-    if os.getpid() == pid:  # not in a process that was forked from it, which shares the map
-        mapped[slot] = FREE
-
-
 def can_open(pid: int) -> bool:
-    """Return whether the process `pid` can open descriptors of this one: it is of the same user, and sees its id."""
+    """Return whether the process `pid` can open descriptors of this one.
+
+    It can if it is of the same user, sees this process's id, and has each capability that this one has. A process that
+    has changed its user, or whose program has capabilities, is not "dumpable": then its descriptors belong to root.
+    """
     if not pid or sys.platform != "linux":
         return False
     me = os.geteuid()
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ValueError):
         return (
-            os.stat("/proc/self").st_uid == me  # else this process is not dumpable
+            os.stat("/proc/self/fd").st_uid == me
             and os.stat(f"/proc/{pid}").st_uid == me
             and os.readlink(f"/proc/{pid}/ns/pid") == os.readlink("/proc/self/ns/pid")
+            and not _capabilities(os.getpid()) & ~_capabilities(pid)
         )
     return False
+
+
+def _capabilities(pid: int) -> int:
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("CapPrm:")[2].split(None, 1)[0], 16)
 
 
 def _raise(error: Exception) -> Any:

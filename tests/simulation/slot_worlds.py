@@ -28,7 +28,8 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from rr_actors.hosting.streams import Connected, Keep, KnownReader, PublishedFrame, Stream
-from rr_actors.wire.segments import PAGE_BYTES, Lie, Parcel, Slot, Slots, places_in
+from rr_actors.wire.segment_slots import PAGE_BYTES, Slot, Slots
+from rr_actors.wire.segments import Lie, Parcel, places_in
 from simulation.explore import Walk
 
 FRAME_PAGES = 2

@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.wire.segments import PAGE_BYTES
+from rr_actors.wire.segment_slots import PAGE_BYTES
 from support import TESTS, eventually
 
 Start = Callable[..., rr.System]

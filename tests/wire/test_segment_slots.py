@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rr_actors.wire.segments import PAGE_BYTES, Intervals, Slots
+from rr_actors.wire.segment_slots import PAGE_BYTES, Intervals, Slots
 
 PAGES = 40
 
@@ -115,4 +115,18 @@ def test_a_slot_is_free_when_the_last_of_its_numbers_is() -> None:
         assert slots.take(PAGE_BYTES, 10**9) is None
         assert number is not None
         slots.free(number)
+    assert slots.take(PAGE_BYTES, 10**9) is not None
+
+
+def test_a_holder_of_many_small_values_leaves_as_many_numbers_to_others() -> None:
+    slots, greedy, other = Slots(bytearray(60), PAGE_BYTES, 100 * PAGE_BYTES, range(8, 60)), object(), object()
+    for holder in (greedy, other):
+        shared = 0
+        while (slot := slots.take(PAGE_BYTES, 10**9)) is not None:
+            if slots.share(slot.number, holder, 10**9) is None:
+                break
+            slots.free(slot.number)
+            shared += 1
+        slots.free(slot.number if slot else 0)
+        assert shared >= 10
     assert slots.take(PAGE_BYTES, 10**9) is not None

@@ -9,6 +9,10 @@ import gc
 import os
 import pickle
 import resource
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +21,8 @@ import pytest
 
 from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, Unavailable
-from rr_actors.wire.segments import PAGE_BYTES, Lie, Parcel, Parcels, Segments
+from rr_actors.wire.segment_slots import PAGE_BYTES
+from rr_actors.wire.segments import Lie, Parcel, Parcels, Segments
 
 LARGE = pickling.LARGE_BYTES
 
@@ -258,6 +263,148 @@ def test_a_process_whose_id_is_not_known_gets_values_in_band() -> None:
     for pid in (0, None):
         nobody = Segments().parcels(pid)
         assert type(nobody.pack(pickling.dumps_large(box(2**18), "value"))) is bytes
+
+
+def test_the_error_of_full_segments_names_the_process_that_keeps_values() -> None:
+    ends = Ends(limit=2**20, frame_limit=2**18)
+    held = ends.send(box(10 * LARGE))
+    other = ends.segments.parcels(os.getppid())
+    with pytest.raises(MailboxFull, match=f"bytes in use: 6[0-9]{{5}} by process {os.getpid()}$"):
+        other.pack(pickling.dumps_large(box(2**19), "value"))
+    del held
+    ends.close()
+
+
+def test_a_segment_takes_address_space_as_far_as_it_is_used() -> None:
+    before = address_space()
+    ends = Ends(limit=2**40)
+    assert ends.send(box(2**18)).bytes == box(2**18).bytes
+    assert address_space() - before < 2**28
+
+    large = [ends.send(bytearray(40 * 2**20)) for _ in range(4)]  # more than was mapped at first
+    more = [ends.send(box(2**20)) for _ in range(3)]
+
+    assert all(value == bytes(40 * 2**20) for value in large)
+    assert [value.bytes for value in more] == [box(2**20).bytes] * 3
+    ends.close()
+
+
+def address_space() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
+def test_a_limit_of_the_length_of_files_limits_segments_and_no_value_is_lost() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**22, hard))
+    try:
+        ends = Ends(limit=2**30, frame_limit=2**20)
+        assert type(ends.pack(box(2**21))) is Parcel
+        with pytest.raises(MailboxFull):
+            ends.pack(box(2**23))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    ends.close()
+
+
+def test_more_values_than_a_page_has_bytes_are_in_use_at_once() -> None:
+    ends = Ends(limit=2**30)
+    held = [ends.send(box(LARGE)) for _ in range(PAGE_BYTES + 1000)]
+    assert type(ends.pack(box(LARGE))) is Parcel
+    del held
+    ends.close()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can change its user")
+def test_a_process_that_has_changed_its_user_sends_values_through_the_connection() -> None:
+    program = (
+        "import os; from rr_actors.wire.segments import can_open; "
+        "print(can_open(os.getpid())); os.setgid(65534); os.setuid(65534); print(can_open(os.getpid()))"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, check=True).stdout
+    assert shown.split() == ["True", "False"]
+
+
+def test_the_default_limit_is_a_quarter_of_what_the_process_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rr_actors.wire.segments.memory_bytes", lambda: 400 * 2**20)
+    assert Segments().limit_bytes == 100 * 2**20
+
+
+# -- fork --------------------------------------------------------------------------------------------------------------
+
+
+def in_fork(run: Callable[[], object]) -> Callable[[], str]:
+    """Run a function in a child of fork; return a function that waits for what it returned, as text."""
+    read, write = os.pipe()
+    pid = os.fork()
+    if not pid:
+        try:
+            os.write(write, repr(run()).encode())
+        finally:
+            os._exit(0)
+    os.close(write)
+
+    def result() -> str:
+        with os.fdopen(read) as pipe:
+            shown = pipe.read()
+        os.waitpid(pid, 0)
+        return shown
+
+    return result
+
+
+def test_a_child_of_fork_has_values_of_its_own() -> None:
+    ends = Ends()
+    held = [ends.send(box(LARGE))]
+    content = held[0].bytes
+    go_on, told = os.pipe()
+
+    def look() -> tuple[bool, bool]:
+        os.read(go_on, 1)
+        unchanged = held[0].bytes == content
+        held[0].data[:] = bytes(len(content))
+        return unchanged, held[0].bytes == bytes(len(content))
+
+    shown = in_fork(look)
+    held.clear()
+    for seed in range(30):  # in the same memory
+        assert ends.send(box(LARGE, seed)).bytes == box(LARGE, seed).bytes
+    kept = ends.send(box(LARGE, 99))
+    os.write(told, b"0")
+    assert shown() == "(True, True)"
+    assert kept.bytes == box(LARGE, 99).bytes
+    for fd in (go_on, told):
+        os.close(fd)
+    ends.close()
+
+
+def test_a_child_of_fork_frees_nothing_of_its_parent() -> None:
+    ends = Ends()
+    held = [ends.send(box(LARGE))]
+    content = held[0].bytes
+    assert in_fork(lambda: (held.clear(), gc.collect()))()
+    for seed in range(5):
+        ends.send(box(LARGE, seed))
+    assert held[0].bytes == content
+    ends.close()
+
+
+def test_what_is_dropped_while_a_process_forks_is_freed_afterwards() -> None:
+    ends = Ends(limit=2**20)
+    stop = threading.Event()
+
+    def drop() -> None:
+        while not stop.is_set():
+            assert ends.send(box(2**18)).bytes[:5] == box(2**18).bytes[:5]
+
+    dropping = threading.Thread(target=drop)
+    dropping.start()
+    for _ in range(20):
+        in_fork(lambda: 0)()
+    stop.set()
+    dropping.join()
+    gc.collect()
+    assert [type(ends.pack(box(2**18))) for _ in range(3)] == [Parcel] * 3
+    ends.close()
 
 
 # -- ends that lie -----------------------------------------------------------------------------------------------------

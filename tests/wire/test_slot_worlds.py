@@ -7,7 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from rr_actors.hosting.streams import Connected, KnownReader, PollSet, Shared, Stream
-from rr_actors.wire.segments import Parcel, Slot, Slots
+from rr_actors.wire.segment_slots import Slot, Slots
+from rr_actors.wire.segments import Parcel
 from simulation.explore import Walk
 from simulation.slot_worlds import PRODUCT, WORLDS, Reader, main, walk_slots
 
