@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -119,7 +117,7 @@ def _kill(system: rr.System, id: str) -> tuple[float, float]:
     (child,) = system.supervisor().which_children()
     unsubscribe = system.subscribe(heard)
     start = time.time()
-    os.kill(child.pid or 0, signal.SIGKILL)
+    child.kill()
     if not back.wait(_LIMIT_S):
         raise TimeoutError(f"{id} was not restarted within {_LIMIT_S:g} s")
     unsubscribe()
@@ -141,7 +139,7 @@ def _kill_all(system: rr.System) -> float:
     unsubscribe = system.subscribe(heard)
     start = time.perf_counter()
     for child in children:
-        os.kill(child.pid or 0, signal.SIGKILL)
+        child.kill()
     if not back.wait(_LIMIT_S):
         raise TimeoutError(f"{len(missing)} of {len(children)} were not restarted within {_LIMIT_S:g} s")
     taken = time.perf_counter() - start

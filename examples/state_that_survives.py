@@ -9,7 +9,6 @@ python examples/state_that_survives.py
 from __future__ import annotations
 
 import os
-import signal
 import tempfile
 import threading
 
@@ -47,7 +46,7 @@ def main() -> None:
         printers.ask("print")
         print("before: pages, open printers:", *printers.ask("print"), flush=True)
 
-        os.kill(system.supervisor().which_children()[0].pid or 0, signal.SIGKILL)
+        system.supervisor().which_child("printers").kill()
         again = app.load("printers/printer", "laser")  # waits until the manager serves again
         restarted.wait(10)  # its on_start has returned: from now on it takes messages, too
 

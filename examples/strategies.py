@@ -6,7 +6,6 @@ python examples/strategies.py
 from __future__ import annotations
 
 import os
-import signal
 import tempfile
 import threading
 from typing import Any
@@ -40,7 +39,7 @@ def show(system: rr.System, strategy: str) -> None:
             back.set()
 
     unsubscribe = system.subscribe(heard)
-    os.kill(second.pid or 0, signal.SIGKILL)
+    second.kill()
     back.wait(10)
     unsubscribe()
     marks = ["new" if child.pid != before[child.id] else "-" for child in here.which_children()[::-1]]

@@ -5,8 +5,6 @@ They go to docs/images. Look at each before you commit it.
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -90,7 +88,7 @@ def take_tree(tab: Tab) -> None:
         tab.do(tab.locate('[data-path="root/drive/left"]').click())
         tab.sees(".rr-rows", "running, pid")
         (left,) = [one for one in system.supervisor("root/drive").which_children() if one.id == "left"]
-        os.kill(left.pid or 0, signal.SIGKILL)
+        left.kill()
         tab.sees('[data-path="root/drive/left"]', "↻1", "running")
         tab.sees('[data-path="root/drive"]', "1/3")
         tab.sees(".rr-rows", "SIGKILL", "restarted")

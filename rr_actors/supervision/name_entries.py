@@ -67,11 +67,18 @@ class Entries:
                 text = f"start_child: {path}: a registrar {name!r} is in the system already; choose another id"
                 raise NameTaken(text, name=name)
 
+    def pid_of(self, path: str) -> int | None:
+        """Return the id of the process of the actor at `path`, as its own entry says; None if it is not up."""
+        return self._pid(actor_key(path))
+
     def pids_below(self, path: str) -> list[int]:
         """Return the ids of the processes of the actors below `path`."""
-        entries = [self._directory.lookup(key) for key in self._directory.actors_below(path)]
-        pids = {pid_of(entry.address) for entry in entries if entry is not None and entry.status is Presence.UP}
+        pids = {self._pid(key) for key in self._directory.actors_below(path)}
         return [pid for pid in pids if pid is not None]
+
+    def _pid(self, key: str) -> int | None:
+        entry = self._directory.lookup(key)
+        return pid_of(entry.address) if entry is not None and entry.status is Presence.UP else None
 
     def forget_dynamic(self, spec: ChildSpec, path: str, managers: set[str]) -> list[str]:
         """Mark the children that were added at run time below `path` as GONE: their supervisor there has died.

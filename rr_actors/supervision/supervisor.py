@@ -62,7 +62,8 @@ class Child(NamedTuple):
     Attributes:
         ref: a reference that works whenever the child is running.
         state: "running", "restarting" (also during a backoff), "stopped", or "starting" during its first start.
-        pid: the process in which the child runs; None while it does not.
+        pid: the process in which the child runs; None while it does not. A child that has answered a load has one, also
+            if its supervisor has not noted the start yet.
     """
 
     id: str
@@ -70,6 +71,17 @@ class Child(NamedTuple):
     type: Literal["worker", "supervisor"]
     state: ChildState
     pid: int | None
+
+    def kill(self) -> bool:
+        """Kill the child's process (SIGKILL), as `ref.kill()` does: its supervisor then acts as after a crash.
+
+        Returns:
+            False if the child does not run now. No process gets a signal then.
+
+        Raises:
+            UsageError: the child shares its process with others (placement="thread").
+        """
+        return self.ref.kill()
 
 
 Answer = Callable[[CallReply], None]
@@ -224,7 +236,8 @@ class SupervisorActor(LoopActor):
         child = child_calls.find_child(self._supervision.tree, id)
         ref = ref_to(self._supervision.path_of(id))
         life = self._supervision.life_of(id)
-        return Child(id, ref, child.spec.type, child.state, None if life is None else life.pid)
+        pid = None if life is None else life.pid or self._supervision.entries.pid_of(life.path)
+        return Child(id, ref, child.spec.type, child.state, pid)
 
 
 def target_of(spec: ChildSpec) -> Target:

@@ -517,7 +517,7 @@ def test_a_monitor_called_off_is_forgotten_in_the_other_process(start: Start, wa
 
     watcher.ask(("watch", mine))
     eventually(lambda: watches.kept() == 1)
-    os.kill(running_pid(system, "watcher") or 0, signal.SIGKILL)  # a watcher that dies leaves none behind either
+    assert system.supervisor().which_child("watcher").kill()  # a watcher that dies leaves none behind either
     eventually(lambda: watches.kept() == 0)
     mine.stop()
 
@@ -547,7 +547,7 @@ def test_all_below_a_killed_supervisor_are_heard_of(start: Start) -> None:
     for child in below:
         rr.monitor(system.ref(f"root/inner/{child.id}"), calls)
 
-    os.kill(running_pid(system, "inner") or 0, signal.SIGKILL)
+    assert system.supervisor().which_child("inner").kill()
 
     assert {down.reason for down in calls.wait(3)} == {"killed"}
 
@@ -614,7 +614,8 @@ def test_an_actor_whose_start_fails_is_down() -> None:
 def test_a_process_that_was_stopped_before_it_could_answer_is_told_of_when_it_dies(start: Start) -> None:
     system = start(rr.ChildSpec(Worker, id="a", restart="temporary"))
     watched, calls = system.ref("a"), Calls()
-    pid = running_pid(system, "a") or 0
+    pid = running_pid(system, "a")
+    assert pid is not None
     os.kill(pid, signal.SIGSTOP)
     rr.monitor(watched, calls)
 
@@ -644,7 +645,8 @@ def test_only_a_process_that_was_killed_before_it_got_the_watch_was_killed(
 ) -> None:
     system = start(rr.ChildSpec(Worker, id="a", restart=restart))
     calls = Calls()
-    pid = running_pid(system, "a") or 0
+    pid = running_pid(system, "a")
+    assert pid is not None
     asked, may_connect = hold_connections(system, monkeypatch)
     watching = threading.Thread(target=rr.monitor, args=(system.ref("a"), calls))
     watching.start()
@@ -665,7 +667,8 @@ def test_a_supervisor_that_is_late_to_say_how_a_process_ended_is_waited_for(
 ) -> None:
     system = start(rr.ChildSpec(Worker, id="a", restart="temporary"))
     directory, calls = node_of(system).directory, Calls()
-    pid = running_pid(system, "a") or 0
+    pid = running_pid(system, "a")
+    assert pid is not None
     up = directory.lookup(actor_key("root/a"))
     asked, may_connect = hold_connections(system, monkeypatch)
     lookup, looks, said = directory.lookup, itertools.count(), threading.Event()
@@ -725,7 +728,8 @@ def test_a_death_is_heard_of_also_when_all_workers_are_busy(start: Start) -> Non
     serve(provider, "slow", load=gate)
     watched, calls = system.ref("a"), Calls()
     rr.monitor(watched, calls)
-    pid = running_pid(system, "a") or 0
+    pid = running_pid(system, "a")
+    assert pid is not None
     waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
     gate.wait_arrived(2)
 

@@ -135,7 +135,7 @@ def test_what_a_killed_process_had_told_is_heard_before_its_end(start: Start, wo
     names = [f"thing {number}" for number in range(50)]
     for name in names:
         app.load("shop/thing", Order(name))
-    os.kill(system.ref("shop").pid or 0, signal.SIGKILL)
+    assert system.ref("shop").kill()
 
     eventually(lambda: any(event["event"] == "exited" for event in heard))
     before = [event["event"] for event in heard]

@@ -369,7 +369,7 @@ def test_resources_have_room_in_an_answer_beside_the_notes_on_registrars_that_do
 
 
 def test_the_history_of_a_child_tells_of_its_exits(shop: rr.System, console: ConsoleClient) -> None:
-    os.kill(shop.ref("shop").pid or 0, signal.SIGKILL)
+    assert shop.ref("shop").kill()
 
     def restarted() -> bool:
         records = console.ask(ListHistory("shop")).records

@@ -9,7 +9,6 @@ Look for: the resource that is still there after the kill, as "unloading"; the m
 from __future__ import annotations
 
 import os
-import signal
 import threading
 import time
 from pathlib import Path
@@ -46,8 +45,8 @@ def main(state_dir: str) -> None:
         release = threading.Thread(target=log.unload)
         release.start()
         time.sleep(3)
-        pid = system.supervisor().which_children()[0].pid or 0
-        print(f"SIGKILL to process {pid}, in the middle of its unload", flush=True)
-        os.kill(pid, signal.SIGKILL)
+        (child,) = system.supervisor().which_children()
+        print(f"SIGKILL to process {child.pid}, in the middle of its unload", flush=True)
+        child.kill()
         release.join()
         time.sleep(8)

@@ -9,7 +9,6 @@ Look for: the resource that is still loading after the kill, the manager's new p
 from __future__ import annotations
 
 import os
-import signal
 import threading
 import time
 
@@ -32,8 +31,8 @@ def main(state_dir: str) -> None:
         time.sleep(2)
         loads.start()
         time.sleep(3)
-        pid = system.supervisor().which_children()[0].pid or 0
-        print(f"SIGKILL to process {pid}, in the middle of its load", flush=True)
-        os.kill(pid, signal.SIGKILL)
+        (child,) = system.supervisor().which_children()
+        print(f"SIGKILL to process {child.pid}, in the middle of its load", flush=True)
+        child.kill()
         loads.join()
         time.sleep(4)

@@ -96,8 +96,9 @@ def main() -> None:
 
         heard.clear()
         child = system.supervisor().which_children()[0]
+        assert child.pid is not None
         sitecustomize.shared[0] = 1
-        os.kill(child.pid or 0, signal.SIGKILL)
+        os.kill(child.pid, signal.SIGKILL)
         assert heard.wait(10)
         sitecustomize.shared[0] = 0
         trips["restore"] = _below(_here())

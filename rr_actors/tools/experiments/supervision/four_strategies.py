@@ -8,8 +8,6 @@ one_for_all, the killed one and the one after it under rest_for_one, one under s
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from typing import Any
 
@@ -34,6 +32,6 @@ def main(state_dir: str, child: str = "b") -> None:
         for strategy in strategies:
             killed = system.supervisor(f"root/{strategy}").which_children()["abc".index(child)]
             print(f"SIGKILL to {killed.id} under {strategy}", flush=True)
-            os.kill(killed.pid or 0, signal.SIGKILL)
+            killed.kill()
             time.sleep(3)
         time.sleep(3)
