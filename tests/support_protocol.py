@@ -419,6 +419,7 @@ def _respawned(script: Script, name: str) -> None:
     side.start()
     script.down.discard(name)
     script.post(name, c.BeginAgain())
+    script.post(name, c.BeginServing("serving"))  # as a registrar without an on_start
 
 
 def _gone(script: Script, name: str) -> None:

@@ -36,7 +36,8 @@ class Manager(Actor):
     Subclass it, declare servers with ``@rr.server``, and put it into a ChildSpec: its child id is its registrar's name.
     A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers: their
     recover callbacks begin, and the manager waits for them, though not for long. ``on_start`` runs, with
-    ``self.registrar.queries()`` restored. Other registrars connect.
+    ``self.registrar.queries()`` restored. Other registrars connect, and all other callbacks begin: those that a crash
+    has interrupted, and probes.
     """
 
     registrar: Registrar = cast("Registrar", _NotYet())

@@ -76,8 +76,9 @@ class Registrar:
         rows = [row for table in self.catalog.tables.values() for row in table.values()]
         registrar = Registrar(self.catalog.name, rows=rows, epoch=self.catalog.epoch + 1)
         registrar.begin_again()
-        for server in servers:
-            registrar.obey(c.Register(server, "event"))
+        registrar.together(
+            *((c.Register(server, "event"), None) for server in servers), (c.BeginServing("event"), None)
+        )
         return registrar
 
     def together(self, *items: Item) -> list[Any]:
@@ -1000,7 +1001,7 @@ def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
     registrar = Registrar("p", rows=rows, epoch=registrar.catalog.epoch + 1)
     registrar.begin_again()
     refusals = registrar.replies
-    registrar.obey(c.Register(Server("cam"), "event"))
+    registrar.together((c.Register(Server("cam"), "event"), None), (c.BeginServing("event"), None))
     assert registrar.started(e.StartUnload) == ["q"]
     part = FetchedQuery("part", "zoom", "res", b"", b"x", "q", asked.attempt, asked.seq, "OK")
     registrar.obey(c.Reconcile("lens", [part], "r"))

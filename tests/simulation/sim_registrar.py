@@ -61,6 +61,10 @@ class SimRegistrar(SimShell):
     def serve(self) -> None:
         """Others are let in, and statuses are heard."""
         self.state = "up"
+        if self.inbox:
+            self.post(c.BeginServing("serving"))
+        else:
+            self.take_up([(c.BeginServing("serving"), None)], "", 0)
         held_back, self.held_back = self.held_back, []
         for message, sender in held_back:
             self.receive(message, sender)

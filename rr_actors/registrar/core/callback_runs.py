@@ -34,6 +34,7 @@ ROLES = ("recover", "status", "unload", "pause", "resume", "health")
 
 def start_load(decision: Decision, resource: Resource) -> None:
     """Run the load callback; if the server is not registered (yet), the resource waits for it."""
+    decision.forget(decision.catalog.early, resource.id)
     if resource.server in decision.catalog.servers:
         decision.cause(StartLoad(resource))
         limit_load(decision, resource)

@@ -45,6 +45,8 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
     decision = Decision(catalog)
     for item, sender in items:
         kind = item.__class__
+        if catalog.early:
+            recovery.begin_early(decision, item)
         if sender is None:
             if (obey := _COMMANDS.get(kind)) is None:
                 raise TypeError(f"{catalog.name}: not a command for a registrar: {shown(item)}")
@@ -108,6 +110,7 @@ _MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
 
 _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.BeginAgain: lambda decision, _: recovery.begin_again(decision),
+    c.BeginServing: recovery.begin_serving,
     c.BeginClosing: reconciliation.begin_closing,
     c.EndClosing: reconciliation.end_closing,
     c.SetRows: _set_rows,

@@ -1,8 +1,10 @@
 """Recovery: a registrar goes on with all that was in progress when its process died, or stopped.
 
-The first decision is `begin_again`, at the opening of the catalog. Then follows `register` for each server: an
-interrupted load or unload runs again, and each live resource is recovered, kept, reloaded or lost, as the server's
-policy says.
+The first decision is `begin_again`, at the opening of the catalog. Then follows `register` for each server: each live
+resource is recovered, kept, reloaded or lost, as the server's policy says. Then comes `begin_serving`, as on_start has
+returned: an interrupted load, unload, pause or resumption runs again, as does a reload. Before that only recover
+callbacks run, because the others may use what on_start makes. If on_start itself loads or unloads such a resource, its
+callback runs at once (`begin_early`): on_start may wait for it.
 
 An interrupted load whose resource nobody holds any more does not run again. Its unload callback runs, with no response.
 """
@@ -53,7 +55,9 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.commands import (
     BeginProbe,
+    BeginServing,
     BeginTrial,
+    ForceUnload,
     PauseDone,
     PauseErred,
     ProbeDone,
@@ -65,13 +69,15 @@ from rr_actors.registrar.model.commands import (
     ResumeDone,
     ResumeErred,
     TrialOver,
+    Unregister,
 )
 from rr_actors.registrar.model.effects import Died, Happened, SendReply, SetTimer, StartProbe, StartRecover
-from rr_actors.registrar.model.messages import Load
+from rr_actors.registrar.model.messages import Load, Unload
 from rr_actors.registrar.model.rows import (
     NOT_BEGUN,
     PAUSED,
     PAUSING,
+    RESTING,
     RESUMING,
     STANDBY,
     CallbackRun,
@@ -108,8 +114,7 @@ def begin_again(decision: Decision) -> None:
     for run in list(decision.catalog.callback_runs.values()):
         if run.id.startswith("request:"):
             refuse_for_a_while(decision, run.id)
-    for revocation in decision.catalog.revocations.values():
-        limit_grace(decision, revocation)
+    decision.note(decision.catalog.early, "", "")
     if died:
         decision.cause(Died(tuple(died), tuple(given_up)))
 
@@ -155,23 +160,97 @@ def register(decision: Decision, command: Register) -> None:
             _lose_unread(decision, resource, command.event)
             continue
         match resource.phase:
-            case Phase.LOADING if resource.tries == NOT_BEGUN:
-                _interrupted(decision, resource)
-            case Phase.LOADING:
-                start_load(decision, resource)
-            case Phase.QUEUED:
-                start_queued(decision, resource)
-            case Phase.UNLOADING:
-                run_unload(decision, resource)
-            case Phase.LOADED:
-                _recover(decision, resource, server, command.event)
+            case Phase.LOADING | Phase.QUEUED | Phase.UNLOADING:
+                if not _waits_for_start(decision, resource, _MOVE):
+                    _move_again(decision, resource)
             case Phase.UNLOAD_FAILED:
                 pass
             case _:
                 _recover(decision, resource, server, command.event)
         if (left := catalog.resources.get(resource.id)) is not None and left.id not in catalog.recovering:
             _rest_again(decision, left, command.event)
-    start_own(decision, server.name)
+    if "" not in catalog.early:
+        start_own(decision, server.name)
+
+
+def _move_again(decision: Decision, resource: Resource) -> None:
+    """Run a load or unload again that a crash has interrupted, or one that has waited for its server."""
+    match resource.phase:
+        case Phase.LOADING if resource.tries == NOT_BEGUN:
+            _interrupted(decision, resource)
+        case Phase.LOADING:
+            start_load(decision, resource)
+        case Phase.QUEUED:
+            start_queued(decision, resource)
+        case _:
+            run_unload(decision, resource)
+
+
+# -- what waits until on_start has returned ----------------------------------------------------------------------------
+
+_MOVE, _LEAVE, _RELOAD, _REST = "move", "leave", "reload", "rest"
+
+
+def _waits_for_start(decision: Decision, resource: Resource, what: str) -> bool:
+    """Return whether on_start has not returned yet; the resource then goes on with `what` when it has."""
+    if "" not in decision.catalog.early:
+        return False
+    if resource.id not in decision.catalog.early:
+        decision.note(decision.catalog.early, resource.id, what)
+    return True
+
+
+def begin_serving(decision: Decision, command: BeginServing) -> None:
+    """Begin all that has waited for on_start."""
+    catalog = decision.catalog
+    decision.forget(catalog.early, "")
+    for revocation in catalog.revocations.values():
+        limit_grace(decision, revocation)
+    for resource_id in list(catalog.early):
+        _begin_early(decision, resource_id, command.event)
+    for name in catalog.servers:
+        start_own(decision, name)
+
+
+def begin_early(decision: Decision, item: object) -> None:
+    """Before on_start has returned, begin what waits for that, and for what a load or unload of on_start waits."""
+    catalog = decision.catalog
+    ids: list[str | None] = []
+    match item:
+        case Load():
+            query = catalog.queries.get(item.query_id)
+            ids = [*catalog.unloading.get((item.server, item.request), ())]
+            ids.append(catalog.joinable(item.server, item.request) if query is None else query.resource_id)
+        case Unload() if (query := catalog.queries.get(item.query_id)) is not None:
+            ids = [query.resource_id]
+        case ForceUnload() if (resource := catalog.find(item.target)) is not None:
+            ids = [resource.id]
+        case Unregister():
+            ids = [*catalog.by_server.get(item.name, ())]
+        case _:
+            pass
+    for id in filter(None, ids):
+        _begin_early(decision, id, f"early:{id}:{catalog.epoch}")
+
+
+def _begin_early(decision: Decision, resource_id: str, event: str) -> None:
+    catalog = decision.catalog
+    what = decision.forget(catalog.early, resource_id)
+    resource = catalog.resources.get(resource_id)
+    server = None if resource is None else catalog.servers.get(resource.server)
+    if what is None or resource is None or server is None:
+        return
+    if what == _RELOAD and resource_id in catalog.recovering:
+        _recover_in_turn(decision, resource, server)
+    elif what == _MOVE and resource.phase in (Phase.LOADING, Phase.QUEUED, Phase.UNLOADING):
+        _move_again(decision, resource)
+    elif what == _LEAVE and resource.id not in catalog.holders:
+        _leave(decision, resource, server)
+    elif resource.id not in catalog.recovering:
+        _rest(decision, resource, event)
+
+
+# -- recovery ----------------------------------------------------------------------------------------------------------
 
 
 def _note_types(decision: Decision, command: Register) -> None:
@@ -244,10 +323,8 @@ def _to_recover(catalog: Catalog, server: Server) -> list[Resource]:
 def _recover(decision: Decision, resource: Resource, server: Server, event: str) -> None:
     has_recover, policy = server.has_recover, server.recovery
     if resource.id not in decision.catalog.holders:
-        if has_recover or policy != "keep":  # it may be lost, so it is not kept warm
-            begin_unload(decision, resource)
-        else:
-            retire(decision, resource)
+        if not _waits_for_start(decision, resource, _LEAVE):
+            _leave(decision, resource, server)
     elif resource.state is State.FATAL:
         return  # parts of an interrupted reload stay with it until its holders release it
     elif role := next((it for it in ("recover", "health") if is_given_up(decision.catalog, it, resource.id)), None):
@@ -255,11 +332,24 @@ def _recover(decision: Decision, resource: Resource, server: Server, event: str)
         spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
     elif has_recover or policy == "reload":
         decision.note(decision.catalog.recovering, resource.id, ())
-        if not awaits_trial(decision, "recover", resource.id):
-            _run_recover(decision, resource, server)
+        if has_recover or not _waits_for_start(decision, resource, _RELOAD):
+            _recover_in_turn(decision, resource, server)
     elif policy == "lost":
         why = "lost: its manager was restarted"
         spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
+
+
+def _leave(decision: Decision, resource: Resource, server: Server) -> None:
+    """Unload a resource that nobody holds. It may be lost, unless it is kept: then it is kept warm, too."""
+    if server.has_recover or server.recovery != "keep":
+        begin_unload(decision, resource)
+    else:
+        retire(decision, resource)
+
+
+def _recover_in_turn(decision: Decision, resource: Resource, server: Server) -> None:
+    if not awaits_trial(decision, "recover", resource.id):
+        _run_recover(decision, resource, server)
 
 
 def _run_recover(decision: Decision, resource: Resource, server: Server) -> None:
@@ -284,7 +374,16 @@ def _run_recover(decision: Decision, resource: Resource, server: Server) -> None
 def _rest_again(decision: Decision, resource: Resource, event: str) -> None:
     """Go on with a pause or resumption that a crash has interrupted, and with the time of an idle resource."""
     catalog = decision.catalog
-    if resource.phase in (PAUSING, RESUMING):
+    idles = resource.phase is Phase.LOADED and catalog.priority_of(resource.id) <= STANDBY
+    if (idles or resource.phase in RESTING) and not _waits_for_start(decision, resource, _REST):
+        _rest(decision, resource, event)
+
+
+def _rest(decision: Decision, resource: Resource, event: str) -> None:
+    catalog = decision.catalog
+    if resource.phase in (Phase.LOADED, PAUSED) and resource.id not in catalog.holders:
+        retire(decision, resource)
+    elif resource.phase in (PAUSING, RESUMING):
         role = "pause" if resource.phase is PAUSING else "resume"
         deaths = deaths_of(catalog, role, resource.id)
         if deaths < ATTEMPTS:
@@ -295,7 +394,7 @@ def _rest_again(decision: Decision, resource: Resource, event: str) -> None:
             _runs(decision, resource)
         else:
             _not_resumed(decision, resource, event, Failure("LoadFailed", why, {}))
-    elif catalog.priority_of(resource.id) <= STANDBY or resource.phase is PAUSED:
+    else:
         balance(decision, resource.id)
 
 
@@ -500,9 +599,6 @@ def _go_on(decision: Decision, resource_id: str) -> None:
             load(decision, message)
         else:
             unload(decision, message)
-    left = catalog.resources.get(resource_id)
-    if left is not None and left.phase in (Phase.LOADED, PAUSED) and resource_id not in catalog.holders:
-        retire(decision, left)
-    elif left is not None:
+    if (left := catalog.resources.get(resource_id)) is not None:
         _rest_again(decision, left, f"rest:{resource_id}:{catalog.epoch}")
     start_deferred(decision, resource_id)

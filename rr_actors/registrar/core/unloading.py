@@ -245,6 +245,7 @@ def refuse_waiting(decision: Decision, resource: Resource, failure: Failure) -> 
 def go_on(decision: Decision, resource: Resource) -> None:
     """Run the pause callback; or the resume callback, when all parts have been resumed."""
     catalog = decision.catalog
+    decision.forget(catalog.early, resource.id)
     decision.forget(catalog.idle, resource.id)
     touch(decision, resource.id)
     role = "pause" if resource.phase is PAUSING else "resume"
@@ -265,6 +266,7 @@ def begin_unload(decision: Decision, resource: Resource) -> None:
 
 def run_unload(decision: Decision, resource: Resource) -> None:
     """Run the unload callback, unless it has ended the process too often, or is not to run before its turn."""
+    decision.forget(decision.catalog.early, resource.id)
     if resource.id in decision.catalog.unread:  # the callback cannot run without its request and response
         _remove(decision, resource)
     elif is_given_up(decision.catalog, "unload", resource.id):

@@ -67,6 +67,8 @@ class RegistrarActor(RegistrarBase):
         """Go on with the work that the catalog says was in progress, and look for the providers of its queries."""
         self.lock_in_use(in_use=True)
         self.monitor.run(c.BeginAgain())
+        if self.serving:  # the catalog is read again
+            self.post(c.BeginServing(new_id()))
         with self.lock:
             providers = {**self.whole().peers, **self.catalog.outbound}
         for provider in providers:
@@ -76,6 +78,8 @@ class RegistrarActor(RegistrarBase):
     def serve(self) -> None:
         """Let in consumers from now on, and decide the statuses that waited."""
         self.serving = True
+        self.servers.open_probes()
+        self.post(c.BeginServing(new_id()))
         self.monitor.hear_held_back()
 
     @on_loop

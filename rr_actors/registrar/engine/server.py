@@ -449,7 +449,7 @@ class ServerActor:
         self.probes = Probes(loop, *rounds, self._probed, self._probe, self._probe_late)
         self._health, self._counts = health, dict[str, ProbeCounts]()  # by resource
         self._inherited = self._held_before() if spec.health else frozenset[str]()
-        self._careful_until = time.monotonic() + _CAREFUL_S
+        self._careful_until = math.inf
 
     def _described(
         self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
@@ -741,6 +741,13 @@ class ServerActor:
     # -- health --------------------------------------------------------------------------------------------------
 
     @on_loop
+    def open_probes(self) -> None:
+        """Begin to probe. Before on_start has returned, the health callback may lack what that makes."""
+        if self.spec.health is not None:
+            self._careful_until = time.monotonic() + _CAREFUL_S
+            self.probes.open()
+
+    @on_loop
     def _probed(self) -> list[str]:
         """Return the resources of the next round, and forget the results of the others."""
         with self.registrar.lock:
@@ -1025,8 +1032,14 @@ class Servers:
             registrar.post(c.Register(server.facts, new_id(), reread, server.digest))
         else:
             registrar.catalog.servers[name] = server.facts
-        if server.spec.health is not None:
-            server.probes.open()
+        if registrar.serving:
+            server.open_probes()
+
+    @on_loop
+    def open_probes(self) -> None:
+        """Begin to probe, as on_start has returned."""
+        for server in self._by_name.values():
+            server.open_probes()
 
     @on_loop
     def close(self) -> None:

@@ -117,6 +117,8 @@ class Catalog:
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: queries whose Load was refused
       lately. `unanswered`: queries whose Unload has come over the present link and has not been answered.
     - `recovering`: resources whose recover callback runs, with the messages parked until it has returned.
+    - `early`: resources whose callbacks go on with work of before a crash when on_start has returned, and how
+      (recovery.py). "" is in it until then.
     - `closings`: releases of parts in progress, by the query whose release has been sent.
     - `direct`: queries whose Load a thread has sent by its own connection, which has not answered yet; False: the query
       has ended by another way. `fresh`: queries that such a connection answered while the provider's link was down, and
@@ -195,6 +197,7 @@ class Catalog:
         self.refused: dict[str, Failure] = {}
         self.unanswered: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
+        self.early: dict[str, str] = {}
         self.closings: dict[str, Closing] = {}
         self.unread: dict[str, str] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}

@@ -24,6 +24,12 @@ class BeginAgain(Command, frozen=True):
     """The registrar has opened its catalog. This is the first command, before any server is registered."""
 
 
+class BeginServing(Command, frozen=True):
+    """on_start has returned, and other registrars are let in: callbacks that waited for that begin."""
+
+    event: str
+
+
 class BeginClosing(Command, frozen=True):
     """The registrar is being closed for good: it loads nothing any more for others; `own`: nor for itself."""
 
