@@ -18,7 +18,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, wait
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -178,7 +178,7 @@ class ExternalPrograms:
         raise ProgramFailed(f"the program {end}", exit=end)
 
     def stop(self, key: str) -> None:
-        """End a program: the order's signal to its group, and after the grace SIGKILL, to all its descendants too.
+        """End a program: the order's signal to it and all its descendants, and after the grace SIGKILL.
 
         Returns when no process of the program is left: at once if it is gone already.
 
@@ -208,32 +208,33 @@ class ExternalPrograms:
     def pause(self, key: str) -> None:
         """Stop a program where it is, with all that it started, until resume(), or stop(), which ends them.
 
-        Its control group is frozen. Without one, its process group is stopped.
+        Its control group is frozen. Without one, it and all its descendants are stopped by SIGSTOP.
 
         Raises:
             ProgramFailed: the program has ended.
         """
-        with self._program(key) as program:
+        with self._shim(key) as (shim, program):
             group = self._home(key).group()
             if group is None or not group.freeze(program.pid):
-                _signal_group(program, signal.SIGSTOP)
+                _signal_all(shim, program, signal.SIGSTOP)
 
     def resume(self, key: str) -> None:
         """Let a paused program go on; one that is not paused does so in any case. Raises as pause() does."""
-        with self._program(key) as program:
+        with self._shim(key) as (shim, program):
             group = self._home(key).group()
             if group is not None:
                 group.thaw()
-            _signal_group(program, signal.SIGCONT)
+            _signal_all(shim, program, signal.SIGCONT)
 
     @contextlib.contextmanager
-    def _program(self, key: str) -> Generator[ProcessHandle]:
-        try:
-            program = ProcessHandle(*self._home(key).state()["program"])
-        except (KeyError, ProcessLookupError):
-            raise ProgramFailed("the program has ended") from None
-        with contextlib.closing(program):
-            yield program
+    def _shim(self, key: str) -> Generator[tuple[ProcessHandle, Running]]:
+        """Yield the shim of a running program, and the program."""
+        state = self._home(key).state()
+        shim = shim_of(state)
+        if shim is None or "program" not in state:
+            raise ProgramFailed("the program has ended")
+        with contextlib.closing(shim):
+            yield shim, _running(state)
 
     def usage(self, key: str) -> dict[str, float]:
         """Return what a running program uses, with all that it has started, as ProgramUsage.now() does.
@@ -241,12 +242,7 @@ class ExternalPrograms:
         Raises:
             ProgramFailed: the program has ended.
         """
-        state = self._home(key).state()
-        shim = shim_of(state)
-        if shim is None or "program" not in state:
-            raise ProgramFailed("the program has ended")
-        running = _running(state)
-        with contextlib.closing(shim):
+        with self._shim(key) as (shim, running):
             known = self._usages.get(key)
             if known is None or known.pid != running.pid:
                 known = self._usages[key] = ProgramUsage(shim.pid, *running)
@@ -418,9 +414,28 @@ class ExternalPrograms:
                 shim.wait(_SHIM_LIMIT_S)
 
 
-def _signal_group(program: ProcessHandle, number: int) -> None:
+def _signal_all(shim: ProcessHandle, program: Running, number: int) -> None:
+    """Send a signal to the program's process group at once, and to each descendant outside of it.
+
+    It looks again until there is no new one: a process that is not stopped yet may start another.
+    """
     with contextlib.suppress(ProcessLookupError):
         os.killpg(program.pid, number)
+    done: set[psutil.Process] = set()
+    while new := set(_outside(shim.pid, program.pid)) - done:
+        for process in new:
+            with contextlib.suppress(psutil.Error):  # psutil compares the start time: it never signals a reused pid
+                process.send_signal(number)
+        done |= new
+
+
+def _outside(shim: int, group: int) -> Iterator[psutil.Process]:
+    """Return the living processes below a shim, which adopts the program's orphans, that are not in the group."""
+    with contextlib.suppress(psutil.Error):
+        for process in psutil.Process(shim).children(recursive=True):
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                if os.getpgid(process.pid) != group:
+                    yield process
 
 
 def _ask(ready: Callable[[Running], bool], running: Running) -> Future[bool]:

@@ -73,7 +73,7 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         environment: variables that are added to the manager's own, or replace them.
         directory: its working directory; a relative path begins at the manager's. Default: the manager's.
         ready: the conditions under which it is ready.
-        stop_signal: the signal that asks its whole process group to end.
+        stop_signal: the signal that asks the program to end, and each process that it has started.
         grace_s: seconds until SIGKILL follows; infinite: it does not.
         instance: a name that distinguishes requests that are otherwise the same: each name gets its own program.
         cost: what it costs of the pools of the manager's Budgets, as ``{"cpu": 0.5, "memory_bytes": 2e8}``: the shares
@@ -125,7 +125,7 @@ class Programs(Manager):
             probes: functions that requests may name as their readiness.
             idle, linger_s, paused_s: what becomes of a program that nobody needs, as for register_server(). A paused
                 program keeps its memory and takes no CPU: its control group is frozen, with all that it started.
-                Where none can be made, its process group is stopped by SIGSTOP.
+                Where none can be made, each of its processes is stopped by SIGSTOP.
             cost_from: the child of the system that runs Budgets, for the requests with a `cost`, as for @rr.server.
 
         Raises:
@@ -171,7 +171,7 @@ class Programs(Manager):
 
     @run_program.pause
     def pause_program(self, request: RunProgram, response: Program) -> None:
-        """Freeze the program with all that it started, or stop its process group."""
+        """Freeze the program with all that it started, or stop each of these processes."""
         self._external.pause(current().resource_id)
 
     @run_program.resume

@@ -30,7 +30,7 @@ import signal
 import sys
 import time
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 LOG_LIMIT_BYTES = 256 * 1024
 LINE_LIMIT_BYTES = 64 * 1024
@@ -120,7 +120,7 @@ class Shim:
             self._reap()
             if self._asked and self._stop_at is None:
                 self._begin_stop()
-            if self._stop_at is not None and (time.monotonic() >= self._stop_at or self._only_daemons_left()):
+            if self._stop_at is not None and time.monotonic() >= self._stop_at:
                 break
         self._kill_all()
         self._copy_output()
@@ -223,9 +223,9 @@ class Shim:
     def _begin_stop(self) -> None:
         self._stop_at = time.monotonic() + self._order["grace_s"]
         self._state["stopped"] = True
-        self._signal_group(self._order["stop_signal"])
+        self._signal_all(self._order["stop_signal"])
         _write(self._order["group"], "cgroup.freeze", "0")  # a paused program acts on no signal
-        self._signal_group(signal.SIGCONT)
+        self._signal_all(signal.SIGCONT)
 
     def _reap(self) -> None:
         """Reap every child that has ended, and note the end of the program."""
@@ -245,18 +245,6 @@ class Shim:
         self._state["ended"] = {"code": code} if code >= 0 else {"signal": -code}
         return True
 
-    def _only_daemons_left(self) -> bool:
-        """Return whether the program and its group are gone, so that only processes outside the group are left."""
-        if "ended" not in self._state:
-            return False
-        try:
-            os.killpg(self._pid, 0)
-        except ProcessLookupError:
-            return True
-        except PermissionError:
-            return False  # only processes of another user are left in it, as sudo makes
-        return False
-
     def _kill_all(self) -> None:
         """Send SIGKILL to the group and every descendant, round by round, until none of this user is left."""
         self._signal_group(signal.SIGKILL)
@@ -264,6 +252,16 @@ class Shim:
             self._note_end(*os.waitpid(-1, 0))
         self._reap()
         self._ended = True
+
+    def _signal_all(self, number: int) -> None:
+        """Send a signal once to the group, and to each descendant that has left it for a session or group of its own.
+
+        What they start while they act on it, such as a command that cleans up, does not get it.
+        """
+        outside = [one for one in _descendants() if one.group != self._pid]
+        self._signal_group(number)
+        for one in outside:
+            one.signal(number)
 
     def _signal_group(self, number: int) -> None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -321,15 +319,49 @@ def _execute(command: str, arguments: list[str], environment: dict[str, str]) ->
         raise FileNotFoundError(f"{found} is there, but not {what}") from None
 
 
-def _children() -> list[int]:
-    """Return the pids of this process's children, zombies too (/proc/*/task/*/children is not in every kernel)."""
-    mine: list[int] = []
+class _Process(NamedTuple):
+    """A process as /proc has it; pid and start together always name one process."""
+
+    pid: int
+    parent: int
+    group: int
+    start: int
+
+    def signal(self, number: int) -> None:
+        """Send it a signal; do nothing if it is gone, or this user may not."""
+        with contextlib.suppress(OSError):
+            descriptor = os.pidfd_open(self.pid)
+            try:
+                if start_ticks(self.pid) == self.start:  # else another process has got the pid
+                    signal.pidfd_send_signal(descriptor, number)
+            finally:
+                os.close(descriptor)
+
+
+def _processes() -> list[_Process]:
+    """Return all processes, zombies too (/proc/*/task/*/children is not in every kernel)."""
+    found: list[_Process] = []
     for name in os.listdir("/proc"):
         if name.isdigit():
             with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
-                if int(file.read().rpartition(b")")[2].split()[1]) == os.getpid():
-                    mine.append(int(name))
-    return mine
+                words = file.read().rpartition(b")")[2].split()  # the name in parentheses may hold anything
+                found.append(_Process(int(name), int(words[1]), int(words[2]), int(words[19])))
+    return found
+
+
+def _children() -> list[int]:
+    return [one.pid for one in _processes() if one.parent == os.getpid()]
+
+
+def _descendants() -> list[_Process]:
+    """Return all that the program has started: this process is the parent of those whose own parent has ended."""
+    below: dict[int, list[_Process]] = {}
+    for one in _processes():
+        below.setdefault(one.parent, []).append(one)
+    found = below.get(os.getpid(), [])
+    for one in found:  # which grows meanwhile
+        found.extend(below.get(one.pid, []))
+    return found
 
 
 def _kill(pid: int) -> bool:

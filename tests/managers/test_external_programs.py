@@ -284,6 +284,48 @@ print('all ready'); time.sleep(600)"""
     assert mark.exists()
 
 
+@pytest.mark.parametrize("leader_waits", [False, True])
+def test_the_stop_signal_reaches_a_process_in_a_session_of_its_own_which_gets_the_grace(
+    programs: ExternalPrograms, tmp_path: Path, leader_waits: bool
+) -> None:
+    saved = tmp_path / "saved"
+    saving = f"""
+import signal, time
+def leave(*_):
+    time.sleep(0.2); open({str(saved)!r}, 'a').write('saved '); raise SystemExit
+signal.signal(signal.SIGTERM, leave)
+print('ready', flush=True)
+while True: time.sleep(600)"""
+    code = f"""
+import signal, subprocess, sys
+other = subprocess.Popen([sys.executable, '-u', '-c', {saving!r}], stdout=-1, start_new_session=True)
+other.stdout.readline()
+signal.signal(signal.SIGTERM, lambda *_: sys.exit({leader_waits} and other.wait()))
+print('all ready')
+while True: signal.pause()"""
+    programs.start(KEY, python(code, ready="all ready", grace_s=60))
+    began = time.monotonic()
+    programs.stop(KEY)
+    assert time.monotonic() - began < 30
+    assert saved.read_text() == "saved "
+    assert not find_processes(VARIABLE, KEY)
+
+
+def test_what_a_program_starts_in_order_to_end_gets_no_stop_signal(programs: ExternalPrograms, tmp_path: Path) -> None:
+    saved = tmp_path / "saved"
+    code = f"""
+import signal, subprocess, sys
+def leave(*_):
+    subprocess.run(['sh', '-c', 'sleep 0.2; touch {saved}'], start_new_session=True)
+    sys.exit()
+signal.signal(signal.SIGTERM, leave)
+print('ready')
+while True: signal.pause()"""
+    programs.start(KEY, python(code, ready="ready", grace_s=60))
+    programs.stop(KEY)
+    assert saved.exists()
+
+
 def refuse_signal(number: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Have shims that may not send this signal, as to processes of another user."""
     file = tmp_path / "refused_shim.py"
@@ -727,6 +769,31 @@ def test_where_none_can_be_made_a_program_runs_and_is_stopped_and_its_limits_are
     finally:
         programs.stop(KEY)
         programs.close()
+
+
+def test_without_a_control_group_a_pause_stops_what_runs_in_a_session_of_its_own_too(
+    tmp_path: Path, exits: Exits
+) -> None:
+    programs = ExternalPrograms(tmp_path / "programs", exits, pauses=True, groups=ControlGroups(None, None))
+    code = f"""
+import signal, subprocess, sys
+signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+other = subprocess.Popen([sys.executable, '-c', {SLEEP!r}], stdout=subprocess.DEVNULL, start_new_session=True)
+print('ready')
+other.wait()"""
+    try:
+        programs.start(KEY, python(code, ready="ready", grace_s=60))
+        pids = set(find_processes(VARIABLE, KEY))
+        assert len(pids) == 2
+        programs.pause(KEY)
+        eventually(lambda: all(stands(pid) for pid in pids))
+        programs.resume(KEY)
+        eventually(lambda: not any(stands(pid) for pid in pids))
+        programs.pause(KEY)
+    finally:
+        programs.stop(KEY)  # what is stopped goes on, and acts on the stop signal
+        programs.close()
+    assert not find_processes(VARIABLE, KEY)
 
 
 def test_a_program_enters_its_group_and_the_limits_are_there_before_it(tmp_path: Path, exits: Exits) -> None:
