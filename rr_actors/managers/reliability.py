@@ -11,7 +11,7 @@ from typing import Annotated
 
 import msgspec
 
-from rr_actors.managers.kept_record import KeptRecord
+from rr_actors.managers.planning.kept_record import KeptRecord
 
 FALL = 0.5  # a failure halves it
 _COUNTED_LIMIT = 100

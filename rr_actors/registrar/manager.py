@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from pathlib import Path
 from typing import Any, NoReturn, cast
+
+import msgspec
+from pykka import ActorDeadError
 
 from rr_actors.actors.actor import Actor
 from rr_actors.actors.refs import ActorRef
@@ -16,6 +21,22 @@ from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.server import ServerSpec, current, serving
 from rr_actors.registrar.registrar import Registrar, register_spec
 from rr_actors.wire.name_service import Presence
+
+
+class Beginning(msgspec.Struct, frozen=True):
+    """The facts of a start of a manager.
+
+    Attributes:
+        name: of its registrar.
+        directory: the private directory of its catalog, which may not exist yet.
+        run: identifies the run of the system.
+        by_hand: start_child or restart_child asks for this start, and not the supervisor.
+    """
+
+    name: str
+    directory: Path
+    run: str
+    by_hand: bool
 
 
 class _NotYet:
@@ -69,13 +90,22 @@ class Manager(Actor):
             f"rr.System([rr.ChildSpec({cls.__name__}, id='...')]).start(), or system.start_child(...) if a system runs"
         )
 
+    def _beginning(self) -> Beginning | None:
+        """Return the facts of this start, for __init__; None if no system makes this manager."""
+        place = self._place
+        if place is None:
+            return None
+        node: Node = place.node
+        directory = node.config.registrar(place.id).catalog_path(node.info.state_dir).parent
+        return Beginning(place.id, directory, node.info.run_dir, place.by_hand)
+
     async def _before_start(self, place: Any) -> None:
         node: Node = place.node
         self._node = node
         actor = await node.open_registrar(place.id, node.config.registrar(place.id))
         self.registrar = Registrar(node, actor)
         self._served = actor
-        actor.on_failure = self._registrar_failed
+        actor.on_failure = self._failed
         actor.path = place.path
         place.abandoned = functools.partial(self._close_registrar, None)
         try:
@@ -140,12 +170,16 @@ class Manager(Actor):
         """Return whether this manager still owns the registrar of its name: an abandoned one may have a successor."""
         return self._node.registrars.get(self.registrar.name) is self._served
 
-    def _registrar_failed(self, error: BaseException) -> None:
-        """Make the manager fail with its registrar's error; its supervisor then starts it again from the catalog."""
-        self.actor_ref.tell(_RegistrarFailed(error))
+    def _failed(self, error: BaseException) -> None:
+        """Make the manager fail with an error of its registrar, or of a thread of its own. From any thread.
+
+        Its supervisor then starts it again from the catalog.
+        """
+        with contextlib.suppress(ActorDeadError):  # it has ended already
+            self.actor_ref.tell(_Failed(error))
 
     def _handle_receive(self, message: Any) -> Any:
-        if isinstance(message, _RegistrarFailed):
+        if isinstance(message, _Failed):
             raise message.error
         return super()._handle_receive(message)
 
@@ -162,6 +196,6 @@ def ref(id: str) -> ActorRef[Any]:
     return node.ref(where, node.path)
 
 
-class _RegistrarFailed:
+class _Failed:
     def __init__(self, error: BaseException) -> None:
         self.error = error

@@ -91,7 +91,7 @@ class ChildProcess:
         self._channel: control.Channel | None = None
         self._hosted: Hosted | None = None
         loop = self.node.dispatcher.loop
-        self._told_to_start: asyncio.Future[None] = loop.create_future()
+        self._told_to_start: asyncio.Future[control.Start] = loop.create_future()
         self._told_to_stop: asyncio.Future[None] = loop.create_future()
         self._stop: control.Stop | None = None
         self._is_limited = False  # the parent limits the stops that it asks for
@@ -151,7 +151,9 @@ class ChildProcess:
         self._shutdown_s = spec.shutdown_s
         cls, args, kwargs = target_of(spec)
         self._hosted = prepare(self.node, cls, self._path, self._report.set_result, once=spec.restart == "temporary")
-        starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent has the time limit
+        by_hand = self._told_to_start.result().by_hand
+        start = self._hosted.start(args, kwargs, None, by_hand=by_hand)  # the parent has the time limit
+        starting = asyncio.ensure_future(start)
         await asyncio.wait((starting, self._told_to_stop), return_when=asyncio.FIRST_COMPLETED)
         if not starting.done():
             self._hosted.cut_short()
@@ -191,7 +193,7 @@ class ChildProcess:
     def _received(self, message: control.Message) -> None:
         match message:
             case control.Start():
-                self._told_to_start.set_result(None)
+                self._told_to_start.set_result(message)
             case control.Stop():
                 self.node.stopping = f"{self._path} is being stopped"
                 self._stop_as(message)

@@ -62,9 +62,9 @@ class LocalRun:
         temporary = spec.restart == "temporary"
         self._hosted = prepare(node, target[0], path, lambda report: on_end(_exit_of(report)), once=temporary)
 
-    async def start(self) -> bool:
+    async def start(self, *, by_hand: bool) -> bool:
         _, args, kwargs = self._target
-        return await self._hosted.start(args, kwargs, self._timeout_s)
+        return await self._hosted.start(args, kwargs, self._timeout_s, by_hand=by_hand)
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
         return _exit_of(await self._hosted.stop(shutdown_s, final=final))
@@ -116,8 +116,11 @@ class ProcessRun:
 
     # -- Run -------------------------------------------------------------------------------------------------------
 
-    async def start(self) -> bool:
+    async def start(self, *, by_hand: bool) -> bool:
         """Start the child. Return True once it is ready, False if its on_start returned IGNORE. Not after stop().
+
+        Args:
+            by_hand: start_child or restart_child asks for this start, and not the supervisor.
 
         Raises:
             StartFailed: the child did not become ready, or was stopped first.
@@ -130,7 +133,7 @@ class ProcessRun:
         assert self._channel is not None
         if self._stopping:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
-        self._channel.send(control.Start())
+        self._channel.send(control.Start(by_hand))
         if self.spec.heartbeat_s is not None and not self._end.done():
             self._heartbeat = Heartbeat(self.spec.heartbeat_s, self._ping, self._kill_hung, self._starved_s)
         await wait_while_running(self._answer, timeout_s)

@@ -25,7 +25,9 @@ _REST_S = 0.01
 
 
 class Start(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """Start the actor: the siblings before it are ready."""
+    """Start the actor: the siblings before it are ready. `by_hand`: start_child or restart_child asks for it."""
+
+    by_hand: bool = False
 
 
 class Stop(msgspec.Struct, tag=True, array_like=True, frozen=True):

@@ -38,6 +38,7 @@ from rr_actors.supervision.core.state import (
     StopChild,
     SupervisorStarted,
     SupervisorState,
+    Why,
 )
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.supervision.given_up import give_up
@@ -188,7 +189,7 @@ class Supervision:
         life.began = time.monotonic()
         try:
             life.run = self._new_run(life)
-            ready = await life.run.start()
+            ready = await life.run.start(by_hand=life.why in (Why.NEW, Why.MANUAL))
         except Exception as failure:
             error = failure if type(failure) is StartFailed else await described_error(failure)
             if not life.told_to_stop.is_set():

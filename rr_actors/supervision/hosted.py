@@ -84,6 +84,7 @@ class ActorPlace:
         node: the process's runtime.
         path: the actor's, "root/cameras".
         id: its name among its siblings, "cameras".
+        by_hand: start_child or restart_child asks for this start, and not the supervisor.
         cut_short: set by an actor whose start may take long and can be ended at once.
         kill: set by an actor that has processes below it, which can be killed.
         abandoned: set by an actor that holds what its successor needs; called when the actor is abandoned.
@@ -93,6 +94,7 @@ class ActorPlace:
         self.node = node
         self.path = path
         self.id = path.rpartition("/")[2]
+        self.by_hand = False
         self.cut_short: Callable[[], None] | None = None
         self.kill: Callable[[], None] | None = None
         self.abandoned: Callable[[], None] | None = None
@@ -116,13 +118,16 @@ class Hosted(abc.ABC):
         self._ready = False
         self._stopping = False
 
-    async def start(self, args: Sequence[Any], kwargs: Mapping[str, Any], timeout_s: float | None) -> bool:
+    async def start(
+        self, args: Sequence[Any], kwargs: Mapping[str, Any], timeout_s: float | None, *, by_hand: bool = False
+    ) -> bool:
         """Start the actor. Return True once others can reach it, False if its on_start returned IGNORE.
 
         Raises:
             StartFailed: it was not ready within `timeout_s`, or killed; it is stopped as soon as that is possible.
             BaseException: the error of `__init__` or on_start.
         """
+        self._place.by_hand = by_hand
         starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
         try:
             await wait_while_running(starting, timeout_s)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from rr_actors.managers.kept_record import KeptRecord
+from rr_actors.managers.planning.kept_record import KeptRecord
 
 
 class _Record(msgspec.Struct):

@@ -38,7 +38,7 @@ from rr_actors.managers.choices.matching import ranked, why_none
 from rr_actors.managers.choices.planning import Choice, in_turn
 from rr_actors.managers.choices.relays import Address, Relays, parse_address
 from rr_actors.managers.choices.trials import FAILED, Trials
-from rr_actors.managers.kept_record import KeptRecord
+from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.reliability import Reliabilities
 from rr_actors.managers.templates import Parameter
 from rr_actors.registrar.declarations import server

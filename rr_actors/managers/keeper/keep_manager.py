@@ -43,7 +43,7 @@ from rr_actors.base.values.canonical import encode
 from rr_actors.managers.keeper import comparing
 from rr_actors.managers.keeper.comparing import Failure, Report, Seen, Slot, Steps, Wanted
 from rr_actors.managers.keeper.desired import Desired, Replica, Request, changes, parse_desired
-from rr_actors.managers.kept_record import KeptRecord
+from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
