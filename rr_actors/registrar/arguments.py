@@ -28,7 +28,7 @@ from rr_actors.base.errors import (
 )
 from rr_actors.base.names import ServerId, check_name, parse_server
 from rr_actors.base.values.canonical import Codec
-from rr_actors.registrar.declarations import Declared, id_in
+from rr_actors.registrar.declarations import Declared, declaring
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import Current, current_or_none
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
@@ -51,7 +51,7 @@ def server_target(server: object, node: Node) -> ServerId:
         UnknownRegistrar, UsageError: none or several of the system's children have the declaring class.
     """
     if is_a(server, Declared):
-        return parse_server(id_in(cast("Declared[Any, Any, Any]", server), node.directory))
+        return parse_server(declaring(cast("Declared[Any, Any, Any]", server)).id_in(node.directory))
     try:
         return parse_server(server)
     except InvalidName as error:

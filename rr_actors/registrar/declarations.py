@@ -6,7 +6,7 @@ import copy
 import functools
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from types import FunctionType
-from typing import Any, Generic, Literal, Protocol, TypeVar, cast, overload
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar, cast, overload
 
 from msgspec.structs import replace
 
@@ -232,32 +232,48 @@ class Declared(Generic[Request, Returned, Response]):
             load = self._cost.paid_before(load, manager)
         return checked_whole(checked_spec(replace(self._spec, load=load, **roles)))
 
-    def _id_in(self, directory: Directory) -> str:
-        """Return "registrar/server". The registrar is that of the one child of the system that has the declaring class.
+    def _declaring(self) -> Declaring:
+        """Return which class declares the server.
+
+        Raises:
+            UsageError: the declaration is no attribute of a class.
+        """
+        if self._owner is None:
+            raise UsageError(f"server {self.name!r}: expected an attribute of a Manager class, got a function")
+        return Declaring(class_name(self._owner), self._load.__name__, self.name)
+
+
+class Declaring(NamedTuple):
+    """A class of managers, as the directory of names has it, one of its methods, and the server that this declares."""
+
+    owner: str
+    method: str
+    server: str
+
+    def id_in(self, directory: Directory) -> str:
+        """Return "registrar/server". The registrar is that of the one child of the system that has the class.
 
         Raises:
             UnknownRegistrar: no child has that class.
             UsageError: several children have it.
         """
-        owner = self._owner
-        if owner is None:
-            raise UsageError(f"server {self.name!r}: expected an attribute of a Manager class, got a function")
-        found = [name for name, classes in directory.manager_classes().items() if class_name(owner) in classes]
+        found = [name for name, classes in directory.manager_classes().items() if self.owner in classes]
         alive = [name for name in found if _is_alive(directory, name)]
         if len(alive) == 1:
-            return f"{alive[0]}/{self.name}"
-        what = f"{owner.__name__}.{self._load.__name__}"
+            return f"{alive[0]}/{self.server}"
+        owner = self.owner.rpartition(":")[2].rpartition(".")[2]
         if not alive:
             there = ", ".join(directory.registrars()) or "none"
-            text = f"{what}: no child of this system is a {class_name(owner)}; its registrars are: {there}"
+            text = f"{owner}.{self.method}: no child of this system is a {self.owner}; its registrars are: {there}"
             raise UnknownRegistrar(text, registrar="", known=())
-        names = " or ".join(f'load("{name}/{self.name}", ...)' for name in alive)
-        raise UsageError(f"{what}: {len(alive)} children of this system are a {owner.__name__}: name one: {names}")
+        names = " or ".join(f'load("{name}/{self.server}", ...)' for name in alive)
+        text = f"{owner}.{self.method}: {len(alive)} children of this system are a {owner}: name one: {names}"
+        raise UsageError(text)
 
 
 # For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
-id_in = Declared[Any, Any, Any]._id_in  # pyright: ignore[reportPrivateUsage]
+declaring = Declared[Any, Any, Any]._declaring  # pyright: ignore[reportPrivateUsage]
 
 
 # -- what a resource costs -----------------------------------------------------------------------------------------

@@ -150,7 +150,7 @@ class Query(Generic[Response]):
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
-        self._waiters: list[Flag | Wake] | None = None
+        self._waiters: list[Flag | Wake | _Over] | None = None
         self._statuses: _Statuses | None = None  # made for the first: most queries hear of none
 
     @property
@@ -258,8 +258,7 @@ class Query(Generic[Response]):
                 if (found := self._take(wanted)) is not None:
                     return found
                 if self._is_released or self._is_copy():
-                    text = f"no status of query {self.id} will come: it is released, or another process holds it"
-                    raise UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
+                    raise self._silence()
                 left_s = None if deadline is None else deadline - time.monotonic()
                 if not flag.wait(left_s) and left_s is not None and left_s <= 0:
                     what = "status" if wanted is None else f"status {wanted}"
@@ -303,11 +302,11 @@ class Query(Generic[Response]):
     def _named_streams(self) -> list[Stream]:
         return streams_in(shown_plain(self._response_bytes()))
 
-    def _watch(self, waiter: Flag | Wake) -> None:
+    def _watch(self, waiter: Flag | Wake | _Over) -> None:
         with _lock:
             self._waiters = [*(self._waiters or ()), waiter]
 
-    def _unwatch(self, waiter: Flag | Wake) -> None:
+    def _unwatch(self, waiter: Flag | Wake | _Over) -> None:
         with _lock:
             self._waiters = [other for other in self._waiters or () if other is not waiter] or None
 
@@ -317,6 +316,17 @@ class Query(Generic[Response]):
             text = f"{self.server_id}: resource {self.resource_id} is lost"
             raise ResourceLost(text, query_id=self.id, resource_id=self.resource_id)
         return self._is_released
+
+    def _silence(self) -> RrError:
+        """Return the error that says why no status will come any more."""
+        text = f"no status of query {self.id} will come: it is released, or another process holds it"
+        return UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
+
+    def _when_over(self, call: Callable[[], object]) -> None:
+        """Call `call` once, from any thread, when the query is not held any more; at once if it is not."""
+        over = _Over(self, call)
+        self._watch(over)
+        over.set()
 
     def _take(self, wanted: State | None) -> Status | None:
         statuses = self._statuses or _Statuses()
@@ -494,7 +504,22 @@ held_by = Query._held_by  # pyright: ignore[reportPrivateUsage]
 response_bytes = Query._response_bytes  # pyright: ignore[reportPrivateUsage]
 read_as = Query._read_as  # pyright: ignore[reportPrivateUsage]
 begin_unload = Query._begin_unload  # pyright: ignore[reportPrivateUsage]
+when_over = Query._when_over  # pyright: ignore[reportPrivateUsage]
 unload_if_held_async = Query._unload_if_held_async  # pyright: ignore[reportPrivateUsage]
+
+
+class _Over:
+    """A waiter of a query that hears nothing but the end of it."""
+
+    def __init__(self, query: Query, call: Callable[[], object]) -> None:
+        self._query = query
+        self._calls = [call]
+
+    def set(self) -> None:
+        """Look whether the query is over, as something has happened to it."""
+        if self._query._is_gone():  # pyright: ignore[reportPrivateUsage]  # same file
+            with contextlib.suppress(IndexError):  # another thread was faster
+                self._calls.pop()()
 
 
 def _no_types(server_id: str) -> tuple[Codec, Codec]:

@@ -35,7 +35,8 @@ from rr_actors.base.errors import (
 )
 from rr_actors.base.values.canonical import encode
 from rr_actors.system.console import connected_client, console_client, console_server, console_view
-from rr_actors.system.console.console_client import Connections, ConsoleClient, NotRunning
+from rr_actors.system.console.client_queries import ClientViews, SystemConnections
+from rr_actors.system.console.console_client import ConsoleClient, NotRunning
 from rr_actors.system.console.console_commands import Hold
 from rr_actors.system.console.console_questions import Find
 from rr_actors.wire.unix_sockets import SocketPeer
@@ -54,7 +55,7 @@ def camera(provider: rr.Registrar) -> Served:
     return serve(provider, "camera")
 
 
-class NotedConnections(Connections):
+class NotedConnections(SystemConnections):
     """`opened`: all that were opened."""
 
     def __init__(self, *args: Any) -> None:
@@ -75,7 +76,7 @@ def connections(monkeypatch: pytest.MonkeyPatch) -> list[NotedConnections]:
         made.append(NotedConnections(*args))
         return made[-1]
 
-    monkeypatch.setattr(connected_client, "Connections", noted)
+    monkeypatch.setattr(connected_client, "SystemConnections", noted)
     return made
 
 
@@ -274,7 +275,7 @@ def test_a_client_hears_all_statuses_that_come_before_the_answer_to_its_load(
 ) -> None:
     sent = [str(number) for number in range(200)]
     heard = Calls()
-    views = vars(connected_client)["_ClientViews"]
+    views = ClientViews
     add = views.add
 
     def add_late(self: Any, query: Any, options: Any) -> None:

@@ -38,7 +38,7 @@ class Status:
         query_id: the receiver's query on that resource; "" if the resource is the receiver's own.
         source: the server where the status began, "registrar/server".
         repeated: whether the status may have been heard before; a crash made that uncertain.
-        reason: "revoked" if the resource's owner takes it away; "" else.
+        reason: "revoked" if the resource's owner takes it away; "ended" if a client's system has ended; "" else.
         deadline_s: of a revoked resource, how many seconds after the status was sent it is unloaded by force: 0.0, if
             that is done. None for any other status.
     """

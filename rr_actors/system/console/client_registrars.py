@@ -16,10 +16,12 @@ from collections.abc import Callable
 
 from rr_actors.base.errors import RrError, UnknownQuery, UnknownRegistrar, shown
 from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
+from rr_actors.registrar.queries import Query, when_over
 from rr_actors.registrar.registrar import Registrar, news
-from rr_actors.system.console.console_messages import RESPONSE_LIMIT_BYTES, Heard
+from rr_actors.system.console.console_messages import RESPONSE_LIMIT_BYTES, Dropped, Heard
 
 logger = Log("rr_actors")
 
@@ -35,7 +37,7 @@ class ClientsRegistrar:
         self.owner = owner
         self.registrar = registrar
         self._lock = threading.Lock()
-        self._unheard: deque[tuple[Heard, Callable[[], object]]] = deque()  # at most one of each query
+        self._unheard: deque[tuple[Heard | Dropped, Callable[[], object]]] = deque()  # one status of each query
         self._ended = False
         self._arrived: Callable[[], None] | None = None
 
@@ -45,16 +47,34 @@ class ClientsRegistrar:
         if status.state is not State.UPDATE or (response is not None and len(response) > RESPONSE_LIMIT_BYTES):
             response = None
         about = status.query_id, status.resource_id, str(status.state), status.message[:_SHORT], status.source
+        why = status.repeated, status.reason, status.deadline_s
         taken = asyncio.Event()
         take = functools.partial(asyncio.get_running_loop().call_soon_threadsafe, taken.set)
+        if self._add(Heard(*about, *why, response, released), take):
+            await taken.wait()
+
+    def watch(self, query: Query, node: Node) -> None:
+        """Have the client hear when its query is released, also if it is not the client that releases it.
+
+        If its provider takes the query away, its last status says so. If the system stops, the end of the connection
+        does.
+        """
+
+        def over() -> None:
+            if not (query.released or node.stopping):
+                self._add(Dropped(query.id), lambda: None)
+
+        when_over(query, over)
+
+    def _add(self, news: Heard | Dropped, take: Callable[[], object]) -> bool:
         with self._lock:
             if self._ended:
-                return
-            self._unheard.append((Heard(*about, status.repeated, response, released), take))
+                return False
+            self._unheard.append((news, take))
             arrived, self._arrived = self._arrived, None
         if arrived is not None:
             arrived()
-        await taken.wait()
+        return True
 
     def has_unheard(self, arrived: Callable[[], None]) -> bool:
         """Return whether statuses wait for the client; if none does, have `arrived` called once when one arrives."""
@@ -62,15 +82,15 @@ class ClientsRegistrar:
             self._arrived = None if self._unheard else arrived
             return bool(self._unheard)
 
-    def take(self) -> list[Heard]:
+    def take(self) -> list[Heard | Dropped]:
         """Return statuses that wait, as many as one answer has room for."""
-        taken: list[Heard] = []
+        taken: list[Heard | Dropped] = []
         left = _BATCH_BYTES
         with self._lock:
             while self._unheard and left > 0:
                 heard, take = self._unheard.popleft()
                 taken.append(heard)
-                left -= len(heard.message) + len(heard.response or b"")
+                left -= len(heard.message) + len(heard.response or b"") if isinstance(heard, Heard) else 0
                 with contextlib.suppress(RuntimeError):  # the user loop has ended: the process is stopping
                     take()
         return taken

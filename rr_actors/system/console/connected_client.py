@@ -7,55 +7,46 @@ the client.
 
 from __future__ import annotations
 
-import asyncio
-import inspect
 import os
 import threading
+import time
 import weakref
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, wait
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownQuery, UsageError
+from rr_actors.base.errors import NotRunning, NotSerializable, RrError, Unavailable, UnknownQuery, UsageError, is_a
 from rr_actors.base.names import ServerId, parse_server_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.arguments import LoadOptions, Parent, checked_callback, checked_priority, state_path, target_id
-from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.declarations import Declared, declaring
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries, note_request
 from rr_actors.registrar.pages import QueryRow
-from rr_actors.registrar.queries import (
-    Holder,
-    Query,
-    Response,
-    StatusCallback,
-    end,
-    hear,
-    loaded_directly,
-    read_as,
-    was_given,
-)
+from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, read_as, was_given
 from rr_actors.registrar.registrar import Consumer
 from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, RemoteLoads, RemoteUnloads
-from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.time_limits import time_limit
-from rr_actors.system.console.console_client import Connections, ConsoleClient, find_console
+from rr_actors.system.console.client_queries import ClientQuery, ClientViews, SystemConnections, listen
+from rr_actors.system.console.console_client import find_console
 from rr_actors.system.console.console_commands import AskActor, GivePriority, Hold, OpenRegistrar, Release
-from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES, Heard
-from rr_actors.system.console.console_questions import Find
+from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
+from rr_actors.system.console.console_questions import Find, FindServer
 
 T = TypeVar("T")
 
 logger = Log("rr_actors")
 
-_ANSWER_S = 60.0  # for a request that has no time limit of its own
 _GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
+_RETRY_S = 0.05  # between two looks for a system that is awaited
 
 
 class Client:
     """A client of a running system. connect() makes it; as a context manager it is closed at the end. From any thread.
+
+    When the system ends, each query of its registrars hears FATAL with the reason "ended", and calls raise NotRunning.
 
     Attributes:
         system: the system's name.
@@ -64,12 +55,24 @@ class Client:
     """
 
     def __init__(self, run_dir: Path) -> None:
-        self._connections = Connections(lambda: run_dir, _ANSWER_S)
+        self._connections = SystemConnections(run_dir)
         with self._connections.lent() as client:
             welcome = client.welcome
         self.system = welcome.system
         self.state_dir = Path(welcome.state_dir)
         self.pid = welcome.pid
+
+    @property
+    def ended(self) -> NotRunning | None:
+        """The error that says that the system has ended; None while it runs, or if this client was closed first."""
+        if self._connections.ended is None:
+            try:
+                self._connections.open().close()
+            except NotRunning:
+                pass  # it is noted, unless this client is closed
+            except Unavailable:
+                return None  # it runs, and is busy
+        return self._connections.ended
 
     def open_registrar(self, name: str | None = None) -> ClientRegistrar:
         """Open a registrar for this client. When the client ends, it is closed, and its queries are released.
@@ -129,7 +132,7 @@ NOT_FOR_CLIENTS = {
 class _ClientCalls(RemoteCalls):
     """The calls of a client's registrar: requests to the system's console, of plain data, never pickles."""
 
-    def __init__(self, connections: Connections, name: str, views: _ClientViews) -> None:
+    def __init__(self, connections: SystemConnections, name: str, views: ClientViews) -> None:
         super().__init__(name)
         self.connections = connections
         self.views = views
@@ -180,7 +183,8 @@ class _ClientLoads(RemoteLoads):
         command = Hold(client.name, str(target), bytes(request), limit_s, options.priority)
         query: ClientQuery | None = None
         try:
-            with client.connections.lent() as connection:  # if this ends before keep(), the system releases the query
+            # If the connection ends before keep(), the system releases the query.
+            with client.views.loading(), client.connections.lent() as connection:
                 held = connection.ask(command, limit_s + _GRACE_S)
                 query = ClientQuery(held.query_id, target, request, "", client.name, self.holder, _shown_types)
                 if options.codec is not None:
@@ -229,104 +233,6 @@ def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
     threading.Thread(target=make, name="rr-client", daemon=True).start()
 
 
-_EARLY = 1000
-
-
-class _ClientViews:
-    """The queries that a client's registrar holds, and the status callbacks. One thread passes the statuses on.
-
-    Args:
-        is_open: returns whether the registrar is open. When it is not, no callback begins any more.
-    """
-
-    def __init__(self, is_open: Callable[[], bool]) -> None:
-        self._is_open = is_open
-        self._lock = threading.Lock()
-        self._held: dict[str, tuple[ClientQuery, StatusCallback | None]] = {}
-        self._on_server: dict[str, list[StatusCallback]] = {}
-        self._early: dict[str, list[Heard]] = {}  # of loads whose answers have not been read yet
-
-    def add(self, query: ClientQuery, options: LoadOptions) -> None:
-        """Have statuses reach a query and its callback."""
-        own = None if options.on_status is None else described(options.on_status, "load: on_status")
-        if own is not None and options.loop is not None:
-            own = options.loop.bring(self._while_held(query.id, own))
-        with self._lock:
-            self._held[query.id] = query, own
-            early = self._early.pop(query.id, [])
-        for heard in early:
-            self.hear(heard)
-
-    def add_callback(self, server: str, callback: StatusCallback) -> None:
-        """Have the callback called for the queries at a server."""
-        with self._lock:
-            self._on_server.setdefault(server, []).append(callback)
-
-    def forget(self, query_id: str, server: str) -> None:
-        """Forget a query that is released; or all at a server; or all."""
-        with self._lock:
-            held = [query for query, _ in self._held.values()]
-            gone = [one for one in held if query_id in ("", one.id) and server in ("", one.server_id)]
-            for query in gone:
-                del self._held[query.id]
-        for query in gone:
-            end(query)
-
-    def hear(self, heard: Heard) -> None:
-        """Pass a status on to its query, and to the callbacks."""
-        with self._lock:
-            held = self._held.get(heard.query_id)
-            if held is None:
-                self._early.setdefault(heard.query_id, []).append(heard)
-                if len(self._early) > _EARLY:  # the oldest is of a query that was released meanwhile
-                    del self._early[next(iter(self._early))]
-                return
-            query, own = held
-            callbacks = [*([own] if own is not None else []), *self._on_server.get(query.server_id, ())]
-        place = {"resource_id": heard.resource_id, "query_id": heard.query_id, "source": heard.source}
-        status = Status(heard.state, heard.message, **place, repeated=heard.repeated)
-        hear(query, status, heard.response, released=heard.released)
-        for callback in callbacks:
-            if not self._hears(query.id):
-                return
-            try:
-                if inspect.isawaitable(answer := callback(status)):
-                    asyncio.run(_await(answer))
-            except Exception as error:
-                log_raised(logger, error, "a status callback for %s raised", query.server_id)
-
-    def _hears(self, query_id: str) -> bool:
-        return query_id in self._held and self._is_open()
-
-    def _while_held(self, query_id: str, callback: StatusCallback) -> Callable[[Status], Coroutine[Any, Any, None]]:
-        async def begin(status: Status) -> None:
-            if self._hears(query_id):
-                await callback(status)
-
-        return begin
-
-
-def _listen(lifeline: ConsoleClient, name: str, views_of: Callable[[], _ClientViews | None]) -> None:
-    """Pass on the statuses of a registrar, until it is closed or nobody has it any more. In a thread of its own."""
-    try:
-        while True:
-            statuses = lifeline.wait_statuses(name)
-            views = views_of()
-            if views is None:
-                return
-            for heard in statuses:
-                views.hear(heard)
-            del views  # while it waits, the registrar may be collected
-    except RrError as error:  # NotRunning: the registrar is closed, or the system has ended
-        logger.debug("registrar %s hears no more statuses: %s", name, error)
-    if (views := views_of()) is not None:
-        views.forget("", "")
-
-
-async def _await(answer: Awaitable[object]) -> None:
-    await answer
-
-
 class ClientRegistrar(Consumer):
     """A client's registrar: it loads, holds and releases, as Registrar does. A context manager closes it at the end.
 
@@ -338,22 +244,24 @@ class ClientRegistrar(Consumer):
         name: the registrar's name in the system, "client.NAME".
     """
 
-    def __init__(self, connections: Connections, name: str) -> None:
+    def __init__(self, connections: SystemConnections, name: str) -> None:
         self._connections = connections
         self._lifeline = connections.open()
+        self._closed = threading.Event()
         try:
             done = self._lifeline.ask(OpenRegistrar(name))
         except BaseException:
             self._lifeline.close()
             raise
         self._name: str = done.facts["registrar"]
-        self._views = _ClientViews(self._lifeline.is_open)
+        closed = self._closed
+        self._views = ClientViews(lambda: not (closed.is_set() or connections.is_closed))
         calls = _ClientCalls(connections, self._name, self._views)
         self._client_loads = _ClientLoads(calls, self)
         self._unload_ways = RemoteUnloads(calls)
         weakref.finalize(self, self._lifeline.close)  # else the thread would keep it open for ever
-        listens = self._lifeline, self._name, weakref.ref(self._views)
-        threading.Thread(target=_listen, args=listens, name="rr-statuses", daemon=True).start()
+        listens = self._lifeline, self._name, connections, weakref.ref(self._views)
+        threading.Thread(target=listen, args=listens, name="rr-statuses", daemon=True).start()
 
     @property
     def _load_ways(self) -> _ClientLoads:
@@ -365,7 +273,10 @@ class ClientRegistrar(Consumer):
         return self._name
 
     def _target(self, server: object) -> ServerId:
-        return parse_server_id(server)
+        if not is_a(server, Declared):
+            return parse_server_id(server)
+        place = declaring(cast("Declared[Any, Any, Any]", server))
+        return parse_server_id(self._connections.ask(FindServer(*place)).id)
 
     def _holder(self, parent: Parent | None) -> tuple[Consumer, str]:
         _refuse(self._name, "parent", parent is not None)
@@ -442,6 +353,7 @@ class ClientRegistrar(Consumer):
 
     def close(self) -> None:
         """Close the registrar, whose queries are released a moment later. A second close does nothing."""
+        self._closed.set()
         self._lifeline.close()
 
     def __enter__(self) -> Self:
@@ -452,23 +364,6 @@ class ClientRegistrar(Consumer):
 
     def __repr__(self) -> str:
         return f"<ClientRegistrar {self.name}>"
-
-
-class ClientQuery(Query[Response]):
-    """A client's hold on one resource: a Query. As a context manager it is released at the end.
-
-    Statuses reach it a moment later than a query of the application. A class in a response of which no type is known
-    is read as a dict.
-    """
-
-    __slots__ = ()
-
-    def _may_be_gone(self) -> bool:
-        """Return True: that the provider has taken the resource away may be known in the system first."""
-        return True
-
-    def __repr__(self) -> str:
-        return f"<ClientQuery {self.id} of {self.origin} on {self.server_id}>"
 
 
 class _ShownPlain(Codec):
@@ -487,20 +382,29 @@ def _shown_types(_server_id: str) -> tuple[Codec, Codec]:
     return _plain, _plain
 
 
-def connect(state_dir: str | os.PathLike[str] | None = None) -> Client:
+def connect(state_dir: str | os.PathLike[str] | None = None, *, wait_s: float | None = 0.0) -> Client:
     """Return a client of a running system of this user, in this process or another.
 
     Args:
         state_dir: the system's state directory; None: the one that RR_STATE names, or else of the one running system.
+        wait_s: how many seconds to wait for a system that does not run yet, or is being started again; None: no limit.
 
     Raises:
-        NotRunning: no system runs, or it has no console.
+        NotRunning: no system runs, or it has no console, also not within `wait_s`.
         UsageError: several systems run; the error names them.
         Unavailable: the system is another user's, or of another version.
         ConfigError: state_dir is no path, or cannot be read.
     """
     place = state_dir if state_dir is not None else os.environ.get("RR_STATE")
-    return Client(find_console(None if place is None else state_path(place)))
+    limit_s = time_limit(wait_s)
+    deadline = None if limit_s is None else time.monotonic() + limit_s
+    while True:
+        try:
+            return Client(find_console(None if place is None else state_path(place)))
+        except NotRunning:
+            if deadline is not None and time.monotonic() >= deadline:
+                raise
+        time.sleep(_RETRY_S)
 
 
 def _limit(timeout_s: float | None) -> float:

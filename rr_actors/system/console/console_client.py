@@ -98,7 +98,7 @@ class ConsoleClient:
         self.is_broken = isinstance(answer, c.Holding | c.Refused)
         return _checked(answer, expected)
 
-    def wait_statuses(self, registrar: str) -> list[c.Heard]:
+    def wait_statuses(self, registrar: str) -> list[c.Heard | c.Dropped]:
         """Wait without limit for statuses of the queries of the registrar that this connection has opened."""
         self._send(AwaitStatuses(registrar))
         return _checked(self._receive(None), c.Statuses).statuses
@@ -306,6 +306,11 @@ class Connections:
         self._idle: list[ConsoleClient] = []
         self._all: weakref.WeakSet[ConsoleClient] = weakref.WeakSet()
         _here.add(self)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether this side has closed the connections."""
+        return bool(self._closed)
 
     def open(self) -> ConsoleClient:
         """Return a new connection. The caller closes it; close() does, too.

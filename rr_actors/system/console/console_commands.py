@@ -397,6 +397,7 @@ class Hold(Command[c.Holding], frozen=True):
             registrar.unload(query.id, timeout_s=self.timeout_s)
             text = f"a response of {len(response)} bytes is over a client's limit of {c.RESPONSE_LIMIT_BYTES}"
             raise NotSerializable(f"{self.server}: {text}; give the name of a file, say", path="response")
+        client.watch(query, view.node)
         return c.Holding(query.id, query.resource_id, response, query.state)
 
 

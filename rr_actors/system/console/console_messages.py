@@ -23,7 +23,7 @@ from rr_actors.registrar.pages import LoadRow, QueryRow, ResourceRow, ServerRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.recording.figures import Figure
 
-VERSION = 4
+VERSION = 5
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request. The longest part of any is a resource's request as JSON."""
@@ -280,6 +280,12 @@ class Figures(Message, frozen=True):
     figures: list[Figure]
 
 
+class ServerFound(Message, frozen=True):
+    """The answer to FindServer: the id of the server, "registrar/server"."""
+
+    id: str
+
+
 class Done(Message, frozen=True):
     """The answer to a command that was carried out: a sentence that says what was done, and the same as plain data."""
 
@@ -296,8 +302,10 @@ class Holding(Message, frozen=True):
     state: State = State.OK
 
 
-class Heard(msgspec.Struct, frozen=True, omit_defaults=True):
+class Heard(msgspec.Struct, frozen=True, omit_defaults=True, tag=True):
     """A status of a query, as its on_status callback gets it, and what else is new of the query.
+
+    Its fields up to `deadline_s` are those of Status, by the same names.
 
     Attributes:
         response: the canonical bytes of the newest response, if the status is an UPDATE.
@@ -310,14 +318,22 @@ class Heard(msgspec.Struct, frozen=True, omit_defaults=True):
     message: str = ""
     source: str = ""
     repeated: bool = False
+    reason: str = ""
+    deadline_s: float | None = None
     response: bytes | None = None
     released: bool = False
 
 
-class Statuses(Message, frozen=True):
-    """The answer to AwaitStatuses: the statuses that have arrived since the last one, oldest first."""
+class Dropped(msgspec.Struct, frozen=True, tag=True):
+    """A query is not held any more: its registrar has released it, by whatever call. No status comes for it."""
 
-    statuses: list[Heard]
+    query_id: str
+
+
+class Statuses(Message, frozen=True):
+    """The answer to AwaitStatuses: what has happened to the queries since the last one, oldest first."""
+
+    statuses: list[Heard | Dropped]
 
 
 class Replied(Message, frozen=True):

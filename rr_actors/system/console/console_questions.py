@@ -7,6 +7,7 @@ from typing import TypeVar
 import msgspec
 
 from rr_actors.base.errors import NotSerializable
+from rr_actors.registrar.declarations import Declaring
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_view import Caller, Verb, View, room_for
 from rr_actors.system.snapshots import ask_each
@@ -117,6 +118,17 @@ class Find(Verb[c.Found], frozen=True):
 
     def _carry_out(self, view: View, caller: Caller) -> c.Found:
         return view.find(self.id, self.registrar)
+
+
+class FindServer(Verb[c.ServerFound], frozen=True):
+    """The server that a method of a Manager class declares, at the one child of the system that has the class."""
+
+    owner: c.Text
+    method: c.Text
+    server: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.ServerFound:
+        return c.ServerFound(Declaring(self.owner, self.method, self.server).id_in(view.node.directory))
 
 
 class ReadResponse(Verb[c.Response], frozen=True):

@@ -1,0 +1,259 @@
+"""A client hears at once that a query of it is released, revoked, or gone with its system."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.base.errors import UnknownQuery, UnknownRegistrar
+from rr_actors.registrar.engine.status import Status
+from rr_actors.system.console.client_queries import status_heard
+from rr_actors.system.console.console_messages import Heard
+from support import LIMIT_S, Calls, eventually
+
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
+
+class Cameras(rr.Manager):
+    @rr.server("camera")
+    def open_camera(self, name: str) -> str:
+        self.stream = rr.current().open_stream("images")
+        return name
+
+
+class Unused(rr.Manager):
+    @rr.server("thing")
+    def make(self, name: str) -> str:
+        return name
+
+
+@pytest.fixture
+def system(state_dir: Path) -> Iterator[rr.System]:
+    with rr.System([rr.ChildSpec(Cameras, id="cameras", placement="thread")], state_dir=state_dir) as system:
+        yield system
+
+
+@pytest.fixture
+def client(system: rr.System, state_dir: Path) -> Iterator[rr.Client]:
+    with rr.connect(state_dir) as client:
+        yield client
+
+
+class InThread:
+    """A call in a thread of its own: its result or its error."""
+
+    def __init__(self, call: Callable[[], Any]) -> None:
+        self.result: Any = None
+        self.error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, args=(call,), daemon=True)
+        self._thread.start()
+
+    def _run(self, call: Callable[[], Any]) -> None:
+        try:
+            self.result = call()
+        except BaseException as error:
+            self.error = error
+
+    def ended(self) -> InThread:
+        self._thread.join(LIMIT_S)
+        assert not self._thread.is_alive(), "the call still waits"
+        return self
+
+
+def frames(query: rr.Query[Any]) -> list[Any]:
+    return list(query.stream("images"))
+
+
+async def frames_async(query: rr.Query[Any]) -> list[Any]:
+    return [frame async for frame in query.stream("images")]
+
+
+def release_from_outside(system: rr.System, query: rr.Query[Any]) -> None:
+    system.registrar(query.origin).unload(query.id)
+
+
+@pytest.mark.parametrize("read", [frames, lambda query: asyncio.run(frames_async(query))], ids=["for", "async for"])
+def test_a_stream_ends_when_the_query_is_released_from_outside(
+    system: rr.System, client: rr.Client, read: Callable[[rr.Query[Any]], Any]
+) -> None:
+    query = client.open_registrar("w").load("cameras/camera", "front")
+    reading = InThread(lambda: read(query))
+
+    release_from_outside(system, query)
+
+    assert reading.ended().error is None
+
+
+def test_a_wait_for_a_status_ends_when_the_query_is_released_from_outside(system: rr.System, client: rr.Client) -> None:
+    query = client.open_registrar("w").load("cameras/camera", "front")
+    waiting = InThread(lambda: query.wait_status("FATAL", timeout_s=None))
+
+    release_from_outside(system, query)
+
+    assert isinstance(waiting.ended().error, UnknownQuery)
+
+
+def test_a_query_that_is_released_from_outside_can_be_left_like_any_other(system: rr.System, client: rr.Client) -> None:
+    with client.open_registrar("w").load("cameras/camera", "front") as query:
+        release_from_outside(system, query)
+        with pytest.raises(UnknownQuery):
+            query.wait_status(timeout_s=LIMIT_S)
+
+
+def test_all_queries_end_when_the_registrar_of_a_client_is_emptied_from_outside(
+    system: rr.System, client: rr.Client
+) -> None:
+    worker = client.open_registrar("w")
+    queries = [worker.load("cameras/camera", name) for name in "abc"]
+    waiting = [InThread(lambda one=one: one.wait_status(timeout_s=None)) for one in queries]
+
+    system.registrar(worker.name).unload_all()
+
+    assert all(isinstance(one.ended().error, UnknownQuery) for one in waiting)
+
+
+def test_a_revocation_has_its_reason_and_its_deadline(system: rr.System, client: rr.Client) -> None:
+    heard = Calls()
+    query = client.open_registrar("w").load("cameras/camera", "front", on_status=heard)
+    app: rr.Registrar = system.registrar("cameras")
+
+    revoking = InThread(lambda: app.revoke(query.resource_id, "no power", grace_s=5))
+    (status,) = eventually(lambda: list(heard))
+
+    assert (status.state, status.reason, status.deadline_s, status.message) == ("FATAL", "revoked", 5.0, "no power")
+    query.unload_if_held()
+    revoking.ended()
+
+
+def test_each_field_of_a_status_reaches_a_client() -> None:
+    of_status = {name for name in Status.__slots__ if not name.startswith("_")}
+    values = {
+        "state": "ERROR", "message": "m", "resource_id": "r", "query_id": "q", "source": "a/b",
+        "repeated": True, "reason": "revoked", "deadline_s": 2.5,
+    }  # fmt: skip
+
+    assert of_status == set(values), "a new field of Status: does Heard have it, and status_heard() set it?"
+    assert of_status | {"response", "released"} == set(Heard.__struct_fields__)
+    status = status_heard(Heard(**values))
+    assert {name: getattr(status, name) for name in of_status} == values
+
+
+# -- the end of the system ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ending(state_dir: Path) -> Iterator[rr.System]:
+    system = rr.System([rr.ChildSpec(Cameras, id="cameras", placement="thread")], state_dir=state_dir).start()
+    yield system
+    system.stop()
+
+
+def test_the_end_of_the_system_is_a_status_of_each_query(ending: rr.System, state_dir: Path) -> None:
+    heard = Calls()
+    with rr.connect(state_dir) as client:
+        worker = client.open_registrar("w")
+        query = worker.load("cameras/camera", "front", on_status=heard)
+        worker.on_status("cameras/camera", heard)
+        assert client.ended is None
+
+        ending.stop()
+
+        eventually(lambda: len(heard) == 2)
+        assert {(one.state, one.reason, one.query_id) for one in heard} == {("FATAL", "ended", query.id)}
+        assert all(str(state_dir) in one.message for one in heard)
+        assert query.state is rr.State.FATAL
+        assert isinstance(client.ended, rr.NotRunning)
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda query: query.wait_status("WARNING", timeout_s=None),
+        frames,
+        lambda query: asyncio.run(frames_async(query)),
+    ],
+    ids=["wait_status", "for", "async for"],
+)
+def test_whatever_waits_raises_that_the_system_has_ended(
+    ending: rr.System, state_dir: Path, wait: Callable[[rr.Query[Any]], Any]
+) -> None:
+    with rr.connect(state_dir) as client:
+        query = client.open_registrar("w").load("cameras/camera", "front")
+        waiting = InThread(lambda: wait(query))
+
+        ending.stop()
+
+        error = waiting.ended().error
+        assert isinstance(error, rr.NotRunning)
+        assert "has ended" in str(error)
+
+
+def test_every_call_says_in_the_same_words_that_the_system_has_ended(ending: rr.System, state_dir: Path) -> None:
+    with rr.connect(state_dir) as client:
+        worker = client.open_registrar("w")
+        query = worker.load("cameras/camera", "front")
+        ending.stop()
+        eventually(lambda: query.state is rr.State.FATAL)
+
+        texts = set()
+        for call in (
+            lambda: client.ask("cameras", 1),
+            lambda: worker.load("cameras/camera", "back"),
+            lambda: worker.queries(),
+            lambda: client.open_registrar("x"),
+            lambda: query.fetch_state(),
+        ):
+            with pytest.raises(rr.NotRunning) as caught:
+                call()
+            texts.add(str(caught.value))
+        assert len(texts) == 1
+
+
+def test_a_query_is_left_without_an_error_when_the_system_has_ended(ending: rr.System, state_dir: Path) -> None:
+    with rr.connect(state_dir) as client, client.open_registrar("w").load("cameras/camera", "front") as query:
+        ending.stop()
+        eventually(lambda: query.state is rr.State.FATAL)
+
+
+def test_a_client_that_is_closed_first_hears_of_no_end(ending: rr.System, state_dir: Path) -> None:
+    heard = Calls()
+    client = rr.connect(state_dir)
+    query = client.open_registrar("w").load("cameras/camera", "front", on_status=heard)
+    client.close()
+    with pytest.raises(UnknownQuery):
+        query.wait_status(timeout_s=LIMIT_S)
+
+    ending.stop()
+
+    assert client.ended is None
+    assert not heard
+
+
+def test_a_connection_waits_for_a_system_that_is_being_started(state_dir: Path) -> None:
+    with pytest.raises(rr.NotRunning):
+        rr.connect(state_dir, wait_s=0.1)
+    connecting = InThread(lambda: rr.connect(state_dir, wait_s=LIMIT_S))
+
+    with rr.System([], state_dir=state_dir) as system, connecting.ended().result as client:
+        assert client.pid
+        assert client.system == system.name
+
+
+# -- servers by the methods that declare them --------------------------------------------------------------------------
+
+
+def test_a_client_loads_by_the_method_that_declares_the_server(system: rr.System, client: rr.Client) -> None:
+    with client.open_registrar("w").load(Cameras.open_camera, "front") as query:
+        assert query.server_id == "cameras/camera"
+        assert query.response == "front"
+
+
+def test_a_client_hears_that_no_child_has_the_class(client: rr.Client) -> None:
+    with pytest.raises(UnknownRegistrar, match="no child of this system is a"):
+        client.open_registrar("w").load(Unused.make, "lamp")
