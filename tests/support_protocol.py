@@ -189,6 +189,8 @@ class Script:
                 self.say(name, f"returns from {ticket}: {end_text(failure)}")
             case e.Happened():
                 pass
+            case e.Acquitted():
+                self.say(name, "says that no callback has ended its last process")
             case e.Died(runs, given_up):
                 self.say(name, f"says that its last process died in {'; '.join(runs)}")
                 for text in given_up:

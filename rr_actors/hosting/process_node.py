@@ -44,7 +44,7 @@ class SystemInfo(msgspec.Struct, frozen=True):
     """The application's loggers' levels, by name, at the system's start. Children send up no record below them."""
 
 
-def _unheard(_text: str) -> None:
+def _unheard(*_said: object) -> None:
     """Do nothing: no supervisor of another process hears it."""
 
 
@@ -127,8 +127,12 @@ class ProcessNode(abc.ABC):
         self.stopping = ""  # why all registrars here are being closed
         self.owners: dict[str, object] = {}  # kept alive, by the name of a registrar that is open for the application
         self.on_event = on_event
-        self.on_death_in_callback: Callable[[str], None] = _unheard
-        """Called with the callbacks that ran when the process died that a registrar of this one had before."""
+        self.on_death_in_callback: Callable[[str, bool], None] = _unheard
+        """Called with the callbacks that ran when the process died that a registrar of this one had before, and whether
+        one of them is not run again."""
+        self.accused: set[str] = set()  # the registrars of which this is so
+        self.on_acquitted: Callable[[], None] = _unheard
+        """Called when all these callbacks have run again, and this process lives."""
         self.on_resumed: Callable[[str], None] = _unheard
         """Called with each callback that goes on with such work before its registrar serves."""
         self.stacks = Stacks()

@@ -86,8 +86,10 @@ class ProcessRun:
 
     on_end: OnEnd
     """Called if the child has become ready and then ends without stop(). Set it before start()."""
-    on_death_in_callback: Callable[[str], None]
+    on_death_in_callback: Callable[[str, bool], None]
     """Called once, before the child is ready, if its last process died in callbacks of resources. Set it, too."""
+    on_acquitted: Callable[[], None]
+    """Called when none of these has ended the present process. Set it, too."""
 
     def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
         self._loop = loop = asyncio.get_running_loop()
@@ -248,7 +250,9 @@ class ProcessRun:
             case control.DiedInCallback():
                 if not (self._up or self._died_before):
                     self._died_before = True
-                    self.on_death_in_callback(message.runs)
+                    self.on_death_in_callback(message.runs, message.is_proven)
+            case control.Acquitted():
+                self.on_acquitted()
             case control.News():
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # resource events may be many

@@ -86,9 +86,17 @@ class Failed(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 class DiedInCallback(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """The child's last process died while callbacks of resources ran: its death is theirs. `runs` names them."""
+    """The child's last process died while callbacks of resources ran. `runs` names them.
+
+    `is_proven`: processes have died in each of several runs of one of them, which is not run again.
+    """
 
     runs: str
+    is_proven: bool = False
+
+
+class Acquitted(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """All callbacks that ran when the child's last process died have run again, and the child lives."""
 
 
 class Resumed(msgspec.Struct, tag=True, array_like=True, frozen=True):
@@ -112,7 +120,7 @@ class News(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 Message = (Start | Stop | Ping | AskStacks) | (
-    ChildReady | Ignored | Failed | DiedInCallback | Resumed | Pong | FoundStacks | News | Exiting
+    ChildReady | Ignored | Failed | DiedInCallback | Acquitted | Resumed | Pong | FoundStacks | News | Exiting
 )
 
 

@@ -216,6 +216,7 @@ class Supervision:
                 run = ProcessRun(self._node, life.spec, life.path, self._died)
             run.on_end = on_end
             run.on_death_in_callback = functools.partial(self._died_in_callback, life)
+            run.on_acquitted = functools.partial(self._acquitted, life)
             return run
         return LocalRun(self._node, life.spec, life.path, self._target_of(life.spec), on_end)
 
@@ -288,15 +289,23 @@ class Supervision:
             self._retire(self.entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, exit)
 
-    def _died_in_callback(self, life: Life, runs: str) -> None:
+    def _died_in_callback(self, life: Life, runs: str, is_proven: bool) -> None:
         logger.warning(
             "supervisor %s: the last process of %s died while callbacks of its resources ran: this restart does not"
-            " count. They were: %s",
+            " count%s. They were: %s",
             self.path,
             life.path,
+            "" if is_proven else ", unless they end well now",
             runs,
         )
-        self.apply(restarts.decide_uncounted(self.tree, life.id, life.number))
+        self.apply(restarts.decide_uncounted(self.tree, life.id, life.number, is_proven=is_proven))
+
+    def _acquitted(self, life: Life) -> None:
+        text = (
+            "supervisor %s: the callbacks that ran when the last process of %s died have ended well: its restart counts"
+        )
+        logger.warning(text, self.path, life.path)
+        self.apply(restarts.decide_acquitted(self.tree, life.id, life.number, time.monotonic()))
 
     def _has_ended(self, life: Life, exit: Exit) -> None:
         decision = restarts.decide_exit(self.tree, life.id, life.number, exit, time.monotonic(), _chance())

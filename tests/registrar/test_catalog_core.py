@@ -321,8 +321,11 @@ def test_a_health_callback_in_whose_runs_three_processes_have_died_loses_its_res
     server = Server("cam", recovery=recovery)
     registrar = provider("loaded", recovery=recovery)
     for deaths in (1, 2, 3):
-        registrar.obey(c.BeginProbe("q", "cam"))
-        assert [effect.resource_id for effect in registrar.effects if isinstance(effect, e.StartProbe)] == ["q"]
+        registrar.obey(c.BeginRun("health", "q", "cam"))
+        if deaths > 1:  # it waits, as it may be innocent
+            (timer,) = registrar.effects
+            registrar.obey(timer.command)
+        assert [effect.resource_id for effect in registrar.effects if isinstance(effect, e.StartRun)] == ["q"]
         registrar = registrar.again(server)
         assert registrar.catalog.callback_runs["health:q"].deaths == deaths
 
@@ -332,12 +335,36 @@ def test_a_health_callback_in_whose_runs_three_processes_have_died_loses_its_res
 def test_a_health_callback_that_has_returned_is_not_blamed_for_the_death_of_its_process() -> None:
     registrar = provider("loaded")
     for _ in range(5):
-        registrar.obey(c.BeginProbe("q", "cam"))
-        registrar.obey(c.ProbeDone("q"))
+        registrar.obey(c.BeginRun("health", "q", "cam"))
+        registrar.obey(c.RunEnded("health", "q"))
         registrar = registrar.again(Server("cam"))
 
     assert registrar.catalog.callback_runs == {}
     assert registrar.catalog.resources["q"].state is State.OK
+
+
+def test_a_health_callback_is_innocent_if_the_process_dies_without_it() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.BeginRun("health", "q", "cam"))
+    registrar = registrar.again(Server("cam"))
+    assert registrar.catalog.callback_runs["health:q"].deaths == 1
+    (timer,) = registrar.obey(c.BeginRun("health", "q", "cam"))
+    assert isinstance(timer, e.SetTimer)
+    registrar = registrar.again(Server("cam"))  # it dies while the callback waits
+    assert registrar.catalog.callback_runs == {}
+
+
+def test_a_death_counts_when_all_callbacks_that_ran_have_ended_in_the_next_process() -> None:
+    registrar = provider("loaded")
+    registrar.decide(Load("r", "cam", b"rear", "app", "", 0, 2))
+    registrar.obey(c.BeginRun("usage", "q", "cam"))
+    registrar = registrar.again(Server("cam"))
+    assert e.Acquitted() not in registrar.obey(c.LoadDone("r", 2, b"feed"))
+    registrar.obey(c.BeginRun("usage", "q", "cam"))
+    assert e.Acquitted() in registrar.obey(c.RunEnded("usage", "q"))
+
+
+BOTH_PROBED = [(c.BeginRun("health", id, "cam", waited=True), None) for id in "qr"]
 
 
 def test_after_two_deaths_health_callbacks_run_one_after_another_until_the_one_that_kills_is_found() -> None:
@@ -345,15 +372,15 @@ def test_after_two_deaths_health_callbacks_run_one_after_another_until_the_one_t
     registrar.decide(Load("r", "cam", b"rear", "app", "", 0, 2))
     registrar.obey(c.LoadDone("r", 1, b"feed"))
     for _ in range(2):
-        registrar.together((c.BeginProbe("q", "cam"), None), (c.BeginProbe("r", "cam"), None))
-        assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartProbe)] == ["q", "r"]
+        registrar.together(*BOTH_PROBED)
+        assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartRun)] == ["q", "r"]
         registrar = registrar.again(Server("cam"))
 
-    registrar.together((c.BeginProbe("q", "cam"), None), (c.BeginProbe("r", "cam"), None))
-    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartProbe)] == ["q"]
-    registrar.obey(c.ProbeDone("q"))
+    registrar.together(*BOTH_PROBED)
+    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartRun)] == ["q"]
+    registrar.obey(c.RunEnded("health", "q"))
     registrar.obey(c.BeginTrial("health:r"))
-    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartProbe)] == ["r"]
+    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartRun)] == ["r"]
     registrar = registrar.again(Server("cam"))
 
     states = {id: resource.state for id, resource in registrar.catalog.resources.items()}

@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -70,6 +72,15 @@ class Deadly(rr.Manager):
     @load_probed.health
     def probe(self, request: str, response: str) -> None:
         self.meets("health", request)
+
+    @rr.server("used", recovery="keep")
+    def load_used(self, request: str) -> str:
+        return request
+
+    @load_used.usage
+    def use_used(self, request: str, response: str) -> dict[str, float]:
+        self.meets("usage", request)
+        return {"watts": 1.0}
 
     @rr.server("other")
     def load_other(self, request: str) -> str:
@@ -143,6 +154,64 @@ def test_a_status_callback_that_ends_its_process_three_times_is_passed_over(
     assert [status.message for status in hears.wait(2)] == ["first", "second"]
     assert len(workshop.lines("status status")) == 3
     assert system.ended is None
+
+
+@pytest.mark.parametrize("how", ENDS)
+def test_a_usage_callback_that_ends_its_process_three_times_is_named_and_not_run_again(
+    start: Start, workshop: Workshop, how: str
+) -> None:
+    system = start(deadly(workshop, how))
+    app = system.open_registrar("app")
+    hears = Calls()
+    kept = app.load("shop/used", "kept")
+    lost = app.load("shop/used", "usage", on_status=hears)
+    probed = app.load("shop/probed", "well", on_status=hears)
+    workshop.note("armed")
+    for asked in (1, 2, 3):
+        with pytest.raises(rr.RegistrarDown):
+            system.registrar("shop").usage()
+        assert len(workshop.lines("usage usage")) == asked
+    usages = system.registrar("shop").usage()
+    assert usages == {kept.resource_id: {"watts": 1.0}}
+    assert list(usages.failures) == [lost.resource_id]
+    assert "the process died in each of 3 runs of the usage callback" in usages.failures[lost.resource_id]
+    assert len(workshop.lines("usage usage")) == 3
+    assert probed.state is rr.State.OK
+    assert hears.items == []
+    assert system.ended is None
+
+
+class Crashing(rr.Manager):
+    """Its process dies by itself, whatever its callbacks do."""
+
+    def on_start(self) -> None:
+        timer = threading.Timer(float(os.environ["CRASH_AFTER_S"]), os.kill, (os.getpid(), signal.SIGKILL))
+        timer.daemon = True
+        timer.start()
+
+    @rr.server("probed", recovery="keep", health=rr.Health(every_s=0.2, timeout_s=2.0))
+    def load_probed(self, request: str) -> str:
+        return request
+
+    @load_probed.health
+    def probe(self, request: str, response: str) -> None:
+        threading.Event().wait(0.15)
+
+
+@pytest.mark.parametrize("after_s", [0.5, 0.8])
+def test_a_crash_that_has_nothing_to_do_with_the_callbacks_that_run_counts(
+    start: Start, monkeypatch: pytest.MonkeyPatch, after_s: float
+) -> None:
+    monkeypatch.setenv("CRASH_AFTER_S", str(after_s))
+    system = start(rr.ChildSpec(Crashing, id="shop"))
+    app = system.open_registrar("app")
+    hears = Calls()
+    for number in range(5):
+        with contextlib.suppress(rr.RegistrarDown, rr.SupervisionError):
+            app.load("shop/probed", str(number), on_status=hears)
+    eventually(lambda: system.ended is not None, timeout=30)
+    assert "4 restarts needed within 5 s" in str(system.ended)
+    assert not [status for status in hears if "health" in status.message]
 
 
 @pytest.mark.parametrize("how", ENDS)

@@ -164,12 +164,16 @@ def _happened(shell: SimShell, effect: e.Happened) -> None:
     shell.world.note(f"{shell.name}: {effect.what} {effect.resource.id} {effect.detail}")
 
 
-def _start_probe(shell: SimShell, effect: e.StartProbe) -> None:
-    shell.world.note(f"{shell.name}: probes {effect.resource_id}")
+def _start_run(shell: SimShell, effect: e.StartRun) -> None:
+    shell.world.note(f"{shell.name}: runs the {effect.role} callback of {effect.resource_id}")
 
 
 def _died(shell: SimShell, effect: e.Died) -> None:
     shell.world.note(f"{shell.name}: its last process died in {'; '.join(effect.runs)}")
+
+
+def _acquitted(shell: SimShell, _effect: e.Acquitted) -> None:
+    shell.world.note(f"{shell.name}: its last process has not died in a callback")
 
 
 ACT: dict[type, Callable[[SimShell, Any], None]] = {
@@ -179,7 +183,7 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.StartLoad: _start_load,
     e.StartUnload: _start_unload,
     e.StartRecover: _start_recover,
-    e.StartProbe: _start_probe,
+    e.StartRun: _start_run,
     e.StartPause: _start_pause,
     e.StartResume: _start_resume,
     e.StartStatus: _start_status,
@@ -192,4 +196,5 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.AnswerCall: _answer,
     e.Happened: _happened,
     e.Died: _died,
+    e.Acquitted: _acquitted,
 }

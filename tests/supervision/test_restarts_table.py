@@ -15,6 +15,7 @@ from rr_actors.base.errors import (
     ChildRunning,
     NotForDynamic,
     NotFound,
+    RestartIntensityExceeded,
     StartFailed,
 )
 from rr_actors.supervision.core import restarts
@@ -453,6 +454,32 @@ def test_a_death_in_a_callback_of_a_resource_does_not_count_once_the_next_run_sa
         assert made.tree.restarts == ()
         made.settle()
     assert made.states()["b"] == "running"
+
+
+def test_a_death_counts_after_all_if_the_callbacks_that_ran_have_ended_well() -> None:
+    made = world(child("a"), child("b"))
+    for _ in range(made.tree.spec.max_restarts):
+        made.exit("b", "killed")
+        made.take(restarts.decide_uncounted(made.tree, "b", made.tree.children["b"].run))
+        made.settle()
+        made.take(restarts.decide_acquitted(made.tree, "b", made.tree.children["b"].run, made.now))
+        assert made.states()["b"] == "running"
+    assert len(made.tree.restarts) == made.tree.spec.max_restarts
+    made.exit("b", "killed")
+    made.take(restarts.decide_uncounted(made.tree, "b", made.tree.children["b"].run))
+    made.settle()
+    made.take(restarts.decide_acquitted(made.tree, "b", made.tree.children["b"].run, made.now))
+    assert isinstance(made.tree.error, RestartIntensityExceeded)
+
+
+def test_deaths_in_a_callback_that_runs_no_more_never_count() -> None:
+    made = world(child("a"), child("b"))
+    for is_proven in (False, False, True, False):
+        made.exit("b", "killed")
+        made.take(restarts.decide_uncounted(made.tree, "b", made.tree.children["b"].run, is_proven=is_proven))
+        made.settle()
+    made.take(restarts.decide_acquitted(made.tree, "b", made.tree.children["b"].run, made.now))
+    assert len(made.tree.restarts) == 1
 
 
 def test_other_deaths_count_beside_those_in_callbacks_of_resources() -> None:

@@ -5,6 +5,13 @@ row says it of a load and of a first unload, a CallbackRun of all else. The next
 one before it died (`count_deaths`). It cannot know which of several runs has killed the process. Therefore a callback
 in whose runs two processes have died runs alone among its like: its turn is its trial. A third death gives it up. A
 trial that takes long does not hold up the others (TRIAL_S): one callback may wait for another.
+
+A death that is blamed on callbacks does not count as a restart, until they are found innocent: all that ran have ended
+in this process, and it lives. Then it counts after all (`acquit`), so a crash in which some callback happens to run is
+never free.
+
+A health callback runs again and again, so it may run at each crash without being its cause. After a death it waits for
+some seconds (`health_waits_s`) before it runs in the next process. If that dies meanwhile, the callback is innocent.
 """
 
 from __future__ import annotations
@@ -16,7 +23,7 @@ from msgspec.structs import replace
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import BeginTrial, LoadOverdue, RefusalOver, TrialOver
-from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
+from rr_actors.registrar.model.effects import Acquitted, SetTimer, StartLoad, StartUnload
 from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, CallbackRun, Phase, Resource, State
 
 ATTEMPTS = 3
@@ -25,10 +32,12 @@ ATTEMPTS = 3
 TRIAL_S = 5.0
 """How long one callback runs before the next one's trial begins."""
 
+_HEALTH_WAITS_S = (1.0, 4.0)
+
 _REFUSED_S = 5.0
 _REFUSED_AT_MOST_S = 600.0
 
-ROLES = ("recover", "status", "unload", "pause", "resume", "health")
+ROLES = ("recover", "status", "unload", "pause", "resume", "health", "usage")
 """The callbacks whose runs have rows of their own."""
 
 
@@ -164,10 +173,24 @@ def note_begun(decision: Decision, role: str, resource_id: str, *, begun: bool =
 def note_ended(decision: Decision, role: str, resource_id: str) -> None:
     """Write that a run of the callback has ended: deaths in earlier runs do not count any more."""
     catalog = decision.catalog
+    if catalog.accused:
+        acquit(decision, run_id(role, resource_id))
     if catalog.callback_runs and (run := catalog.callback_runs.get(run_id(role, resource_id))) is not None:
         if run.deaths < ATTEMPTS:
             decision.drop(run)
         end_trial(decision, run.id)
+
+
+def acquit(decision: Decision, id: str) -> None:
+    """Note that a callback is innocent of the last process's death. If all are, that death counts as a restart."""
+    accused = decision.catalog.accused
+    if decision.forget(accused, id) and not accused:
+        decision.cause(Acquitted())
+
+
+def health_waits_s(deaths: int) -> float:
+    """Return how long a health callback waits in whose runs so many processes have died."""
+    return _HEALTH_WAITS_S[min(deaths, len(_HEALTH_WAITS_S)) - 1] if deaths else 0.0
 
 
 def forget_runs(decision: Decision, resource_id: str) -> None:
@@ -178,6 +201,8 @@ def forget_runs(decision: Decision, resource_id: str) -> None:
     decision.forget(catalog.rising, resource_id)
     decision.forget(catalog.late, resource_id)
     decision.forget(catalog.unread, resource_id)
+    for role in ("load", *ROLES) if catalog.accused else ():
+        acquit(decision, run_id(role, resource_id))
     if catalog.callback_runs:
         for role in ROLES:
             if (run := catalog.callback_runs.get(run_id(role, resource_id))) is not None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import (
+    acquit,
     end_limit,
     end_trial,
     forget_request,
@@ -205,7 +206,7 @@ def load_done(decision: Decision, done: LoadDone) -> None:
     decision.put(resource)
     decision.cause(Happened("loaded", resource, ""))
     end_limit(decision, resource)
-    if catalog.callback_runs or catalog.trial:
+    if catalog.callback_runs or catalog.trial or catalog.accused:
         _ended(decision, resource)
     holders = catalog.holders.get(resource.id)
     if holders:
@@ -239,7 +240,9 @@ def load_erred(decision: Decision, erred: LoadErred) -> None:
 
 def _ended(decision: Decision, resource: Resource) -> None:
     """Note that the load callback has ended, and the process lives."""
-    end_trial(decision, run_id("load", resource.id))
+    id = run_id("load", resource.id)
+    acquit(decision, id)
+    end_trial(decision, id)
     forget_request(decision, resource)
 
 

@@ -21,6 +21,7 @@ from rr_actors.registrar.core.callback_runs import (
     deaths_of,
     end_trial,
     give_up_request,
+    health_waits_s,
     is_given_up,
     is_its_turn,
     limit_trial,
@@ -54,13 +55,12 @@ from rr_actors.registrar.core.unloading import (
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.commands import (
-    BeginProbe,
+    BeginRun,
     BeginServing,
     BeginTrial,
     ForceUnload,
     PauseDone,
     PauseErred,
-    ProbeDone,
     RecoverDone,
     RecoverErred,
     RecoverOverdue,
@@ -68,10 +68,11 @@ from rr_actors.registrar.model.commands import (
     Reread,
     ResumeDone,
     ResumeErred,
+    RunEnded,
     TrialOver,
     Unregister,
 )
-from rr_actors.registrar.model.effects import Died, Happened, SendReply, SetTimer, StartProbe, StartRecover
+from rr_actors.registrar.model.effects import Acquitted, Died, Happened, SendReply, SetTimer, StartRecover, StartRun
 from rr_actors.registrar.model.messages import Load, Unload
 from rr_actors.registrar.model.rows import (
     NOT_BEGUN,
@@ -95,12 +96,12 @@ def begin_again(decision: Decision) -> None:
     A load that was interrupted is prepared for its next attempt; after ATTEMPTS of them it is refused and cleaned up.
     """
     holding.begin_again(decision)
-    died, given_up = _count_deaths(decision)
+    accused, given_up = _count_deaths(decision)
     for id in list(decision.catalog.moving):
         resource = decision.catalog.resources[id]
         if resource.phase is not Phase.LOADING or resource.tries == NOT_BEGUN:  # no server was there to begin it
             continue
-        died.append(_run_of(decision.catalog, resource, "load"))
+        accused.append(run_id("load", id))
         if resource.attempt < ATTEMPTS:
             decision.put(replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
         else:
@@ -115,16 +116,30 @@ def begin_again(decision: Decision) -> None:
         if run.id.startswith("request:"):
             refuse_for_a_while(decision, run.id)
     decision.note(decision.catalog.early, "", "")
-    if died:
-        decision.cause(Died(tuple(died), tuple(given_up)))
+    if accused:
+        decision.cause(Died(tuple(_run_of(decision.catalog, id) for id in accused), tuple(given_up)))
+    else:
+        _acquit_health_callbacks(decision)
+    for id in accused if not given_up else ():  # else the death is that of a callback which runs no more
+        decision.note(decision.catalog.accused, id, True)
+
+
+def _acquit_health_callbacks(decision: Decision) -> None:
+    """Forget the deaths in health callbacks, as the last process has died without any callback."""
+    runs = decision.catalog.callback_runs.values()
+    innocent = [run for run in runs if run.id.startswith("health:") and 0 < run.deaths < ATTEMPTS]
+    for run in innocent:
+        decision.drop(run)
+    if innocent:
+        decision.cause(Acquitted())
 
 
 def _count_deaths(decision: Decision) -> tuple[list[str], list[str]]:
-    """Count the last process's death for each callback that ran in it; return what ran, and what runs no more."""
+    """Count the last process's death for each callback that ran in it; return their ids, and what runs no more."""
     catalog = decision.catalog
     unloads = [run_id("unload", id) for id in catalog.moving if catalog.resources[id].phase is Phase.UNLOADING]
     first = [CallbackRun(id, begun=True) for id in unloads if id not in catalog.callback_runs]
-    died: list[str] = []
+    accused: list[str] = []
     given_up: list[str] = []
     for run in [*(run for run in catalog.callback_runs.values() if run.begun), *first]:
         role, _, id = run.id.partition(":")
@@ -134,14 +149,15 @@ def _count_deaths(decision: Decision) -> tuple[list[str], list[str]]:
             continue
         deaths = run.deaths + 1
         decision.put(CallbackRun(run.id, deaths))
-        died.append(_run_of(catalog, resource, role))
+        accused.append(run.id)
         if deaths == ATTEMPTS:
             given_up.append(failures.not_run_again(catalog, resource, role, deaths))
-    return died, given_up
+    return accused, given_up
 
 
-def _run_of(catalog: Catalog, resource: Resource, role: str) -> str:
-    return f"the {role} callback of {catalog.origin_of(resource)} for resource {resource.id}"
+def _run_of(catalog: Catalog, run_id: str) -> str:
+    role, _, id = run_id.partition(":")
+    return f"the {role} callback of {catalog.origin_of(catalog.resources[id])} for resource {id}"
 
 
 def register(decision: Decision, command: Register) -> None:
@@ -481,24 +497,28 @@ def _not_resumed(decision: Decision, resource: Resource, event: str, failure: Fa
     spread(decision, resource, event, State.FATAL, failure.message, catalog.origin_of(resource))
 
 
-# -- health callbacks after a crash ------------------------------------------------------------------------------------
+# -- health and usage callbacks: the disk has their runs, as the process may die in them ------------------------------
 
 
-def begin_probe(decision: Decision, command: BeginProbe) -> None:
-    """Run a health callback in which the process before may have died: the disk has it first."""
-    if not awaits_trial(decision, "health", command.resource_id):
-        _run_probe(decision, command.resource_id, command.server)
+def begin_run(decision: Decision, command: BeginRun) -> None:
+    """Run a health callback in which the process before may have died, or a usage callback."""
+    role, id = command.role, command.resource_id
+    wait_s = health_waits_s(deaths_of(decision.catalog, role, id)) if role == "health" and not command.waited else 0.0
+    if wait_s:
+        decision.cause(SetTimer(run_id(role, id), wait_s, replace(command, waited=True)))
+    elif not awaits_trial(decision, role, id):
+        _run(decision, command.role, id, command.server)
 
 
-def _run_probe(decision: Decision, resource_id: str, server: str) -> None:
+def _run(decision: Decision, role: str, resource_id: str, server: str) -> None:
     if resource_id in decision.catalog.resources:
-        note_begun(decision, "health", resource_id)
-    decision.cause(StartProbe(resource_id, server))
+        note_begun(decision, role, resource_id)
+    decision.cause(StartRun(role, resource_id, server))
 
 
-def probe_done(decision: Decision, command: ProbeDone) -> None:
-    """Note that the process lives after the health callback."""
-    note_ended(decision, "health", command.resource_id)
+def run_ended(decision: Decision, command: RunEnded) -> None:
+    """Note that the process lives after the callback."""
+    note_ended(decision, command.role, command.resource_id)
 
 
 # -- callbacks that run alone ------------------------------------------------------------------------------------------
@@ -525,8 +545,8 @@ def begin_trial(decision: Decision, command: BeginTrial) -> None:
             _run_recover(decision, resource, server)
         case "pause" | "resume" if resource.phase in (PAUSING, RESUMING):
             go_on(decision, resource)
-        case "health":
-            _run_probe(decision, id, server.name)
+        case "health" | "usage":
+            _run(decision, role, id, server.name)
         case "status" if catalog.deferred.get(id) and not is_busy(catalog, resource):
             start_deferred(decision, id)
         case _:

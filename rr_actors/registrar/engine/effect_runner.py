@@ -51,7 +51,7 @@ class EffectRunner:
             e.StartLoad: self._start_load,
             e.StartUnload: self._start_unload,
             e.StartRecover: self._start_recover,
-            e.StartProbe: self._start_probe,
+            e.StartRun: self._start_run,
             e.StartPause: self._start_pause,
             e.StartResume: self._start_resume,
             e.StartStatus: self._start_status,
@@ -64,6 +64,7 @@ class EffectRunner:
             e.AnswerCall: self._answer,
             e.Happened: self._happened,
             e.Died: self._died,
+            e.Acquitted: self._acquitted,
         }
 
     def do(self, effects: Sequence[Effect]) -> None:
@@ -178,9 +179,13 @@ class EffectRunner:
             self._before("recover", effect.resource)
             server.start_recover(effect.resource, effect.reload)
 
-    def _start_probe(self, effect: e.StartProbe) -> None:
+    def _start_run(self, effect: e.StartRun) -> None:
         server = self._servers.get(effect.server)
-        if server is not None:
+        if server is None:
+            self._registrar.post(c.RunEnded(effect.role, effect.resource_id))
+        elif effect.role == "usage":
+            server.start_usage(effect.resource_id)
+        else:
             server.start_probe(effect.resource_id)
 
     def _start_pause(self, effect: e.StartPause) -> None:
@@ -283,7 +288,14 @@ class EffectRunner:
         for given_up in effect.given_up:
             logger.error("%s: %s", name, given_up)
         ran = "; ".join(effect.runs[:_NAMED]) + ("; and others" if len(effect.runs) > _NAMED else "")
-        self._registrar.node.on_death_in_callback(ran)
+        self._registrar.node.accused.add(name)
+        self._registrar.node.on_death_in_callback(ran, bool(effect.given_up))
+
+    def _acquitted(self, _effect: e.Acquitted) -> None:
+        node = self._registrar.node
+        node.accused.discard(self._registrar.name)
+        if not node.accused:
+            node.on_acquitted()
 
 
 def _nothing() -> None:

@@ -48,7 +48,7 @@ from rr_actors.base.values.canonical import Codec, encode, shown_plain, text_of_
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.hosting.streams import Publisher, StreamNews
-from rr_actors.registrar.core.callback_runs import deaths_of, running
+from rr_actors.registrar.core.callback_runs import deaths_of, is_given_up, running
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.fields import annotated_types, by_fields, field_names, hints_of
 from rr_actors.registrar.engine.monitor import RegistrarBase
@@ -57,6 +57,7 @@ from rr_actors.registrar.engine.status import Status, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
+from rr_actors.registrar.model.failures import not_run_again
 from rr_actors.registrar.model.health import WELL, Health, ProbeCounts, ProbeResult, first_counts, judged
 from rr_actors.registrar.model.messages import Described, Load
 from rr_actors.registrar.model.rows import (
@@ -107,7 +108,7 @@ UNLOAD = Role("unload", ("request", "response"), UNLOADING, patient=True)
 STATUS = Role("status", ("request", "status"), in_order=True, counted="status")
 RECOVER = Role("recover", ("request", "response"), LOADED, reports=True, patient=True, counted="recover")
 UPGRADE = Role("upgrade", ("request", "response"))
-USAGE = Role("usage", ("request", "response"), patient=True)
+USAGE = Role("usage", ("request", "response"), patient=True, counted="usage")
 PROBE = Role("probe", ("request", "response"), patient=True, counted="health")
 PAUSE = Role("pause", ("request", "response"), PAUSING, patient=True, counted="pause")
 RESUME = Role("resume", ("request", "response"), RESUMING, patient=True, counted="resume")
@@ -712,18 +713,34 @@ class ServerActor:
         known = self._measuring.get(resource.id)
         if known is not None:
             return known
-        future = self._measuring[resource.id] = Future()
+        future = Future[Measured]()
+        catalog = self.registrar.catalog
+        if is_given_up(catalog, "usage", resource.id):
+            future.set_result(not_run_again(catalog, resource, "usage", deaths_of(catalog, "usage", resource.id)))
+            return future
+        self._measuring[resource.id] = future
+        self.registrar.post(c.BeginRun("usage", resource.id, self.spec.name))
+        return future
+
+    @on_loop
+    def start_usage(self, resource_id: str) -> None:
+        """Run a usage callback that the disk has."""
+        future = self._measuring.get(resource_id) or Future[Measured]()
 
         def done(numbers: dict[str, float] | None, error: BaseException | None) -> None:
-            del self._measuring[resource.id]
-            left = self.registrar.catalog.resources.get(resource.id)
+            self._measuring.pop(resource_id, None)
+            self.registrar.post(c.RunEnded("usage", resource_id))
+            left = self.registrar.catalog.resources.get(resource_id)
             if left is None or left.phase not in (LOADED, PAUSED):
                 future.set_result(None)
             else:
                 future.set_result(numbers if error is None else f"{self.origin}: usage: {readable(_text_of(error))}")
 
-        self._submit(USAGE, resource, resource.attempt, done)
-        return future
+        resource = self.registrar.catalog.resources.get(resource_id)
+        if resource is None:
+            done(None, None)
+        else:
+            self._submit(USAGE, resource, resource.attempt, done)
 
     def _numbers(self, answer: object) -> dict[str, float]:
         expected = f"a dict of at most {_MOST_NUMBERS} finite numbers by name"
@@ -770,7 +787,7 @@ class ServerActor:
             for id in ids:
                 resource = self.registrar.catalog.resources.get(id)
                 if resource is not None and self._is_suspect(id):
-                    self.registrar.post(c.BeginProbe(id, self.spec.name))
+                    self.registrar.post(c.BeginRun("health", id, self.spec.name))
                 elif resource is None:
                     self.probes.ended(id)
                 else:
@@ -795,7 +812,7 @@ class ServerActor:
         """Run a health callback that the disk has."""
         resource = self.registrar.catalog.resources.get(resource_id)
         if not self.probes.is_waiting(resource_id):  # for a server of this name that was here before
-            self.registrar.post(c.ProbeDone(resource_id))
+            self.registrar.post(c.RunEnded("health", resource_id))
         elif resource is None:
             self.probes.ended(resource_id)
         else:
@@ -803,7 +820,7 @@ class ServerActor:
             self._submit(PROBE, resource, resource.attempt, done)
 
     def _suspect_ended(self, resource_id: str, found: ProbeResult | None, error: BaseException | None) -> None:
-        self.registrar.post(c.ProbeDone(resource_id))
+        self.registrar.post(c.RunEnded("health", resource_id))
         self._probe_ended(resource_id, found, error)
 
     def _probe_arguments(self, resource: Resource) -> tuple[Any, Any]:

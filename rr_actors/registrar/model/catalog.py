@@ -119,6 +119,7 @@ class Catalog:
     - `recovering`: resources whose recover callback runs, with the messages parked until it has returned.
     - `early`: resources whose callbacks go on with work of before a crash when on_start has returned, and how
       (recovery.py). "" is in it until then.
+    - `accused`: ids of the callback runs in which the process before has died, until they have ended without that.
     - `closings`: releases of parts in progress, by the query whose release has been sent.
     - `direct`: queries whose Load a thread has sent by its own connection, which has not answered yet; False: the query
       has ended by another way. `fresh`: queries that such a connection answered while the provider's link was down, and
@@ -198,6 +199,7 @@ class Catalog:
         self.unanswered: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
         self.early: dict[str, str] = {}
+        self.accused: dict[str, bool] = {}
         self.closings: dict[str, Closing] = {}
         self.unread: dict[str, str] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}

@@ -185,16 +185,22 @@ class ResumeErred(Command, frozen=True):
     event: str
 
 
-class BeginProbe(Command, frozen=True):
-    """The health callback of a resource is due that was there when this process began."""
+class BeginRun(Command, frozen=True):
+    """A usage callback is due, or a health callback of a resource that was there when this process began.
 
+    `waited`: the time is over for which a health callback waited in whose runs processes have died.
+    """
+
+    role: str
     resource_id: str
     server: str
+    waited: bool = False
 
 
-class ProbeDone(Command, frozen=True):
-    """That health callback has ended."""
+class RunEnded(Command, frozen=True):
+    """That callback has ended."""
 
+    role: str
     resource_id: str
 
 

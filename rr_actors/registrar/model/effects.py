@@ -58,9 +58,10 @@ class StartRecover(Effect, frozen=True):
     reload: bool
 
 
-class StartProbe(Effect, frozen=True):
-    """Run the health callback of a resource, if it still is there; then post ProbeDone."""
+class StartRun(Effect, frozen=True):
+    """Run the health or usage callback of a resource, if it still is there; then post RunEnded."""
 
+    role: str
     resource_id: str
     server: str
 
@@ -154,6 +155,10 @@ class Died(Effect, frozen=True):
 
     runs: tuple[str, ...]
     given_up: tuple[str, ...]
+
+
+class Acquitted(Effect, frozen=True):
+    """Say that none of the callbacks that ran when the process before died ends the process: the death counts."""
 
 
 Happening = Literal[

@@ -99,6 +99,7 @@ _BECOMES = {
     "recover": "the resource is lost",
     "reload": "the resource is lost",
     "health": "the resource is lost",
+    "usage": "what the resource uses is not known",
     "pause": "the resource runs on, or is unloaded if nobody holds it",
     "resume": "the resource is lost",
     "status": "statuses of the resource go on to its holders without it",

@@ -24,11 +24,12 @@ from rr_actors.supervision.core.state import (
     ExitSupervisor,
     Mode,
     Reason,
+    Restart,
     SupervisedChild,
     SupervisorState,
     Why,
 )
-from rr_actors.supervision.core.transition import Draft
+from rr_actors.supervision.core.transition import Draft, within
 
 PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
 """The least wait after a start that failed for want of something outside (base/scarcity.py).
@@ -136,6 +137,8 @@ def decide_start_failed(
 def _start_failed(draft: Draft, child: SupervisedChild, reason: BaseException, chance: float) -> None:
     if is_resources(reason) and not child.doubted:
         draft.report("start_failed", child, child.state, error=reason)
+        excused = Restart(draft.now, child.id, f"start failed: {text_of(reason)}", child.run)
+        draft.tree = replace(draft.tree, excused=(*draft.tree.excused, excused))
         draft.start(draft.put(child, doubted=True))
         return
     error = draft.start_error(child, reason)
@@ -199,14 +202,43 @@ def decide_exit(tree: SupervisorState, id: str, run: int, exit: Exit, now: float
     return draft.done()
 
 
-def decide_uncounted(tree: SupervisorState, id: str, run: int) -> Decision:
-    """Note that the run before this one ended in a callback of a resource: its restart does not count."""
+def decide_uncounted(tree: SupervisorState, id: str, run: int, *, is_proven: bool = False) -> Decision:
+    """Note that the run before this one ended while callbacks of resources ran: its restart does not count.
+
+    With `is_proven`, processes have died in each of several runs of one of them, which is not run again. Otherwise the
+    restart counts after all if decide_acquitted() says so.
+    """
     child = tree.children.get(id)
     if child is None or child.run != run:
         return tree, []
     counted = tuple(restart for restart in tree.restarts if (restart.id, restart.run) != (id, child.previous))
+    if is_proven:
+        excused = tuple(restart for restart in tree.excused if restart.id != id)
+    else:
+        excused = (*tree.excused, *(restart for restart in tree.restarts if restart not in counted))
     children = Children.of(tree.children).put(id, replace(child, doubted=False))
-    return replace(tree, restarts=counted, children=children), []
+    return replace(tree, restarts=counted, excused=excused, children=children), []
+
+
+def decide_acquitted(tree: SupervisorState, id: str, run: int, now: float) -> Decision:
+    """Note that the callbacks which ran at the earlier ends of this child have not ended its present run.
+
+    The restarts count that were excused because of them. Give up if these are too many.
+    """
+    draft = Draft(tree, now)
+    child = draft.find(id, run)
+    guilty = [restart for restart in tree.excused if restart.id == id]
+    if child is None or not guilty or not draft.alive:
+        return tree, []
+    restarts = tuple(sorted((*tree.restarts, *guilty), key=lambda restart: restart.at))
+    excused = tuple(restart for restart in tree.excused if restart.id != id)
+    draft.tree = replace(tree, restarts=within(restarts, now, tree.spec.max_seconds), excused=excused)
+    if (count := len(draft.tree.restarts)) > tree.spec.max_restarts:
+        error = draft.too_many_restarts()
+        draft.report("gave_up", child, child.state, error=error, restarts=count)
+        draft.give_up(error)
+        draft.advance()
+    return draft.done()
 
 
 def decide_stopped(tree: SupervisorState, id: str, run: int, exit: Exit, now: float) -> Decision:

@@ -163,6 +163,7 @@ class SupervisorState(Struct, frozen=True):
         path: its place in the tree, "root/inner", for messages.
         children: by id, in start order; after the first decision a `Children`.
         restarts: the restarts that count, oldest first.
+        excused: restarts that do not count, as callbacks of resources ran: they do, if all of those are found innocent.
         last_run, last_dynamic: the last numbers given out.
         generation: part of the ids of dynamic children (`of`).
         delay_s: backoff still to be waited out before the group's next start.
@@ -174,6 +175,7 @@ class SupervisorState(Struct, frozen=True):
     mode: Mode = Mode.NEW
     children: Mapping[str, SupervisedChild] = field(default_factory=dict[str, SupervisedChild])
     restarts: tuple[Restart, ...] = ()
+    excused: tuple[Restart, ...] = ()
     last_run: int = 0
     last_dynamic: int = 0
     generation: str = ""

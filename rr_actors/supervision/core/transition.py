@@ -145,7 +145,9 @@ class Draft:
     def count_restart(self, child: SupervisedChild, reason: str) -> int:
         """Count one more restart, and return the number of those that count now."""
         counted = within(self.tree.restarts, self.now, self.tree.spec.max_seconds)
-        self.tree = replace(self.tree, restarts=(*counted, Restart(self.now, child.id, reason, child.run)))
+        excused = within(self.tree.excused, self.now, self.tree.spec.max_seconds)
+        restarts = (*counted, Restart(self.now, child.id, reason, child.run))
+        self.tree = replace(self.tree, restarts=restarts, excused=excused)
         return len(self.tree.restarts)
 
     def too_many_restarts(self) -> RestartIntensityExceeded:
