@@ -30,14 +30,15 @@ import msgspec
 from rr_actors.base.errors import LoadFailed, RrError
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.toml import read_typed
+from rr_actors.base.toml import parse_typed
+from rr_actors.managers.planning.last_good import last_good_file
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
-from rr_actors.registrar.manager import Manager
+from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 
@@ -120,7 +121,7 @@ class Components(Manager):
         self._lock = threading.Lock()
 
     def _read(self) -> list[ComponentDescription]:
-        return read_registry(self._path)
+        return read_registry(self._path, self._beginning())
 
     @server("component")
     def load_component(self, request: LoadComponent) -> Component:
@@ -236,12 +237,16 @@ def component_of(description: ComponentDescription, parameters: dict[str, str], 
     return Component(description.name, description.type, query.response.pid, parameters)
 
 
-def read_registry(path: Path) -> list[ComponentDescription]:
-    """Read the registry, and check that the names in it are different.
+def read_registry(path: Path, beginning: Beginning | None = None) -> list[ComponentDescription]:
+    """Read the registry, after a crash the last good one, and check that the names in it are different.
 
     Raises:
         ConfigError: the registry cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
-    components = read_typed(str(path), RegistryFile).component
-    check_unique(path, "component", [component.name for component in components])
+    return last_good_file(beginning, path, _parse_registry).now
+
+
+def _parse_registry(data: bytes, file: str) -> list[ComponentDescription]:
+    components = parse_typed(data, file, RegistryFile).component
+    check_unique(Path(file), "component", [component.name for component in components])
     return components

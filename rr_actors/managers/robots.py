@@ -17,13 +17,14 @@ import msgspec
 
 from rr_actors.base.errors import LoadFailed, RrError
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.toml import read_typed
+from rr_actors.base.toml import parse_typed
 from rr_actors.managers.components import Component, LoadComponent
+from rr_actors.managers.planning.last_good import last_good_file
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
-from rr_actors.registrar.manager import Manager
+from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 
@@ -93,7 +94,7 @@ class Robots(Manager):
             ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
         self._path = Path(descriptions).absolute()
-        self._robots = read_robots(self._path)
+        self._robots = read_robots(self._path, self._beginning())
         self._components = components
         self._replace = replace
 
@@ -180,12 +181,16 @@ class Robots(Manager):
         return found
 
 
-def read_robots(path: Path) -> list[RobotDescription]:
-    """Read the descriptions, and check that the names in them are different.
+def read_robots(path: Path, beginning: Beginning | None = None) -> list[RobotDescription]:
+    """Read the descriptions, after a crash the last good ones, and check that the names in them are different.
 
     Raises:
         ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
-    robots = read_typed(str(path), RobotFile).robot
-    check_unique(path, "robot", [robot.name for robot in robots])
+    return last_good_file(beginning, path, _parse_robots).now
+
+
+def _parse_robots(data: bytes, file: str) -> list[RobotDescription]:
+    robots = parse_typed(data, file, RobotFile).robot
+    check_unique(Path(file), "robot", [robot.name for robot in robots])
     return robots

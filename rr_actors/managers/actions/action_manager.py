@@ -119,7 +119,7 @@ class Actions(Manager):
         """
         if not is_number(stop_s) or stop_s < 0:
             raise UsageError(f"Actions: stop_s: expected a number of at least 0, got {shown(stop_s)}")
-        self._library = GraphLibrary(actions, graphs)
+        self._library = GraphLibrary(actions, graphs, self._beginning())
         self._stop_s = stop_s
         self._lock = threading.Lock()
         self._engines: dict[str, GraphEngine] = {}

@@ -47,11 +47,24 @@ def read_graph_file(path: str | os.PathLike[str]) -> ActionGraph:
         GraphError: the file cannot be read, is not JSON, or is no graph.
     """
     file = os.fspath(path)
+    return parse_graph(read_graph_bytes(file), file)
+
+
+def read_graph_bytes(file: str) -> bytes:
+    """Return the contents of a file with a graph; raise GraphError if it cannot be read."""
     try:
-        data = Path(file).read_bytes()
+        return Path(file).read_bytes()
     except (OSError, ValueError) as error:  # ValueError: no file has such a name
         said = getattr(error, "strerror", None) or str(error)
         raise wrong_graph(file, "", "a file that can be read", said, said) from error
+
+
+def parse_graph(data: bytes, file: str) -> ActionGraph:
+    """Return the graph in the contents of a JSON file.
+
+    Raises:
+        GraphError: they are not JSON, or no graph.
+    """
     try:
         document = msgspec.json.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

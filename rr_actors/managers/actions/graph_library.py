@@ -10,9 +10,11 @@ from typing import Any, cast
 
 from rr_actors.base.errors import UsageError, shown
 from rr_actors.managers.actions.action import Action, check_isolation, name_of, signature_of_class
-from rr_actors.managers.actions.graph_checks import completed, signature_of
-from rr_actors.managers.actions.graph_documents import read_graph, read_graph_file
+from rr_actors.managers.actions.graph_checks import Signature, completed, signature_of
+from rr_actors.managers.actions.graph_documents import parse_graph, read_graph, read_graph_bytes
 from rr_actors.managers.actions.graph_model import ActionGraph, wrong_graph
+from rr_actors.managers.planning.last_good import LastGood, Sources
+from rr_actors.registrar.manager import Beginning
 
 
 class GraphLibrary:
@@ -23,8 +25,13 @@ class GraphLibrary:
         graphs: the graphs of the folder, with the parameters of their actions, by name.
     """
 
-    def __init__(self, actions: Sequence[type[Action]], folder: str | os.PathLike[str] | None = None) -> None:
-        """Read the graphs in the files ``*.json`` of a folder.
+    def __init__(
+        self,
+        actions: Sequence[type[Action]],
+        folder: str | os.PathLike[str] | None = None,
+        beginning: Beginning | None = None,
+    ) -> None:
+        """Read the graphs in the files ``*.json`` of a folder; after a crash take the last good ones.
 
         Raises:
             GraphError: a graph is wrong, or the folder cannot be read.
@@ -32,11 +39,19 @@ class GraphLibrary:
                 or `isolate` or `timeout_s` is wrong.
         """
         self.actions = _by_name(actions)
-        self._known = {name: signature_of_class(kind) for name, kind in self.actions.items()}
+        self._known_actions = {name: signature_of_class(kind) for name, kind in self.actions.items()}
+        self._known: dict[str, Signature] = self._known_actions
         self.graphs: dict[str, ActionGraph] = {}
-        unread = {} if folder is None else _read_folder(Path(folder))
+        if folder is not None:
+            path = Path(folder).absolute()
+            self.graphs, self._known = LastGood(beginning, lambda: _read_folder(path), self._parsed).now
+
+    def _parsed(self, sources: Sources) -> tuple[dict[str, ActionGraph], dict[str, Signature]]:
+        self.graphs, self._known = {}, dict(self._known_actions)
+        unread = _parse_folder(sources)
         for name in unread:
             self._complete(name, unread, ())
+        return self.graphs, self._known
 
     def _complete(self, name: str, unread: dict[str, ActionGraph], inside: tuple[str, ...]) -> None:
         """Complete a graph after its sub-graphs."""
@@ -104,12 +119,16 @@ def _by_name(actions: Sequence[type[Action]]) -> dict[str, type[Action]]:
     return found
 
 
-def _read_folder(folder: Path) -> dict[str, ActionGraph]:
+def _read_folder(folder: Path) -> Sources:
     if not folder.is_dir():
         raise wrong_graph(str(folder), "", "a folder with graphs", None, "none")
+    return {str(path): read_graph_bytes(str(path)) for path in sorted(folder.glob("*.json"))}
+
+
+def _parse_folder(sources: Sources) -> dict[str, ActionGraph]:
     found: dict[str, ActionGraph] = {}
-    for path in sorted(folder.glob("*.json")):
-        graph = read_graph_file(path)
+    for file, data in sources.items():
+        graph = parse_graph(data, file)
         if graph.name in found:
             raise wrong_graph(graph.file, "graph_name", f"another name than in {found[graph.name].file}", graph.name)
         found[graph.name] = graph

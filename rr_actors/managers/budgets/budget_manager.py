@@ -164,7 +164,7 @@ class Budgets(Manager):
         Raises:
             ConfigError: the file cannot be read, or a pool is wrong. `.file`, `.key`, `.expected`, `.got`
         """
-        self._pools = read_pools(file_or_pools)
+        self._pools = read_pools(file_or_pools, self._beginning())
         check_amount(None, "grace_s", grace_s)
         self._grace_s = grace_s
         self._changed = threading.Condition(threading.RLock())

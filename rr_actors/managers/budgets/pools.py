@@ -31,10 +31,12 @@ import msgspec
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import InvalidName, is_a, shown
 from rr_actors.base.names import parse_server_id
-from rr_actors.base.toml import read_typed, wrong
+from rr_actors.base.toml import parse_typed, wrong
 from rr_actors.managers.budgets.measures import Measure, faults
 from rr_actors.managers.budgets.planner import Step
 from rr_actors.managers.budgets.probes import NoProbe, probe_of
+from rr_actors.managers.planning.last_good import last_good_file
+from rr_actors.registrar.manager import Beginning
 
 POLICY: tuple[Step, ...] = get_args(Step)
 
@@ -76,17 +78,24 @@ class PoolFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pool: list[Pool]
 
 
-def read_pools(file_or_pools: str | os.PathLike[str] | Sequence[Pool]) -> dict[str, Pool]:
-    """Return the pools by name, from a TOML file or as they are given.
+def read_pools(
+    file_or_pools: str | os.PathLike[str] | Sequence[Pool], beginning: Beginning | None = None
+) -> dict[str, Pool]:
+    """Return the pools by name, from a TOML file or as they are given; after a crash from the last good file.
 
     Raises:
         ConfigError: the file cannot be read, or a pool is wrong. `.file`, `.key`, `.expected`, `.got`
     """
     if isinstance(file_or_pools, (str, os.PathLike)):
-        file: str | None = str(Path(file_or_pools).absolute())
-        pools: Sequence[Pool] = read_typed(file, PoolFile).pool
-    else:
-        file, pools = None, _given(file_or_pools)
+        return last_good_file(beginning, Path(file_or_pools).absolute(), _parse_pools).now
+    return _checked(None, _given(file_or_pools))
+
+
+def _parse_pools(data: bytes, file: str) -> dict[str, Pool]:
+    return _checked(file, parse_typed(data, file, PoolFile).pool)
+
+
+def _checked(file: str | None, pools: Sequence[Pool]) -> dict[str, Pool]:
     found: dict[str, Pool] = {}
     for i, pool in enumerate(pools):
         key = f"pool[{i}]"

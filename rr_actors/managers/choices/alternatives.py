@@ -28,9 +28,11 @@ import msgspec
 from rr_actors.base.checks import is_number, wrong_label
 from rr_actors.base.errors import InvalidName, NotSerializable
 from rr_actors.base.names import parse_server
-from rr_actors.base.toml import read_typed, wrong
+from rr_actors.base.toml import parse_typed, wrong
 from rr_actors.base.values.canonical import encode, json_of, shown_plain
+from rr_actors.managers.planning.last_good import last_good_file
 from rr_actors.managers.templates import Parameter
+from rr_actors.registrar.manager import Beginning
 
 _WHERE = "Choices"
 
@@ -73,17 +75,26 @@ def key_of(server: str, request: object) -> str:
     return server if request is None else f"{server} {json_of(shown_plain(encode(request)))}"
 
 
-def read_alternatives(file_or_alternatives: str | os.PathLike[str] | Sequence[Alternative]) -> tuple[Alternative, ...]:
-    """Return the alternatives of a TOML file, or as they are given, the preferred first.
+def read_alternatives(
+    file_or_alternatives: str | os.PathLike[str] | Sequence[Alternative], beginning: Beginning | None = None
+) -> tuple[Alternative, ...]:
+    """Return the alternatives of a TOML file, after a crash of the last good one, or as they are given.
+
+    The preferred come first.
 
     Raises:
         ConfigError: the file cannot be read, or an alternative is wrong. `.file`, `.key`, `.expected`, `.got`
     """
     if isinstance(file_or_alternatives, (str, os.PathLike)):
-        file: str | None = str(Path(file_or_alternatives).absolute())
-        found: Sequence[Alternative] = read_typed(file, AlternativeFile).alternative
-    else:
-        file, found = None, file_or_alternatives
+        return last_good_file(beginning, Path(file_or_alternatives).absolute(), _parse_alternatives).now
+    return _checked(None, file_or_alternatives)
+
+
+def _parse_alternatives(data: bytes, file: str) -> tuple[Alternative, ...]:
+    return _checked(file, parse_typed(data, file, AlternativeFile).alternative)
+
+
+def _checked(file: str | None, found: Sequence[Alternative]) -> tuple[Alternative, ...]:
     seen: set[tuple[str, str]] = set()
     for i, one in enumerate(found):
         place = f"alternative[{i}]"

@@ -132,7 +132,7 @@ class Choices(Manager):
             ConfigError: the file cannot be read, or an alternative or a host is wrong. `.file`, `.key`, `.expected`,
                 `.got`
         """
-        self._given = self._every = read_alternatives(file_or_alternatives)
+        self._given = self._every = read_alternatives(file_or_alternatives, self._beginning())
         self._labelled_before: tuple[Alternative, ...] = ()
         if not is_number(settle_s) or settle_s < 0:
             raise wrong(None, "settle_s", "a number of seconds, at least 0", settle_s, where="Choices")

@@ -44,10 +44,12 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.base.errors import ConfigError
-from rr_actors.base.toml import read_typed, wrong
+from rr_actors.base.toml import parse_typed, wrong
 from rr_actors.managers.components import ComponentDescription
 from rr_actors.managers.pipes.chains import Link, Step, Way
+from rr_actors.managers.planning.last_good import last_good_file
 from rr_actors.managers.templates import check_unique
+from rr_actors.registrar.manager import Beginning
 
 TYPE_EXPECTED = "a name of letters, digits and _"
 
@@ -95,13 +97,19 @@ WrongAt = Callable[[int, str, str, object], ConfigError]
 """Makes the error for a segment: its number, "inputs" or "outputs", what was expected there, and the value."""
 
 
-def read_pipe_file(path: Path) -> PipeFile:
-    """Read the file, and check that names are different, and that the ends of the segments of each pipe meet.
+def read_pipe_file(path: Path, beginning: Beginning | None = None) -> PipeFile:
+    """Read the file, after a crash the last good one.
+
+    Check that names are different, and that the ends of the segments of each pipe meet.
 
     Raises:
         ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
-    file = read_typed(str(path), PipeFile)
+    return last_good_file(beginning, path, _parse_pipe_file).now
+
+
+def _parse_pipe_file(data: bytes, name: str) -> PipeFile:
+    path, file = Path(name), parse_typed(data, name, PipeFile)
     check_unique(path, "component", [component.name for component in file.component])
     for i, component in enumerate(file.component):
         _check_types(path, f"component[{i}].inputs", component.inputs)

@@ -66,19 +66,29 @@ class LastGood(Generic[C]):
         self._record = KeptRecord(beginning.directory / "configuration.json", _Record)
         kept = self._record.now
         if kept.given is not None and kept.run == beginning.run and not beginning.by_hand:
-            self.now = parse(_bytes_of(kept.applied or kept.given))
-            self.problem = self._difference(read, kept.given)
-            if self.problem:
-                text = "%s goes on with its last good configuration: %s. A change takes effect at the next start."
-                logger.warning(text, beginning.name, self.problem)
-            return
+            try:
+                self.now = parse(_bytes_of(kept.applied or kept.given))
+            except (ConfigError, GraphError) as error:  # the code is another one by now
+                logger.warning("%s: its last good configuration does not hold any more: %s", beginning.name, error)
+            else:
+                self._go_on(beginning.name, read, kept.given)
+                return
+        self._begin(beginning, read, kept)
+
+    def _go_on(self, name: str, read: Callable[[], Sources], given: Mapping[str, str]) -> None:
+        self.problem = self._difference(read, given)
+        if self.problem:
+            text = "%s goes on with its last good configuration: %s. A change takes effect at the next start."
+            logger.warning(text, name, self.problem)
+
+    def _begin(self, beginning: Beginning, read: Callable[[], Sources], kept: _Record) -> None:
         sources = read()
-        self.now = parse(sources)
+        self.now = self._parse(sources)
         given = _texts_of(sources)
         applied = kept.applied if kept.given == given else None
         if applied is not None:
             try:
-                self.now = parse(_bytes_of(applied))
+                self.now = self._parse(_bytes_of(applied))
             except (ConfigError, GraphError) as error:  # another version has applied it
                 logger.warning("%s: what was applied does not hold any more: %s", beginning.name, error)
                 applied = None
@@ -120,6 +130,16 @@ def one_file(path: str | Path) -> Sources:
         ConfigError: it cannot be read.
     """
     return {str(path): read_bytes(str(path))}
+
+
+def last_good_file(beginning: Beginning | None, path: Path, parse: Callable[[bytes, str], C]) -> LastGood[C]:
+    """Return the configuration that is one file; `parse` is called with its contents and its path."""
+
+    def parsed(sources: Sources) -> C:
+        ((file, data),) = sources.items()
+        return parse(data, file)
+
+    return LastGood(beginning, lambda: one_file(path), parsed)
 
 
 def still_standing(overrides: Mapping[str, tuple[V, V]], configured: Mapping[str, V]) -> dict[str, tuple[V, V]]:
