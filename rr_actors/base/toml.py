@@ -13,7 +13,7 @@ import functools
 import importlib
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args, get_origin
 
@@ -37,6 +37,16 @@ def wrong(
         said = shown(got) if got is None else f"{shown(got)} ({type(got).__name__})"
     place = ": ".join(filter(None, (file or where, shortened(key))))
     return ConfigError(f"{place}: expected {expected}, got {said}", file=file, key=key, expected=expected, got=got)
+
+
+def raise_faults(faults: Sequence[ConfigError]) -> None:
+    """Raise the error for all that is wrong; its attributes are of the first fault. Do nothing if there is none."""
+    if len(faults) > 1:
+        first = faults[0]
+        text = "\n".join([f"{len(faults)} faults:", *(f"  {fault}" for fault in faults)])
+        raise ConfigError(text, **first.details)
+    for fault in faults:
+        raise fault
 
 
 def check_keys(table: Collection[str], known: Collection[str], file: str, prefix: str = "") -> None:

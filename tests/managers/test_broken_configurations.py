@@ -11,13 +11,14 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.managers import Actions, Budgets, Choices, Components, Pipes, Robots
+from rr_actors.managers import Actions, Budgets, Choices, Components, Keeper, Pipes, Robots
 from support import kill, wait_respawned
 
 POOLS = '[[pool]]\nname = "watts"\ncapacity = 100\n'
 CHOICES = '[[alternative]]\nkind = "range"\nserver = "cameras/camera"\n'
 COMPONENTS = '[[component]]\nname = "lidar"\ntype = "lidar"\nprogram = { command = "sleep" }\n'
 ROBOTS = '[[robot]]\nname = "rover"\ndriver = { type = "lidar" }\n'
+KEEP = '[[keep]]\nname = "camera"\nserver = "cameras/camera"\n'
 GRAPH = '{"graph_name": "survey", "actions": [{"name": "Look"}]}'
 
 
@@ -34,6 +35,7 @@ MANAGERS: dict[str, tuple[type[rr.Manager], str]] = {
     "Components": (Components, COMPONENTS),
     "Pipes": (Pipes, COMPONENTS),
     "Robots": (Robots, ROBOTS),
+    "Keeper": (Keeper, KEEP),
     "Actions": (Actions, GRAPH),
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import resource
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,8 @@ class Place:
         self.app = self.system.open_registrar("app")
         self.broken = dict[str, Exception]()
         self.stuck, self.goes_on = set[str](), threading.Event()
-        self.alive, self.most = dict[str, int](), 0
+        self.alive, self.opened, self.most = dict[str, int](), dict[str, int](), 0
+        self.open_s, self.unload_fails = 0.0, False
         self.well = True
 
     def serve(self) -> rr.Registrar:
@@ -53,11 +55,15 @@ class Place:
             self.goes_on.wait(60)
         if request in self.broken:
             raise self.broken[request]
+        time.sleep(self.open_s)  # a device that takes so long to open
+        self.opened[request] = self.opened.get(request, 0) + 1
         self.alive[request] = self.alive.get(request, 0) + 1
         self.most = max(self.most, self.alive[request])
         return f"{request} is on"
 
     def _unload(self, request: Any, response: str | None) -> None:
+        if self.unload_fails:
+            raise OSError("it is stuck")
         self.alive[request] -= 1
 
     def _probe(self, request: Any, response: str) -> None:
@@ -81,6 +87,11 @@ class Place:
     def lose(self, request: str) -> None:
         (info,) = [info for info in self.things.resources() if info.request == request and info.status != "FATAL"]
         self.things.send_status(info, rr.Status("FATAL", "it burns"))
+
+    def restart(self) -> None:
+        """Start the keeper anew by hand."""
+        self.system.supervisor().terminate_child("keeper")
+        self.system.supervisor().restart_child("keeper")
 
     def respawn(self) -> None:
         wait_respawned(self.system, "keeper", kill(self.system, "keeper"))
@@ -238,6 +249,30 @@ def test_a_group_is_loaded_as_a_whole_and_anew_when_it_changes(make: Make) -> No
         place.app.load("keeper/group", "navigatio")
 
 
+def group(name: str, *members: tuple[str, str]) -> str:
+    tables = [f'[[group.member]]\nserver = "{server}"\nrequest = "{request}"\n' for server, request in members]
+    return "".join([f'[[group]]\nname = "{name}"\n', *tables])
+
+
+def test_a_changed_group_reaches_what_is_kept_also_if_it_is_in_another_one_or_somebody_shares_it(make: Make) -> None:
+    def text(*sensors: str) -> str:
+        inner = [("things/thing", one) for one in sensors]
+        outer = [("things/thing", "map"), ("keeper/group", "sensors")]
+        return keep("n", '"nav"', "keeper/group") + group("nav", *outer) + group("sensors", *inner)
+
+    place = make(text("laser"))
+    place.serve()
+    assert eventually(lambda: place.there() == ["laser", "map"])
+    shared = place.app.load("keeper/group", "sensors")
+    place.keeper.apply(place.write("next.toml", text("laser", "sonar"))).get()
+    assert eventually(lambda: place.there() == ["laser", "map", "sonar"])
+    assert place.wait_kept(Kept("n", 1, 1))
+    assert shared.wait_status("WARNING", timeout_s=60).message.startswith("the group has other members by now")
+    shared.unload()
+    assert place.app.load("keeper/group", "sensors").state == "OK"
+    assert place.there() == ["laser", "map", "sonar"]
+
+
 def test_a_keeper_that_is_killed_goes_on_with_what_was_applied(make: Make) -> None:
     place = make(keep("a", replicas=2))
     place.serve()
@@ -248,10 +283,65 @@ def test_a_keeper_that_is_killed_goes_on_with_what_was_applied(make: Make) -> No
     place.respawn()
     assert place.wait_kept(Kept("a", 3, 3))
     assert {info.id for info in place.things.resources()} == before
-    place.write("keep.toml", keep("a"))  # the first file, changed, replaces what was applied
+    place.write("keep.toml", keep("a"))  # an edit that nobody has applied
     place.respawn()
+    assert place.wait_kept(Kept("a", 3, 3))
+    place.restart()  # the first file, changed, replaces what was applied
     assert place.wait_kept(Kept("a", 1, 1))
     assert eventually(lambda: place.there() == ["r0"])
+
+
+def test_what_was_applied_does_not_come_back_with_an_earlier_text_of_the_file(make: Make) -> None:
+    place = make(keep("a"))
+    place.serve()
+    place.keeper.apply(place.write("next.toml", keep("a", replicas=3))).get()
+    for replicas in (2, 1):
+        place.write("keep.toml", keep("a", replicas=replicas) if replicas > 1 else keep("a"))
+        place.restart()
+        assert place.wait_kept(Kept("a", replicas, replicas))
+
+
+@pytest.mark.parametrize("replicas", [3, 20])
+@pytest.mark.parametrize("open_s", [0.0, 0.1])
+def test_each_replica_is_opened_once_at_the_start_and_never_at_a_respawn(
+    make: Make, replicas: int, open_s: float
+) -> None:
+    place = make(keep("a", replicas=replicas))
+    place.open_s = open_s
+    place.serve()
+    assert place.wait_kept(Kept("a", replicas, replicas))
+    for _ in range(2):
+        place.respawn()
+        assert place.wait_kept(Kept("a", replicas, replicas))
+        place.keeper.apply(str(place.folder / "keep.toml")).get()  # a look, and nothing to do
+    assert place.opened == {f"r{i}": 1 for i in range(replicas)}
+    assert set(place.alive.values()) == {1}
+
+
+def test_holders_of_kept_hear_each_reason_also_if_only_its_text_is_another(make: Make) -> None:
+    place = make(keep("a", '"r0"'))
+    place.serve()
+    query = place.app.load("keeper/kept", "a", response_type=Kept)
+    assert place.wait_kept(Kept("a", 1, 1))
+    place.broken["r0"] = OSError("no fuel")
+    place.lose("r0")
+    for text in ("no fuel", "no fuse"):
+        place.broken["r0"] = OSError(text)
+        assert eventually(lambda text=text: text in query.wait_status("ERROR", timeout_s=60).message)
+
+
+def test_a_replica_that_cannot_be_unloaded_has_no_second_one(make: Make) -> None:
+    place = make(keep("a", '"r0"'))
+    place.serve()
+    assert place.wait_kept(Kept("a", 1, 1))
+    place.unload_fails = True
+    place.lose("r0")
+    assert place.wait_kept(Kept("a", 1, 0, "unload failed"))
+    assert "it is stuck" in place.keeper.diff().get()[0]
+    assert [info.phase for info in place.things.resources()] == ["unload_failed"]
+    place.unload_fails = False
+    assert place.wait_kept(Kept("a", 1, 1))
+    assert (place.opened, place.alive, len(place.things.resources())) == ({"r0": 2}, {"r0": 1}, 1)
 
 
 def test_a_full_disk_ends_no_keeper_and_what_is_wanted_comes_when_there_is_room(make: Make) -> None:

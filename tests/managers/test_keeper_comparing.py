@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from rr_actors import Backoff, State
-from rr_actors.managers.keeper.comparing import Failure, Report, Seen, Slot, Steps, Wanted, compare, failure, report
+from rr_actors.managers.keeper.comparing import Report, Seen, Slot, Steps, Wanted, compare, report
+from rr_actors.managers.planning.setbacks import Setback, next_setback
 from support_steps import steps_of
 
 BACKOFF = Backoff(1.0, 2.0, 10.0, 0.0)
-FAILED = {("a", 0): Failure(1, 5.0, "failing", "no fuel")}
+FAILED = {("a", 0): Setback(1, 5.0, "failing", "no fuel")}
 A = Wanted("a", 0, b"a0")
 HELD = Seen("a", 0, b"a0", "held", "q")
 OLD = Seen("a", 0, b"old", "held", "q")
@@ -26,13 +27,13 @@ def seen(one: Seen, **changes: object) -> Seen:
 
 
 LOADING, RELEASING, ENDING = (seen(HELD, phase=phase) for phase in ("loading", "releasing", "ending"))
-TABLE: list[tuple[list[Wanted], list[Seen], dict[Slot, Failure], Steps]] = [
+TABLE: list[tuple[list[Wanted], list[Seen], dict[Slot, Setback], Steps]] = [
     ([A], [], {}, Steps(load=[A])),
     ([A], [HELD], {}, Steps()),
     ([A], [LOADING], {}, Steps()),
     # it is loaded again when its time has come
     ([A], [], FAILED, Steps(next_at=5.0)),
-    ([A], [], {("a", 0): Failure(1, 4.0, "failing")}, Steps(load=[A])),
+    ([A], [], {("a", 0): Setback(1, 4.0, "failing")}, Steps(load=[A])),
     # what is lost, or is another thing than is wanted, goes before the new one comes
     ([A], [seen(HELD, state=State.FATAL)], FAILED, Steps(release=[seen(HELD, state=State.FATAL)])),
     ([A], [seen(HELD, state=State.ERROR)], {}, Steps()),
@@ -55,7 +56,7 @@ TABLE: list[tuple[list[Wanted], list[Seen], dict[Slot, Failure], Steps]] = [
 
 
 @pytest.mark.parametrize(("wanted", "there", "failures", "steps"), TABLE)
-def test_the_steps(wanted: list[Wanted], there: list[Seen], failures: dict[Slot, Failure], steps: Steps) -> None:
+def test_the_steps(wanted: list[Wanted], there: list[Seen], failures: dict[Slot, Setback], steps: Steps) -> None:
     assert compare(wanted, there, failures, 4.0) == steps
 
 
@@ -78,27 +79,27 @@ def test_the_last_of_the_file_is_released_first() -> None:
 
 
 ERROR = seen(HELD, state=State.ERROR, message="health: no answer")
-REASONS: list[tuple[list[Seen], dict[Slot, Failure], Report]] = [
+REASONS: list[tuple[list[Seen], dict[Slot, Setback], Report]] = [
     ([HELD], FAILED, Report("a", 1, 1)),
     ([seen(HELD, state=State.WARNING)], {}, Report("a", 1, 1)),
     ([], {}, Report("a", 1, 0, "loading")),
     ([LOADING], {}, Report("a", 1, 0, "loading")),
     ([LOADING], FAILED, Report("a", 1, 0, "all failing", "no fuel", True)),
     ([seen(LOADING, is_slow=True)], FAILED, Report("a", 1, 0, "loading")),
-    ([], {("a", 0): Failure(1, 5.0, "none registered", "x")}, Report("a", 1, 0, "none registered", "x", True)),
-    ([], {("a", 0): Failure(1, 5.0, "over capacity", "x")}, Report("a", 1, 0, "over capacity", "x", True)),
+    ([], {("a", 0): Setback(1, 5.0, "none registered", "x")}, Report("a", 1, 0, "none registered", "x", True)),
+    ([], {("a", 0): Setback(1, 5.0, "over capacity", "x")}, Report("a", 1, 0, "over capacity", "x", True)),
     ([ERROR], {}, Report("a", 1, 0, "all failing", "health: no answer", True)),
 ]
 
 
 @pytest.mark.parametrize(("there", "failures", "expected"), REASONS)
-def test_the_reasons(there: list[Seen], failures: dict[Slot, Failure], expected: Report) -> None:
+def test_the_reasons(there: list[Seen], failures: dict[Slot, Setback], expected: Report) -> None:
     assert report(["a"], [A], there, failures) == {"a": expected}
 
 
 def test_several_reasons_are_named_once_each() -> None:
     replicas = [Wanted("a", i, b"") for i in range(5)]
-    failures = {("a", i): Failure(1, 5.0, why) for i, why in enumerate(["failing", "failing", "over capacity"])}
+    failures = {("a", i): Setback(1, 5.0, why) for i, why in enumerate(["failing", "failing", "over capacity"])}
 
     assert report(["a"], replicas, [seen(HELD, instance=4, what=b"")], failures)["a"] == Report(
         "a", 5, 1, "failing, over capacity, loading", "", True
@@ -114,9 +115,9 @@ def test_what_waits_says_for_which() -> None:
 
 @given(st.integers(0, 30), st.floats(0, 20), st.floats(0, 1e6))
 def test_the_waiting_times_grow_and_begin_anew_after_a_long_run(count: int, ran_s: float, now: float) -> None:
-    before = Failure(count, 0.0, "failing") if count else None
+    before = Setback(count, 0.0, "failing") if count else None
 
-    made = failure(before, ran_s, now, "failing", "why", BACKOFF)
+    made = next_setback(before, now, BACKOFF, ran_s=ran_s, reason="failing", text="why")
 
     again = 0 if ran_s >= 10 else count
     assert (made.count, made.reason, made.text) == (again + 1, "failing", "why")
@@ -146,7 +147,7 @@ class World(RuleBasedStateMachine):
         super().__init__()
         self.wanted: list[Wanted] = []
         self.there: dict[str, Seen] = {}
-        self.failures: dict[Slot, Failure] = {}
+        self.failures: dict[Slot, Setback] = {}
         self.now = 0.0
         self.count = 0
 
@@ -191,7 +192,7 @@ class World(RuleBasedStateMachine):
         self.look()
 
     def fail(self, slot: Slot) -> None:
-        self.failures[slot] = failure(self.failures.get(slot), 0.0, self.now, "failing", "", BACKOFF)
+        self.failures[slot] = next_setback(self.failures.get(slot), self.now, BACKOFF, reason="failing")
 
     def finish(self, id: str, works: bool) -> None:
         one = self.there.pop(id)

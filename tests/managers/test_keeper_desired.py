@@ -46,9 +46,31 @@ def test_a_replica_of_a_group_changes_with_the_group() -> None:
     assert before.what != after.what
 
 
-def test_a_request_of_a_group_that_is_no_name_is_left_to_its_load() -> None:
-    ((_, replica),) = parsed('[[keep]]\nname = "a"\nserver = "keeper/group"\nrequest = {}\n').replicas("keeper/group")
-    assert replica.members == ()
+def group(name: str, *members: str) -> str:
+    tables = [f'[[group.member]]\nserver = "keeper/group"\nrequest = "{one}"\n' for one in members]
+    return "".join([f'[[group]]\nname = "{name}"\n', *(tables or ['[[group.member]]\nserver = "x/y"\n'])])
+
+
+def test_a_replica_of_a_group_has_the_members_of_the_groups_in_it_each_of_them_once() -> None:
+    keep = '[[keep]]\nname = "a"\nserver = "keeper/group"\nrequest = "g"\n'
+    ((_, replica),) = parsed(keep, group("g", "inner", "other"), group("inner"), group("other")).replicas(
+        "keeper/group"
+    )
+    assert replica.members == (Member("x/y"),)
+
+
+def test_all_faults_of_a_file_are_named_at_once() -> None:
+    with pytest.raises(rr.ConfigError) as caught:
+        parsed(A, 'replicas = -1\nafter = ["c"]\n', A, group("g", "g", "h"))
+    assert [line.removeprefix("  keep.toml: ").partition(":")[0] for line in str(caught.value).splitlines()] == [
+        "5 faults",
+        "keep[1].name",
+        "keep[0].replicas",
+        "keep[0].after[0]",
+        "group[0].member[1].request",
+        "group[0].member",
+    ]
+    assert caught.value.key == "keep[1].name"
 
 
 def test_a_request_without_a_number_stays() -> None:
@@ -65,6 +87,18 @@ def test_changes_are_lines() -> None:
 
 
 WRONG: list[tuple[str, str, Any]] = [
+    ('[[keep]]\nname = "a"\nserver = "keeper/group"\nrequest = {}\n', "keep[0].request: expected the name of a", {}),
+    (
+        '[[keep]]\nname = "a"\nserver = "keeper/group"\nrequest = "gg"\n[[group]]\nname = "g"\n',
+        "keep[0].request: expected the name of a group: g, got 'gg'; did you mean 'g'?",
+        "gg",
+    ),
+    (group("g", "g"), "group[0].member: expected names without a ring, got the ring 'g' in 'g'", ["g", "g"]),
+    (
+        group("g", "h") + group("h", "g"),
+        "group[0].member: expected names without a ring, got the ring 'g' in 'h' in 'g'",
+        ["g", "h", "g"],
+    ),
     (A + "replicas = -1\n", "keep[0].replicas: expected a whole number from 0 to 10000, got -1 (int)", -1),
     (A + "replicas = 1.5\n", "keep[0].replicas: expected `int`, got 1.5 (float)", 1.5),
     (A + 'request = "{instance}"\nreplicas = 10001\n', "keep[0].replicas: expected a whole number from 0", 10001),

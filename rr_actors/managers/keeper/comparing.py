@@ -11,8 +11,8 @@ from typing import Literal
 
 import msgspec
 
+from rr_actors.managers.planning.setbacks import Setback
 from rr_actors.registrar.model.rows import State
-from rr_actors.supervision.core.specs import Backoff
 
 Slot = tuple[str, int]
 """The name of a kind of thing that is kept, and the number of the replica."""
@@ -21,7 +21,8 @@ OVER_CAPACITY = "over capacity"
 FAILING = "failing"
 ALL_FAILING = "all failing"
 LOADING = "loading"
-_HINDERED = (NONE_REGISTERED, OVER_CAPACITY, FAILING, ALL_FAILING)
+UNLOAD_FAILED = "unload failed"
+_HINDERED = (NONE_REGISTERED, OVER_CAPACITY, FAILING, ALL_FAILING, UNLOAD_FAILED)
 
 
 class Wanted(msgspec.Struct, frozen=True):
@@ -47,6 +48,7 @@ class Seen(msgspec.Struct, frozen=True):
             been answered. "ending": nobody holds it, and it has not been unloaded yet.
         state, message: of its last status.
         not_before: while it is held: the time before which it is not released, as a release has failed.
+        stuck: why its last release has failed: it may be running still, so no second one is loaded. "": it has not.
         is_slow: whether it has been loading for a while, so that the failure before is not the reason any more.
     """
 
@@ -59,6 +61,7 @@ class Seen(msgspec.Struct, frozen=True):
     priority: int | None = 0
     message: str = ""
     not_before: float = 0.0
+    stuck: str = ""
     is_slow: bool = False
 
     @property
@@ -70,15 +73,6 @@ class Seen(msgspec.Struct, frozen=True):
     def is_ready(self) -> bool:
         """Whether it can be used."""
         return self.phase == "held" and self.state not in (State.ERROR, State.FATAL)
-
-
-class Failure(msgspec.Struct, frozen=True):
-    """That a replica could not be loaded, or was lost: `count` times in a row. It is loaded again at `retry_at`."""
-
-    count: int
-    retry_at: float
-    reason: str
-    text: str = ""
 
 
 class Steps(msgspec.Struct):
@@ -114,13 +108,7 @@ class Report(msgspec.Struct, frozen=True):
     is_hindered: bool = False
 
 
-def failure(before: Failure | None, ran_s: float, now: float, reason: str, text: str, backoff: Backoff) -> Failure:
-    """Return the failure after `before`. The waiting times grow, and begin anew after a run of `backoff.maximum_s`."""
-    count = 0 if before is None or ran_s >= backoff.maximum_s else before.count
-    return Failure(count + 1, now + backoff.delay(count, 0.0), reason, text)
-
-
-def compare(wanted: Sequence[Wanted], seen: Iterable[Seen], failures: Mapping[Slot, Failure], now: float) -> Steps:
+def compare(wanted: Sequence[Wanted], seen: Iterable[Seen], failures: Mapping[Slot, Setback], now: float) -> Steps:
     """Return the steps from what is seen to what is wanted.
 
     A slot is loaded only when nothing else is left in it, so there is never a second one of a replica.
@@ -153,7 +141,7 @@ def unready(wanted: Iterable[Wanted], there: Mapping[Slot, Sequence[Seen]]) -> s
 
 
 def report(
-    names: Iterable[str], wanted: Iterable[Wanted], seen: Iterable[Seen], failures: Mapping[Slot, Failure]
+    names: Iterable[str], wanted: Iterable[Wanted], seen: Iterable[Seen], failures: Mapping[Slot, Setback]
 ) -> dict[str, Report]:
     """Return how each of the names is."""
     of_name: dict[str, list[Wanted]] = {name: [] for name in names}
@@ -168,7 +156,7 @@ def _report(
     name: str,
     wanted: Sequence[Wanted],
     there: Mapping[Slot, Sequence[Seen]],
-    failures: Mapping[Slot, Failure],
+    failures: Mapping[Slot, Setback],
     waiting: set[str],
 ) -> Report:
     missing = [one for one in wanted if not _is_ready(one, there.get(one.slot, ()))]
@@ -181,9 +169,11 @@ def _report(
     return Report(name, len(wanted), len(wanted) - len(missing), ", ".join(whys), detail, is_hindered)
 
 
-def _reason(one: Wanted, found: Sequence[Seen], failed: Failure | None, waiting: set[str]) -> tuple[str, str]:
+def _reason(one: Wanted, found: Sequence[Seen], failed: Setback | None, waiting: set[str]) -> tuple[str, str]:
     """Return why a replica is not ready, and the text of the failure."""
     right = _right(one, found)
+    if right is None and (stuck := next((other.stuck for other in found if other.stuck), "")):
+        return UNLOAD_FAILED, stuck
     if right is not None and right.phase == "held":
         return FAILING, right.message
     if right is None and (before := [name for name in one.after if name in waiting]):

@@ -21,14 +21,14 @@ A file has a table for each kind of thing that is kept::
 from __future__ import annotations
 
 import graphlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import msgspec
 
-from rr_actors.base.errors import InvalidName, did_you_mean, few, shown
+from rr_actors.base.errors import ConfigError, InvalidName, did_you_mean, few, shown
 from rr_actors.base.names import parse_server_id
-from rr_actors.base.toml import parse_typed, wrong
+from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.base.values.canonical import encode
 from rr_actors.managers.keeper.comparing import Wanted
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
@@ -83,7 +83,11 @@ class KeepFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Replica(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request for one replica. `members`: of the group that it loads, so a changed group is loaded anew."""
+    """The request for one replica.
+
+    `members`: what it loads in place of a group: its members, and those of the groups in it. They are part of the
+    request, so a replica of a changed group is another one.
+    """
 
     keep: str
     instance: int
@@ -102,14 +106,21 @@ class Desired(msgspec.Struct, frozen=True):
         """Return all replicas that are wanted; `group_server` is the id of the server of groups."""
         found: list[tuple[Wanted, Replica]] = []
         for keep in self.keeps.values():
-            members: tuple[Member, ...] = ()
-            if keep.server == group_server and isinstance(keep.request, str) and keep.request in self.groups:
-                members = self.groups[keep.request].member
             priority = None if keep.standby else keep.priority
             for i in range(keep.replicas):
-                replica = Replica(keep.name, i, keep.server, numbered(keep.request, i), members)
+                request = numbered(keep.request, i)
+                members = self.members(request, group_server) if keep.server == group_server else ()
+                replica = Replica(keep.name, i, keep.server, request, members)
                 found.append((Wanted(keep.name, i, encode(replica), priority, keep.after), replica))
         return found
+
+    def members(self, group: Request, group_server: str) -> tuple[Member, ...]:
+        """Return the members of a group, with those of the groups in it in their place; each of them once."""
+        found: dict[bytes, Member] = {}
+        for member in self.groups[group].member if isinstance(group, str) and group in self.groups else ():
+            inner = self.members(member.request, group_server) if member.server == group_server else (member,)
+            found |= {encode(one): one for one in inner if encode(one) not in found}
+        return tuple(found.values())
 
 
 def numbered(request: Request, instance: int) -> Request:
@@ -123,71 +134,91 @@ def numbered(request: Request, instance: int) -> Request:
     return request
 
 
-def parse_desired(data: bytes, file: str) -> Desired:
-    """Return what the bytes of a TOML file called `file` want.
+def parse_desired(data: bytes, file: str, group_server: str = "keeper/group") -> Desired:
+    """Return what the bytes of a TOML file called `file` want; `group_server` is the id of the server of groups.
 
     Raises:
-        ConfigError: they are no TOML, or a key is wrong. `.file`, `.key`, `.expected`, `.got`
+        ConfigError: they are no TOML, or keys are wrong: the text has all of them. `.file`, `.key`, `.expected`, `.got`
+            are of the first.
     """
     parsed = parse_typed(data, file, KeepFile)
-    checks = _Checks(file)
-    keeps = {keep.name: keep for keep in parsed.keep}
+    checks = _Checks(file, group_server, parsed)
     checks.names("keep", [keep.name for keep in parsed.keep])
     checks.names("group", [group.name for group in parsed.group])
     for i, keep in enumerate(parsed.keep):
-        checks.keep(f"keep[{i}]", keep, keeps)
+        checks.keep(f"keep[{i}]", keep)
     for i, group in enumerate(parsed.group):
         for j, member in enumerate(group.member):
-            checks.server(f"group[{i}].member[{j}].server", member.server)
-    checks.order(parsed.keep)
-    return Desired(keeps, {group.name: group for group in parsed.group})
+            checks.loads(f"group[{i}].member[{j}]", member.server, [member.request])
+    checks.no_ring("keep", "after", {keep.name: keep.after for keep in parsed.keep}, "after")
+    checks.no_ring("group", "member", {group.name: checks.inner(group) for group in parsed.group}, "in")
+    raise_faults(checks.faults)
+    return Desired({keep.name: keep for keep in parsed.keep}, {group.name: group for group in parsed.group})
 
 
 class _Checks:
-    """The checks of one file. Each raises ConfigError."""
+    """The checks of one file. `faults` has what is wrong."""
 
-    def __init__(self, file: str) -> None:
+    def __init__(self, file: str, group_server: str, parsed: KeepFile) -> None:
+        self.faults: list[ConfigError] = []
         self._file = file
+        self._group_server = group_server
+        self._keeps = [keep.name for keep in parsed.keep]
+        self._groups = [group.name for group in parsed.group]
 
     def names(self, table: str, names: list[str]) -> None:
         seen = set[str]()
         for i, name in enumerate(names):
             if not name or name in seen:
                 said = f"{shown(name)} again" if name else None
-                raise wrong(self._file, f"{table}[{i}].name", f"a name that no other {table} has", name, said=said)
+                self._wrong(f"{table}[{i}].name", f"a name that no other {table} has", name, said)
             seen.add(name)
 
-    def keep(self, key: str, keep: Keep, keeps: Mapping[str, Keep]) -> None:
-        self.server(f"{key}.server", keep.server)
+    def keep(self, key: str, keep: Keep) -> None:
+        replicas = min(max(keep.replicas, 1), MOST_REPLICAS)
+        self.loads(key, keep.server, [numbered(keep.request, i) for i in range(replicas)])
         self._within(f"{key}.replicas", keep.replicas, 0, MOST_REPLICAS)
         self._within(f"{key}.priority", keep.priority, LOWEST, HIGHEST)
         if keep.replicas > 1 and numbered(keep.request, 0) == keep.request:
             expected = f"a request with {INSTANCE}, so that the {keep.replicas} replicas differ"
-            raise wrong(self._file, f"{key}.request", expected, keep.request)
+            self._wrong(f"{key}.request", expected, keep.request)
         for i, name in enumerate(keep.after):
-            if name not in keeps:
-                said = f"{shown(name)}{did_you_mean(name, keeps)}"
-                raise wrong(self._file, f"{key}.after[{i}]", f"one of {few(keeps)}", name, said=said)
+            if name not in self._keeps:
+                said = f"{shown(name)}{did_you_mean(name, self._keeps)}"
+                self._wrong(f"{key}.after[{i}]", f"one of {few(self._keeps)}", name, said)
 
-    def server(self, key: str, server: str) -> None:
+    def loads(self, key: str, server: str, requests: Sequence[Request]) -> None:
+        """Check what a table loads; of a group, that there is one."""
         try:
             parse_server_id(server)
-        except InvalidName as error:
-            raise wrong(self._file, key, "the id of a server, 'registrar/server'", server) from error
+        except InvalidName:
+            self._wrong(f"{key}.server", "the id of a server, 'registrar/server'", server)
+        unknown = [one for one in requests if not isinstance(one, str) or one not in self._groups]
+        if server == self._group_server and unknown:
+            name = unknown[0]
+            said = f"{shown(name)}{did_you_mean(name, self._groups) if isinstance(name, str) else ''}"
+            self._wrong(f"{key}.request", f"the name of a group: {few(self._groups) or 'none'}", name, said)
 
-    def order(self, keeps: tuple[Keep, ...]) -> None:
-        """Check that nothing is, in the end, after itself."""
+    def inner(self, group: Group) -> tuple[str, ...]:
+        """Return the names of the groups that are members of one."""
+        names = (member.request for member in group.member if member.server == self._group_server)
+        return tuple(name for name in names if isinstance(name, str))
+
+    def no_ring(self, table: str, field: str, graph: Mapping[str, tuple[str, ...]], word: str) -> None:
+        """Check that nothing is, in the end, after itself, or in itself."""
         try:
-            graphlib.TopologicalSorter({keep.name: keep.after for keep in keeps}).prepare()
+            graphlib.TopologicalSorter(graph).prepare()
         except graphlib.CycleError as error:
-            ring = " after ".join(map(shown, reversed(error.args[1])))
-            index = next(i for i, keep in enumerate(keeps) if keep.name == error.args[1][-1])
-            key = f"keep[{index}].after"
-            raise wrong(self._file, key, "names without a ring", error.args[1], said=f"the ring {ring}") from error
+            ring = f" {word} ".join(map(shown, reversed(error.args[1])))
+            key = f"{table}[{list(graph).index(error.args[1][-1])}].{field}"
+            self._wrong(key, "names without a ring", error.args[1], f"the ring {ring}")
 
     def _within(self, key: str, number: int, least: int, most: int) -> None:
         if not least <= number <= most:
-            raise wrong(self._file, key, f"a whole number from {least} to {most}", number)
+            self._wrong(key, f"a whole number from {least} to {most}", number)
+
+    def _wrong(self, key: str, expected: str, got: object, said: str | None = None) -> None:
+        self.faults.append(wrong(self._file, key, expected, got, said=said))
 
 
 def changes(before: Desired, after: Desired) -> list[str]:

@@ -1,8 +1,7 @@
 """Keeper: the manager that keeps what a file wants.
 
 Each replica is a resource of the keeper's own server `replica`, and what is kept is its part. So the catalog alone
-says what is there, also after a crash. One thread looks, compares (comparing.py), and begins the steps. All else that
-happens only wakes it.
+says what is there, also after a crash. The planning loop looks, compares (comparing.py), and begins the steps.
 """
 
 from __future__ import annotations
@@ -10,20 +9,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import queue
-import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 
-from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import (
     CatalogError,
-    ConfigError,
-    MailboxFull,
     NotFound,
     OverCapacity,
     RegistrarDown,
@@ -31,6 +25,7 @@ from rr_actors.base.errors import (
     UnknownQuery,
     UnknownRegistrar,
     UnknownServer,
+    UnloadFailed,
     UsageError,
     did_you_mean,
     few,
@@ -38,12 +33,13 @@ from rr_actors.base.errors import (
     text_of,
 )
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.toml import read_bytes
 from rr_actors.base.values.canonical import encode
 from rr_actors.managers.keeper import comparing
-from rr_actors.managers.keeper.comparing import Failure, Report, Seen, Slot, Steps, Wanted
+from rr_actors.managers.keeper.comparing import Report, Seen, Slot, Steps, Wanted
 from rr_actors.managers.keeper.desired import Desired, Replica, Request, changes, parse_desired
-from rr_actors.managers.planning.kept_record import KeptRecord
+from rr_actors.managers.planning.last_good import LastGood, Sources, one_file
+from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.setbacks import BACKOFF, Setbacks
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
@@ -54,10 +50,11 @@ from rr_actors.supervision.core.specs import Backoff
 
 logger = Log("rr_actors.managers.keeper")
 
-BACKOFF = Backoff(delay_s=0.1, factor=2.0, maximum_s=5.0, jitter=0.0)
 _SOON_S = 0.05  # so long after a look the next one, while a holder's response is on its way
 _LOOK_S = 1.0  # while something is not as it is wanted, it looks so often: not every end is announced
 _APPLY_S = 30.0
+_GROUP_CHANGED = "the group has other members by now: load it anew"
+_PART_S = 5.0  # so long the release of a replica waits for that of its part; if it takes longer, it is owed
 
 
 class Kept(msgspec.Struct, frozen=True):
@@ -67,38 +64,13 @@ class Kept(msgspec.Struct, frozen=True):
         name: the name in the file.
         wanted, ready: how many replicas.
         why: why others are not ready: "none registered", "over capacity", "failing", "all failing", "waits for NAME",
-            "loading", or several of them; "" if all are.
+            "loading", "unload failed", or several of them; "" if all are.
     """
 
     name: str
     wanted: int
     ready: int
     why: str = ""
-
-
-class _Record(msgspec.Struct):
-    """What apply() has set, and the text of the file that it replaced."""
-
-    replaced: str = ""
-    text: str = ""
-    file: str = ""
-
-
-class _Loading(msgspec.Struct):
-    """A load that has not been answered."""
-
-    wanted: Wanted
-    future: Reply[Query]
-    since: float
-
-
-class _Failed:
-    """The message that the thread has failed with an error."""
-
-    __match_args__ = ("error",)
-
-    def __init__(self, error: Exception) -> None:
-        self.error = error
 
 
 class Keeper(Manager):
@@ -115,18 +87,19 @@ class Keeper(Manager):
         Raises:
             ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
-        self._file = str(Path(file).absolute())
-        self._text = read_bytes(self._file)
-        self._configured = parse_desired(self._text, self._file)
+        path, beginning = Path(file).absolute(), self._beginning()
+        name = "keeper" if beginning is None else beginning.name
+        self._group_server = f"{name}/group"
+        self._configuration = LastGood(beginning, lambda: one_file(path), self._parse)
+        self._loop: PlanningLoop[Slot | str, Wanted | None] = PlanningLoop("keeper", self._look, self._failed)
         self._backoff = backoff
-        self._happened: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
-        self._loading: dict[Slot, _Loading] = {}
-        self._releasing: set[str] = set()
+        self._failures: Setbacks[Slot] = Setbacks(backoff)
         self._not_before: dict[str, float] = {}
-        self._failures: dict[Slot, Failure] = {}
+        self._stuck: dict[str, str] = {}  # by query: why it could not be released
         self._errors: dict[Slot, RrError] = {}  # of load callbacks: they know more than what their callers hear
         self._held_since: dict[str, float] = {}
         self._messages: dict[str, str] = {}
+        self._said: dict[str, str] = {}  # by resource of `kept`: what its holders have heard
         self._lost: set[str] = set()
         self._is_full = False  # something of the last look could not be written
         self._what: dict[str, bytes] = {}  # by query, as its replica does not change
@@ -136,24 +109,33 @@ class Keeper(Manager):
     def on_start(self) -> None:
         """Go on with what is held."""
         self.registrar.on_status(f"{self.registrar.name}/replica", self._hear)
-        threading.Thread(target=self._run, name="keeper", daemon=True).start()
+        self._loop.start()
 
     def on_stop(self) -> None:
         """Begin no more steps."""
-        self._happened.put(None)
+        self._loop.stop()
+
+    @property
+    def _desired(self) -> Desired:
+        return self._configuration.now
+
+    def _parse(self, sources: Sources) -> Desired:
+        ((file, data),) = sources.items()
+        return parse_desired(data, file, self._group_server)
 
     # -- messages --------------------------------------------------------------------------------------------------
 
     def apply(self, file: str | os.PathLike[str]) -> list[str]:
-        """Keep what another TOML file wants instead, also after a restart, until the first file changes.
+        """Keep what another TOML file wants instead, also after a restart, until a start finds the first file changed.
 
         Return a line for each change, when the steps that follow from it have begun: "~ camera: replicas 3 -> 1".
+        Another line says so if the disk does not take it: then it holds until the next restart.
 
         Raises:
             ConfigError: the file cannot be read, or is wrong. Nothing has changed.
         """
         path = str(Path(file).absolute())
-        return self._apply(read_bytes(path), path)
+        return self._apply(one_file(path))
 
     def get(self) -> list[Kept]:
         """Return how all that is kept is."""
@@ -168,35 +150,29 @@ class Keeper(Manager):
         if file is None:
             return self._differences()
         path = str(Path(file).absolute())
-        return changes(self._desired, parse_desired(read_bytes(path), path))
+        return changes(self._desired, self._parse(one_file(path)))
 
     def on_receive(self, message: Any) -> Any:
         """Answer what `rr-actors apply` and `rr-actors keep` ask."""
         match message:
             case {"apply": str(text), "file": str(file)}:
-                return self._apply(text.encode(), file)
+                return self._apply({file: text.encode()})
             case {"diff": str(text), "file": str(file)}:
-                return changes(self._desired, parse_desired(text.encode(), file))
+                return changes(self._desired, self._parse({file: text.encode()}))
             case {"diff": None}:
                 return self._differences()
-            case _Failed(error):
-                raise error
             case {"get": None}:
                 return [msgspec.structs.asdict(report) for report in self._newest_reports().values()]
             case _:
                 raise UsageError(f"{self.registrar.name}: expected a question to a Keeper, got {shown(message)}")
 
-    def _apply(self, data: bytes, file: str) -> list[str]:
-        wanted = parse_desired(data, file)
-        made = changes(self._desired, wanted)
-        self._record.now = _Record(self._text.decode(), data.decode(), file)
-        self._record.save()
-        done = threading.Event()
-        self._desired = wanted
-        self._happened.put(lambda: self._failures.clear())  # what failed is tried again at once
-        self._happened.put(lambda: self._look(done))
-        done.wait(_APPLY_S)
-        return made
+    def _apply(self, sources: Sources) -> list[str]:
+        before = self._desired
+        is_kept = self._configuration.apply(sources)
+        made = changes(before, self._desired)
+        self._loop.tell(self._failures.clear)  # what failed is tried again at once
+        self._loop.look_and_wait(_APPLY_S)
+        return made if is_kept else [*made, "! this is not on disk: a restart would not know of it"]
 
     def _differences(self) -> list[str]:
         behind = [one for one in self._newest_reports().values() if one.why]
@@ -210,7 +186,7 @@ class Keeper(Manager):
         reports = self._newest_reports()
         if request not in reports:
             raise self._not_found("keep", request, reports)
-        self._happened.put(lambda: None)  # the looks that follow tell what changes until this is loaded
+        self._loop.wake()  # the looks that follow tell what changes until this is loaded
         return _kept(reports[request])
 
     @server("group", recovery="keep")
@@ -227,7 +203,8 @@ class Keeper(Manager):
         slot = request.keep, request.instance
         self._errors.pop(slot, None)
         try:
-            await self._load_part(request.server, request.request)
+            for member in request.members or (request,):
+                await self._load_part(member.server, member.request)
         except RrError as error:
             self._errors[slot] = error
             raise
@@ -239,70 +216,54 @@ class Keeper(Manager):
         text = f"{self.registrar.name}: no {table} {shown(name)}: expected one of {few(known) or 'none'}"
         return NotFound(text + did_you_mean(name, known), id=name, known=tuple(known))
 
-    # -- the thread that looks -------------------------------------------------------------------------------------
+    # -- the loop ----------------------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        """Look, and look again after each thing that happens, until the registrar is closed."""
-        try:
-            wait_s = self._look()
-            while True:
-                for happened in self._all_that_happened(wait_s):
-                    if happened is None:
-                        return
-                    happened()
-                wait_s = self._look()
-        except RegistrarDown:
-            return
-        except Exception as error:  # a fault in here: the manager is to end with it, and to be started again
-            self.actor_ref.tell(_Failed(error))
-
-    def _all_that_happened(self, wait_s: float | None) -> Iterator[Callable[[], object] | None]:
-        with contextlib.suppress(queue.Empty):
-            yield self._happened.get(timeout=wait_s)
-            while True:
-                yield self._happened.get_nowait()
-
-    def _look(self, done: threading.Event | None = None) -> float | None:
-        """Compare once, and begin the steps; return after how many seconds to look again, None if all is well."""
-        desired, now = self._desired, time.monotonic()
+    def _look(self, now: float) -> float | None:
+        """Compare once, and begin the steps; return when to look again, None if all is well."""
+        desired = self._desired
+        infos = self.registrar.resources()
         if self._wanted is None or self._wanted[0] is not desired:
-            self._wanted = desired, desired.replicas(f"{self.registrar.name}/group")
+            self._wanted = desired, desired.replicas(self._group_server)
+            self._tell_groups(infos, desired)
         replicas = self._wanted[1]
         wanted, requests = [one for one, _ in replicas], {one.slot: replica for one, replica in replicas}
-        infos = self.registrar.resources()
-        seen = list(self._seen(infos))
-        self._failures = {slot: failed for slot, failed in self._failures.items() if slot in requests}
+        seen = list(self._seen(infos, now))
+        self._failures.keep_only(requests)
         self._note_losses(seen, now)
         steps = comparing.compare(wanted, seen, self._failures, now)
         self._is_full = False
         self._carry_out(steps, requests)
-        reports = comparing.report(desired.keeps, wanted, seen, self._failures)
-        self._reports = reports
+        self._reports = reports = comparing.report(desired.keeps, wanted, seen, self._failures)
         self._tell(infos, reports)
-        if done is not None:
-            done.set()
         if any(info.server == "kept" and info.phase is Phase.LOADING for info in infos):
-            return _SOON_S
+            return now + _SOON_S
         if steps.next_at is not None:
-            return min(_LOOK_S, max(0.0, steps.next_at - now))
-        is_behind = any(one.why for one in reports.values()) or bool(steps.release or self._releasing)
-        return _LOOK_S if is_behind or self._is_full else None
+            return min(now + _LOOK_S, steps.next_at)
+        is_behind = self._is_full or bool(steps.release) or any(one.why for one in reports.values())
+        return now + _LOOK_S if is_behind or any(isinstance(key, str) for key in self._loop.in_flight) else None
 
     # -- what is there ---------------------------------------------------------------------------------------------
 
-    def _seen(self, infos: list[ResourceInfo]) -> Iterator[Seen]:
-        """Yield the replicas that are held, that are being loaded, and that nobody holds any more."""
-        for loading in self._loading.values():
-            one, is_slow = loading.wanted, time.monotonic() - loading.since >= _LOOK_S
-            yield Seen(one.keep, one.instance, one.what, "loading", is_slow=is_slow)
+    def _seen(self, infos: list[ResourceInfo], now: float) -> Iterator[Seen]:
+        """Yield the replicas that are being loaded, that are held, and that nobody holds any more.
+
+        What a load in flight has made is a part of that load, also if the registrar lists it as held already.
+        """
+        loading = dict[bytes, Wanted]()
+        for step in self._loop.in_flight.values():
+            if (one := step.what) is not None:
+                loading[one.what] = one
+                yield Seen(one.keep, one.instance, one.what, "loading", is_slow=now - step.since >= _LOOK_S)
         by_id = {info.id: info for info in infos}
-        queries = [query for query in self.registrar.queries() if query.server == "replica" and self._is_own(query)]
-        for query in queries:
-            yield self._held(query, by_id.get(query.resource_id))
-        held = {query.resource_id for query in queries}
-        started = {loading.wanted.what for loading in self._loading.values()}
+        held = set[str]()
+        for query in self.registrar.queries():
+            if query.server == "replica" and self._is_own(query):
+                held.add(query.resource_id)
+                one = self._held(query, by_id.get(query.resource_id))
+                if one.what not in loading:
+                    yield one
         for info in infos:
-            if info.server == "replica" and info.id not in held and (what := encode(info.request)) not in started:
+            if info.server == "replica" and info.id not in held and (what := encode(info.request)) not in loading:
                 yield Seen(info.request.keep, info.request.instance, what, "ending")
 
     def _is_own(self, query: Query) -> bool:
@@ -316,18 +277,19 @@ class Keeper(Manager):
             replica.keep,
             replica.instance,
             self._what[query.id],
-            "releasing" if query.id in self._releasing else "held",
+            "releasing" if query.id in self._loop.in_flight else "held",
             query.id,
             State.FATAL if query.released else State(query.state),
             info.priority if info is not None and info.queries == (query.id,) else _priority(query),
             self._messages.get(query.id, ""),
             self._not_before.get(query.id, 0.0),
+            self._stuck.get(query.id, ""),
         )
 
     def _note_losses(self, seen: list[Seen], now: float) -> None:
         """Note each replica that has been lost, once, and forget what is not held any more."""
         held = {one.id for one in seen if one.id}
-        for known in (self._held_since, self._messages, self._not_before, self._what):
+        for known in (self._held_since, self._messages, self._not_before, self._stuck, self._what):
             for id in [id for id in known if id not in held]:
                 del known[id]
         for one in seen:
@@ -335,20 +297,17 @@ class Keeper(Manager):
                 self._held_since[one.id] = now
             if one.state is State.FATAL and one.id not in self._lost:
                 self._lost.add(one.id)
-                self._note_failed(one.slot, now - self._held_since[one.id], comparing.FAILING, one.message)
+                ran_s = now - self._held_since[one.id]
+                self._failures.note(one.slot, now, ran_s=ran_s, reason=comparing.FAILING, text=one.message)
         self._lost &= held
-
-    def _note_failed(self, slot: Slot, ran_s: float, reason: str, text: str) -> None:
-        before, now = self._failures.get(slot), time.monotonic()
-        self._failures[slot] = comparing.failure(before, ran_s, now, reason, text, self._backoff)
 
     # -- steps -----------------------------------------------------------------------------------------------------
 
     def _carry_out(self, steps: Steps, requests: dict[Slot, Replica]) -> None:
         for one in steps.withdraw:
-            self._loading[one.slot].future.cancel()
+            self._loop.withdraw(one.slot)
         for one in steps.release:
-            self._release(one)
+            self._release(one, self._parts(one))
         for one, priority in steps.prioritise:
             with self._unless_full(), contextlib.suppress(UsageError):  # gone, or the registrar has a `max_priority`
                 self.registrar.set_priority(one.id, priority)
@@ -357,37 +316,44 @@ class Keeper(Manager):
 
     def _load(self, one: Wanted, replica: Replica) -> None:
         place = f"{self.registrar.name}/replica"
-        try:
-            loading = self.registrar.load(place, replica, priority=one.priority, timeout_s=None, block=False)
-        except (UsageError, MailboxFull) as error:  # of a priority over the registrar's `max_priority`, for instance
-            self._note_failed(one.slot, 0.0, comparing.FAILING, text_of(error))
-            return
-        future = cast("Reply[Query]", loading)
-        self._loading[one.slot] = _Loading(one, future, time.monotonic())
-        future.add_done_callback(lambda _: self._happened.put(lambda: self._loaded(one, future)))
+        begin = functools.partial(
+            self.registrar.load, place, replica, priority=one.priority, timeout_s=None, block=False
+        )
+        self._loop.begin(one.slot, one, begin, functools.partial(self._loaded, one))
 
-    def _loaded(self, one: Wanted, future: Reply[Query]) -> None:
-        del self._loading[one.slot]
-        if not future.cancelled() and (error := future.exception()) is not None:
-            known = self._errors.get(one.slot) or error
+    def _loaded(self, one: Wanted, ended: Ended) -> None:
+        if ended.error is not None:
+            known = self._errors.get(one.slot) or ended.error
             logger.info("%s %d: %s", one.keep, one.instance, text_of(known))
-            self._note_failed(one.slot, 0.0, _reason_of(known), text_of(known))
+            self._failures.note(one.slot, time.monotonic(), reason=_reason_of(known), text=text_of(known))
 
-    def _release(self, one: Seen) -> None:
-        self._releasing.add(one.id)
+    def _parts(self, one: Seen) -> list[str]:
+        """Return the queries of a replica's parts, the last of them first."""
         try:
-            future = cast("Reply[None]", self.registrar.unload(one.id, timeout_s=None, block=False))
+            return [part.id for part in reversed(self.registrar.children(one.id))]
         except UnknownQuery:  # it has just gone
-            self._releasing.discard(one.id)
-            return
-        future.add_done_callback(lambda _: self._happened.put(lambda: self._released(one, future)))
+            return []
 
-    def _released(self, one: Seen, future: Reply[None]) -> None:
-        self._releasing.discard(one.id)
-        error = future.exception()
-        if error is not None and not isinstance(error, UnknownQuery):
-            logger.warning("%s %d cannot be released: %s", one.keep, one.instance, text_of(error))
+    def _release(self, one: Seen, parts: Sequence[str]) -> None:
+        """Release a replica after its parts. If one cannot be unloaded, it may be running still, and stays a part."""
+        if parts:
+            release = functools.partial(self.registrar.unload, parts[0], timeout_s=_PART_S, block=False)
+            self._loop.begin(one.id, None, release, functools.partial(self._part_released, one, parts[1:]))
+        else:
+            release = functools.partial(self.registrar.unload, one.id, timeout_s=None, block=False)
+            self._loop.begin(one.id, None, release, functools.partial(self._released, one))
+
+    def _part_released(self, one: Seen, parts: Sequence[str], ended: Ended) -> None:
+        if isinstance(ended.error, UnloadFailed):
+            self._released(one, ended)
+        else:  # a provider that does not run has it later: the release is owed
+            self._release(one, parts)
+
+    def _released(self, one: Seen, ended: Ended) -> None:
+        if ended.error is not None and not isinstance(ended.error, UnknownQuery):
+            logger.warning("%s %d cannot be released: %s", one.keep, one.instance, text_of(ended.error))
             self._not_before[one.id] = time.monotonic() + self._backoff.maximum_s
+            self._stuck[one.id] = text_of(ended.error)
 
     @contextlib.contextmanager
     def _unless_full(self) -> Generator[None]:
@@ -401,7 +367,7 @@ class Keeper(Manager):
 
     def _hear(self, status: Status) -> None:
         """Note a status of a replica. It is about the replica alone: the keeper's own resources do not hear it."""
-        self._happened.put(lambda: self._messages.__setitem__(status.query_id, status.message))
+        self._loop.tell(functools.partial(self._messages.__setitem__, status.query_id, status.message))
 
     def _tell(self, infos: list[ResourceInfo], reports: dict[str, Report]) -> None:
         """Tell the holders of `kept` what has changed."""
@@ -413,38 +379,37 @@ class Keeper(Manager):
                 self._tell_one(info, report)
 
     def _tell_one(self, info: ResourceInfo, report: Report) -> None:
+        said, state = _said(report), _state_of(report)
         is_new = info.response != _kept(report)
         if is_new:
-            self.registrar.update_response(info, _kept(report), _said(report))
-        state = _state_of(report)
+            self.registrar.update_response(info, _kept(report), said)
         if state is State.OK:
             is_news = info.status in (State.WARNING, State.ERROR)
         else:
-            is_news = is_new or info.status is not state
+            is_news = is_new or info.status is not state or info.message != said
         if is_news:
-            self.registrar.send_status(info, Status(state, _said(report)))
+            self.registrar.send_status(info, Status(state, said))
+
+    def _tell_groups(self, infos: list[ResourceInfo], desired: Desired) -> None:
+        """Tell the holders of each group whether it is still as the file says."""
+        for info in infos:
+            if info.server != "group" or info.phase is not Phase.LOADED or info.status is State.FATAL:
+                continue
+            members = desired.groups[info.request].member if info.request in desired.groups else ()
+            wanted = [encode([member.server, member.request]) for member in members]
+            with self._unless_full(), contextlib.suppress(UsageError):  # it has just been unloaded
+                parts = self.registrar.children(info)
+                if wanted != [encode([f"{part.registrar}/{part.server}", part.request]) for part in parts]:
+                    self.registrar.send_status(info, Status(State.WARNING, _GROUP_CHANGED))
+                elif info.message == _GROUP_CHANGED:
+                    self.registrar.send_status(info, Status(State.OK, "the group is as it was loaded again"))
 
     def _newest_reports(self) -> dict[str, Report]:
         """Return the reports of the last look, or, before the first, of nothing."""
         if self._reports is not None:
             return self._reports
-        wanted = [one for one, _ in self._desired.replicas(f"{self.registrar.name}/group")]
+        wanted = [one for one, _ in self._desired.replicas(self._group_server)]
         return comparing.report(self._desired.keeps, wanted, [], {})
-
-    # -- what is wanted --------------------------------------------------------------------------------------------
-
-    @functools.cached_property
-    def _record(self) -> KeptRecord[_Record]:
-        return KeptRecord(self.registrar.directory / "keeper.json", _Record)
-
-    @functools.cached_property
-    def _desired(self) -> Desired:
-        """What is wanted: by the file, or by the one that was applied since."""
-        record = self._record.now
-        if record.file and record.replaced == self._text.decode():
-            with contextlib.suppress(ConfigError):  # written by another version
-                return parse_desired(record.text.encode(), record.file)
-        return self._configured
 
 
 def _priority(query: Query) -> int | None:

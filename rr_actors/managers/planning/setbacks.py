@@ -6,8 +6,8 @@ well for as long as the limit begins anew. While something waits, its manager te
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
-from typing import Generic, TypeVar
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from typing import TypeVar
 
 import msgspec
 
@@ -59,7 +59,7 @@ def next_setback(
     return Setback(count + 1, now + backoff.delay(count, 0.0), reason, text, failure_id)
 
 
-class Setbacks(Generic[K]):
+class Setbacks(Mapping[K, Setback]):
     """The setbacks of one manager, by what has failed. It has no lock: use it on one thread, or under a lock."""
 
     def __init__(self, backoff: Backoff = BACKOFF) -> None:
@@ -75,9 +75,14 @@ class Setbacks(Generic[K]):
         self._of[key] = made
         return made
 
-    def get(self, key: K) -> Setback | None:
-        """Return the last setback; None if there is none, or it is forgotten."""
-        return self._of.get(key)
+    def __getitem__(self, key: K) -> Setback:
+        return self._of[key]
+
+    def __iter__(self) -> Iterator[K]:
+        return iter(self._of)
+
+    def __len__(self) -> int:
+        return len(self._of)
 
     def may_try(self, key: K, now: float) -> bool:
         """Return whether it may be tried now."""
