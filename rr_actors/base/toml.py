@@ -1,6 +1,6 @@
 """TOML: the one place that reads it. Every fault is a ConfigError, also a fault that the standard library accepts.
 
-The errors for wrong keys and values are made here, too, for files and for arguments. read_typed() makes a msgspec
+The errors for wrong keys and values are made here, too, for files and for arguments. parse_typed() makes a msgspec
 Struct of a file. The end reads supervision trees.
 
 msgspec imports the standard library's reader when the first file is read: most programs read none.
@@ -13,9 +13,9 @@ import functools
 import importlib
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 
@@ -129,63 +129,82 @@ def _check_integers(value: object) -> None:
 
 # -- tables with a type ----------------------------------------------------------------------------------------------
 
-_FIELD = re.compile(r"Object (contains unknown|missing required) field `(.+)`\Z", re.DOTALL)
-_STEP = re.compile(r"\[(\d+)\]|\.?([^.\[\]]+)")
-
-
-def read_typed(file: str, kind: type[_T]) -> _T:
-    """Return the content of a TOML file as a `kind`, a msgspec Struct.
-
-    Raises:
-        ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or of the wrong type. `.file`,
-            `.key`, `.expected`, `.got`
-    """
-    return parse_typed(read_bytes(file), file, kind)
+_BETWEEN_TICKS = re.compile("`([^`]+)`")
 
 
 def parse_typed(data: bytes, file: str, kind: type[_T]) -> _T:
-    """Return the bytes of a TOML file called `file` as a `kind`; raise ConfigError as read_typed() does."""
+    """Return the bytes of a TOML file called `file` as a `kind`, a msgspec Struct.
+
+    Raises:
+        ConfigError: they are no TOML, or keys are unknown, missing or of the wrong type: the text has all of them.
+            `.file`, `.key`, `.expected`, `.got` are of the first.
+    """
     return convert_typed(parse_toml(data, file), file, kind)
 
 
 def convert_typed(value: object, file: str, kind: type[_T], key: str = "") -> _T:
-    """Return a value that stands at `key` in a file as a `kind`; raise ConfigError as read_typed() does."""
+    """Return a value that stands at `key` in a file as a `kind`; raise ConfigError as parse_typed() does."""
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
+        raise_faults([*_faults(value, kind, file, key)])
         raise _wrong_at(value, kind, file, str(error), key) from error
 
 
-def _wrong_at(whole: Any, kind: Any, file: str, said: str, at: str) -> ConfigError:
-    """Return the error for msgspec's text, such as "Expected `int`, got `str` - at `$.component[0].reliability`"."""
-    problem, _, place = said.removesuffix("`").partition(" - at `$")
-    key = (at + place).removeprefix(".")
-    in_toml = problem.removeprefix("Expected ").replace("`object`", "a table").replace("`array`", "a list")
-    expected, _, got = in_toml.partition(", got ")
-    if "[...]" in key:  # msgspec does not say which key of a mapping, so its value is not known
-        return wrong(file, key, expected, got, said=got)
-    value: Any = whole
-    for index, name in _STEP.findall(place):
-        value = value[int(index) if index else name]
-        kind = _kind_below(kind, name)
+def _faults(value: object, kind: Any, file: str, key: str) -> Iterator[ConfigError]:
+    """Yield what is wrong in the parts of a value, in their order; or, if they are right, in the whole."""
+    is_right = True
+    for fault in _faults_of_parts(value, kind, file, key):
+        is_right = False
+        yield fault
+    if is_right:
+        try:
+            msgspec.convert(value, kind)
+        except msgspec.ValidationError as error:
+            yield _wrong_at(value, kind, file, str(error), key)
+
+
+def _faults_of_parts(value: object, kind: Any, file: str, key: str) -> Iterator[ConfigError]:
+    if get_origin(kind) is Annotated:
+        kind = get_args(kind)[0]
+    struct, items = _struct_in(kind), [one for one in get_args(kind) if one is not ...]
+    if struct is not None and isinstance(value, dict):
+        yield from _faults_of_table(cast("dict[str, object]", value), struct, file, key)
+    elif get_origin(kind) is dict and isinstance(value, dict):
+        for name, inner in cast("dict[str, object]", value).items():
+            yield from _faults(inner, items[-1], file, f"{key}.{name}".removeprefix("."))
+    elif get_origin(kind) in (list, tuple) and len(items) == 1 and isinstance(value, list):
+        for i, inner in enumerate(cast("list[object]", value)):
+            yield from _faults(inner, items[0], file, f"{key}[{i}]")
+
+
+def _faults_of_table(table: dict[str, object], struct: Any, file: str, key: str) -> Iterator[ConfigError]:
+    fields = {field.encode_name: field for field in msgspec.structs.fields(struct)}
+    prefix = f"{key}." if key else ""
+    for name, value in table.items():
+        if name in fields:
+            yield from _faults(value, fields[name].type, file, prefix + name)
+        elif struct.__struct_config__.forbid_unknown_fields:
+            yield unknown_key(name, list(fields), file, prefix)
+    for name, field in fields.items():
+        if field.required and name not in table:
+            yield wrong(file, key, f"the key {name}", table, said="none")
+
+
+def _wrong_at(value: object, kind: Any, file: str, said: str, key: str) -> ConfigError:
+    """Return the error for msgspec's text about a value, such as "Expected `int`, got `str`"."""
+    problem = said.partition(" - at `")[0]
+    expected = _BETWEEN_TICKS.sub(_in_toml, problem.removeprefix("Expected ").partition(", got ")[0])
     if problem.startswith("Invalid enum value"):  # msgspec does not say which there are
         literal = next((one for one in (kind, *get_args(kind)) if get_origin(one) is Literal), None)
         expected = f"one of {', '.join(map(str, get_args(literal)))}" if literal else expected
-    field = _FIELD.match(problem if place else said)
-    if field is None:
-        return wrong(file, key, expected, value)
-    if field[1] == "missing required":
-        return wrong(file, key, f"the key {field[2]}", value, said="none")
-    known = [one.encode_name for one in msgspec.structs.fields(_struct_in(kind))]
-    return unknown_key(field[2], known, file, f"{key}." if key else "")
+    return wrong(file, key, expected, value)
 
 
-def _kind_below(kind: Any, name: str) -> Any:
-    """Return the type of a field of a Struct, or of the items of a list, a tuple or a mapping."""
-    struct = _struct_in(kind)
-    if struct is None:
-        return [one for one in get_args(kind) if one is not ...][-1]
-    return next(one.type for one in msgspec.structs.fields(struct) if one.encode_name == name)
+def _in_toml(found: re.Match[str]) -> str:
+    """Return "`object | null`" in the words of TOML, "a table"."""
+    names = [name for name in found[1].split(" | ") if name != "null"]
+    return " or ".join({"object": "a table", "array": "a list"}.get(name, f"`{name}`") for name in names)
 
 
 def _struct_in(kind: Any) -> Any:

@@ -21,17 +21,18 @@ from __future__ import annotations
 import functools
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 
-from rr_actors.base.errors import LoadFailed, RrError
+from rr_actors.base.errors import ConfigError, LoadFailed, RrError
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.toml import parse_typed
-from rr_actors.managers.planning.last_good import last_good_file
+from rr_actors.base.toml import parse_typed, raise_faults, wrong
+from rr_actors.managers.planning.last_good import last_good_file, path_of
+from rr_actors.managers.program_checks import parameter_faults, program_faults
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
@@ -114,7 +115,7 @@ class Components(Manager):
         Raises:
             ConfigError: the registry cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
-        self._path = Path(registry).absolute()
+        self._path = path_of(registry, type(self).__name__, "registry")
         self._registry = self._read()
         self._programs = programs
         self._replace = replace
@@ -248,5 +249,22 @@ def read_registry(path: Path, beginning: Beginning | None = None) -> list[Compon
 
 def _parse_registry(data: bytes, file: str) -> list[ComponentDescription]:
     components = parse_typed(data, file, RegistryFile).component
-    check_unique(Path(file), "component", [component.name for component in components])
+    check_components(file, components)
     return components
+
+
+def check_components(file: str, components: Sequence[ComponentDescription]) -> None:
+    """Check what the types of the fields do not say.
+
+    Raises:
+        ConfigError: a name is not its own, or a program cannot be run as it is described.
+    """
+    check_unique(Path(file), "component", [component.name for component in components])
+    faults: list[ConfigError] = []
+    for i, component in enumerate(components):
+        key = f"component[{i}]"
+        if not component.type:
+            faults.append(wrong(file, f"{key}.type", "the name of a type", component.type))
+        faults += parameter_faults(file, f"{key}.parameters", component.parameters)
+        faults += program_faults(file, f"{key}.program", component.program)
+    raise_faults(faults)

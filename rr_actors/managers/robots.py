@@ -15,11 +15,11 @@ from pathlib import Path
 
 import msgspec
 
-from rr_actors.base.errors import LoadFailed, RrError
+from rr_actors.base.errors import ConfigError, LoadFailed, RrError
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.toml import parse_typed
+from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.components import Component, LoadComponent
-from rr_actors.managers.planning.last_good import last_good_file
+from rr_actors.managers.planning.last_good import last_good_file, path_of
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
@@ -93,7 +93,7 @@ class Robots(Manager):
         Raises:
             ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
-        self._path = Path(descriptions).absolute()
+        self._path = path_of(descriptions, "Robots", "descriptions")
         self._robots = read_robots(self._path, self._beginning())
         self._components = components
         self._replace = replace
@@ -193,4 +193,12 @@ def read_robots(path: Path, beginning: Beginning | None = None) -> list[RobotDes
 def _parse_robots(data: bytes, file: str) -> list[RobotDescription]:
     robots = parse_typed(data, file, RobotFile).robot
     check_unique(Path(file), "robot", [robot.name for robot in robots])
+    faults: list[ConfigError] = []
+    for i, robot in enumerate(robots):
+        parts = {"driver": robot.driver, "controller": robot.controller}
+        parts |= {f"sensors[{j}]": sensor for j, sensor in enumerate(robot.sensors)}
+        for field, part in parts.items():
+            if part is not None and not part.type:
+                faults.append(wrong(file, f"robot[{i}].{field}.type", "the type of a component", part.type))
+    raise_faults(faults)
     return robots

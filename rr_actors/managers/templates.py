@@ -7,22 +7,25 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rr_actors.base.errors import ConfigError, shortened, shown
-from rr_actors.base.toml import wrong
+from rr_actors.base.toml import raise_faults, wrong
 
 Parameter = str | int | float | bool
 Parameters = Mapping[str, Parameter]
 
 
 def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
-    """Check that no two entries of `[[table]]` have the same name.
+    """Check that each entry of `[[table]]` has a name, and that no two have the same.
 
     Raises:
-        ConfigError: two have; it names the second. `.file`, `.key`, `.expected`, `.got`
+        ConfigError: the names of some are wrong. `.file`, `.key`, `.expected`, `.got`
     """
+    faults: list[ConfigError] = []
     for i, name in enumerate(names):
-        if name in names[:i]:
+        if not name or name in names[:i]:
             expected = f"a name that no other {table} has"
-            raise wrong(str(path), f"{table}[{i}].name", expected, name, said=f"{shown(name)} again")
+            said = f"{shown(name)} again" if name else None
+            faults.append(wrong(str(path), f"{table}[{i}].name", expected, name, said=said))
+    raise_faults(faults)
 
 
 def fill(text: str, parameters: Parameters, where: str) -> str:

@@ -51,7 +51,7 @@ def test_a_key_says_what_is_loaded_whatever_type_the_request_has() -> None:
         ("= 0.9", "= 9", "alternative[0].provides.reliability", "a number from 0 to 1", 9),
         ("= 0.9", '= "high"', "alternative[0].provides.reliability", "a number from 0 to 1", "high"),
         ("place", '"-place"', "alternative[0].provides", "names that do not begin with '-'", "-place"),
-        ('"roof"', "[]", "alternative[0].provides[...]", "", "a list"),
+        ('"roof"', "[]", "alternative[0].provides.place", "`str`", []),
         ("= 5", "= 0", "alternative[1].timeout_s", "a number of seconds over 0", 0),
         ('kind = "range"', 'kind = ""', "alternative[0].kind", "a name", ""),
         ('kind = "range"', "", "alternative[0]", "the key kind", None),

@@ -440,3 +440,25 @@ def test_a_file_that_is_wrong_fails_the_start_by_name(start: Start, tmp_path: Pa
     (tmp_path / "pools.toml").write_text('[[pool]]\nname = "watts"\ncapcity = 100\n')
     with pytest.raises(rr.StartFailed, match=r"pools.toml: pool\[0\].capcity: expected one of name, capacity"):
         start(rr.ChildSpec(Budgets, id="budgets", args=(str(tmp_path / "pools.toml"),)))
+
+
+def test_a_capacity_that_was_set_holds_until_the_file_says_something_else_and_never_comes_back(
+    start: Start, tmp_path: Path
+) -> None:
+    file = tmp_path / "pools.toml"
+
+    def says(capacity: int) -> None:
+        file.write_text(f'[[pool]]\nname = "watts"\ncapacity = {capacity}\n')
+
+    says(100)
+    system = start(rr.Supervisor([rr.ChildSpec(Budgets, id="budgets", args=(str(file),))], max_restarts=100))
+    budgets = system.ref("budgets").proxy()
+    budgets.set_capacity("watts", 60).get()
+    for capacity, holds in ((100, 60), (80, 80), (100, 100)):
+        says(capacity)
+        system.supervisor().terminate_child("budgets")
+        system.supervisor().restart_child("budgets")
+        assert budgets.pools().get()[0].capacity == holds
+        says(7)  # nobody asks for the file to be read
+        wait_respawned(system, "budgets", kill(system, "budgets"))
+        assert eventually(lambda holds=holds: budgets.pools().get()[0].capacity == holds)

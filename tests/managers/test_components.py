@@ -206,7 +206,7 @@ def test_the_program_managers_crash_is_not_held_against_a_component(begin: Begin
         (entry("a").replace("timeout_s", "timeout"), "component[0].program.ready.timeout", "did you mean 'timeout_s'?"),
         ("[robot]\n", "robot", "expected one of component, got an unknown key"),
         (entry("a").replace("5 }", "'5' }"), "component[0].program.ready.timeout_s", "got '5' (str)"),
-        (entry("a").replace("topic =", "topic = [], to ="), "component[0].parameters[...]", "got a list"),
+        (entry("a").replace("topic =", "topic = [], to ="), "component[0].parameters.topic", "got [] (list)"),
         (entry("a") + entry("a"), "component[1].name", "'a' again"),
     ],
 )

@@ -118,7 +118,11 @@ def test_what_cannot_be_kept_is_named_in_a_comment(tmp_path: Path) -> None:
     ]
 
 
-@given(st.text(st.characters(exclude_categories=["Cs"])), st.floats(0, 1), st.floats() | st.booleans() | st.text())
+@given(
+    st.text(st.characters(exclude_categories=["Cs"]), min_size=1),
+    st.floats(0, 1),
+    st.floats() | st.booleans() | st.text(),
+)
 def test_any_text_and_number_is_the_same_afterwards(
     tmp_path_factory: pytest.TempPathFactory, text: str, reliability: float, value: float | str
 ) -> None:

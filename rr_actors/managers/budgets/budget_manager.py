@@ -530,7 +530,8 @@ class Budgets(Manager):
 
     @functools.cached_property
     def _record(self) -> BudgetRecord:
-        return BudgetRecord(self.registrar.directory / "budgets.json")
+        configured = {name: pool.capacity for name, pool in self._pools.items()}
+        return BudgetRecord(self.registrar.directory / "budgets.json", configured)
 
     @functools.cached_property
     def _books(self) -> dict[str, _Book]:

@@ -6,11 +6,13 @@ It has the capacities that were set or measured while the manager ran, and the r
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 
 from rr_actors.managers.planning.kept_record import KeptRecord
+from rr_actors.managers.planning.last_good import still_standing
 
 
 class _Record(msgspec.Struct):
@@ -20,15 +22,19 @@ class _Record(msgspec.Struct):
 
 
 class BudgetRecord:
-    """What is known after a restart beside the catalog. A changed capacity of the file replaces what was set."""
+    """What is known after a restart beside the catalog."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, configured: Mapping[str, float]) -> None:
+        """Read the record. Forget each capacity that was set in place of another one than the configured."""
         self._record = KeptRecord(path, _Record)  # after damage the configured capacities hold, reserves start again
+        standing = still_standing(self._record.now.capacities, configured)
+        if standing != self._record.now.capacities:
+            self._record.now.capacities = standing
+            self._record.save()
 
     def capacity(self, pool: str, configured: float) -> float:
         """Return the capacity that was set, or else the configured one."""
-        before, now = self._record.now.capacities.get(pool, (configured, configured))
-        return now if before == configured else configured
+        return self._record.now.capacities.get(pool, (configured, configured))[1]
 
     def set_capacity(self, pool: str, configured: float, capacity: float) -> None:
         """Keep a capacity that was set."""

@@ -29,9 +29,9 @@ from typing import Any, cast, get_args
 import msgspec
 
 from rr_actors.base.checks import is_number
-from rr_actors.base.errors import InvalidName, is_a, shown
+from rr_actors.base.errors import ConfigError, InvalidName, is_a, shown
 from rr_actors.base.names import parse_server_id
-from rr_actors.base.toml import parse_typed, wrong
+from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.budgets.measures import Measure, faults
 from rr_actors.managers.budgets.planner import Step
 from rr_actors.managers.budgets.probes import NoProbe, probe_of
@@ -97,20 +97,32 @@ def _parse_pools(data: bytes, file: str) -> dict[str, Pool]:
 
 def _checked(file: str | None, pools: Sequence[Pool]) -> dict[str, Pool]:
     found: dict[str, Pool] = {}
+    faults: list[ConfigError] = []
     for i, pool in enumerate(pools):
         key = f"pool[{i}]"
-        if pool.name in found or not pool.name:
-            said = f"{shown(pool.name)} again" if pool.name else None
-            raise wrong(file, f"{key}.name", "a name that no other pool has", pool.name, where="Budgets", said=said)
-        check_amount(file, f"{key}.capacity", pool.capacity)
-        for j, reserve in enumerate(pool.reserve):
-            _check_server(file, f"{key}.reserve[{j}].server", reserve.server)
-            check_amount(file, f"{key}.reserve[{j}].amount", reserve.amount)
-        if unknown := [step for step in pool.policy if step not in POLICY]:
-            raise wrong(file, f"{key}.policy", f"of {', '.join(POLICY)}", unknown[0], where="Budgets")
-        _check_measure(file, f"{key}.measure", pool.measure)
+        try:
+            if pool.name in found or not pool.name:
+                said = f"{shown(pool.name)} again" if pool.name else None
+                raise wrong(file, f"{key}.name", "a name that no other pool has", pool.name, where="Budgets", said=said)
+            _check_pool(file, key, pool)
+        except ConfigError as error:
+            faults.append(error)
         found[pool.name] = pool
+    raise_faults(faults)
     return found
+
+
+def _check_pool(file: str | None, key: str, pool: Pool) -> None:
+    check_amount(file, f"{key}.capacity", pool.capacity)
+    for j, reserve in enumerate(pool.reserve):
+        _check_server(file, f"{key}.reserve[{j}].server", reserve.server)
+        check_amount(file, f"{key}.reserve[{j}].amount", reserve.amount)
+    if unknown := [step for step in pool.policy if step not in POLICY]:
+        raise wrong(file, f"{key}.policy", f"of {', '.join(POLICY)}", unknown[0], where="Budgets")
+    if again := [step for i, step in enumerate(pool.policy) if step in pool.policy[:i]]:
+        said = f"{again[0]} again"
+        raise wrong(file, f"{key}.policy", "each step once", pool.policy, where="Budgets", said=said)
+    _check_measure(file, f"{key}.measure", pool.measure)
 
 
 def _given(pools: object) -> Sequence[Pool]:

@@ -26,9 +26,9 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.checks import is_number, wrong_label
-from rr_actors.base.errors import InvalidName, NotSerializable
+from rr_actors.base.errors import ConfigError, InvalidName, NotSerializable
 from rr_actors.base.names import parse_server
-from rr_actors.base.toml import parse_typed, wrong
+from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.base.values.canonical import encode, json_of, shown_plain
 from rr_actors.managers.planning.last_good import last_good_file
 from rr_actors.managers.templates import Parameter
@@ -87,6 +87,9 @@ def read_alternatives(
     """
     if isinstance(file_or_alternatives, (str, os.PathLike)):
         return last_good_file(beginning, Path(file_or_alternatives).absolute(), _parse_alternatives).now
+    if not isinstance(file_or_alternatives, (list, tuple)):
+        expected = "a list of Alternative, or the path of a TOML file"
+        raise wrong(None, "alternatives", expected, file_or_alternatives, where=_WHERE)
     return _checked(None, file_or_alternatives)
 
 
@@ -96,13 +99,19 @@ def _parse_alternatives(data: bytes, file: str) -> tuple[Alternative, ...]:
 
 def _checked(file: str | None, found: Sequence[Alternative]) -> tuple[Alternative, ...]:
     seen: set[tuple[str, str]] = set()
+    faults: list[ConfigError] = []
     for i, one in enumerate(found):
         place = f"alternative[{i}]"
-        _check(file, place, one)
+        try:
+            _check(file, place, one)
+        except ConfigError as error:
+            faults.append(error)
+            continue
         if (one.kind, one.key) in seen:
             expected = "a server and request that no other alternative of this kind has"
-            raise wrong(file, place, expected, one.key, where=_WHERE, said=f"{one.key} again")
+            faults.append(wrong(file, place, expected, one.key, where=_WHERE, said=f"{one.key} again"))
         seen.add((one.kind, one.key))
+    raise_faults(faults)
     return tuple(found)
 
 

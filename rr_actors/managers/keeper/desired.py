@@ -179,6 +179,8 @@ class _Checks:
         self.loads(key, keep.server, [numbered(keep.request, i) for i in range(replicas)])
         self._within(f"{key}.replicas", keep.replicas, 0, MOST_REPLICAS)
         self._within(f"{key}.priority", keep.priority, LOWEST, HIGHEST)
+        if keep.standby and keep.priority:
+            self._wrong(f"{key}.priority", "none, as what is on standby has no priority", keep.priority)
         if keep.replicas > 1 and numbered(keep.request, 0) == keep.request:
             expected = f"a request with {INSTANCE}, so that the {keep.replicas} replicas differ"
             self._wrong(f"{key}.request", expected, keep.request)

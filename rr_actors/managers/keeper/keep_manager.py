@@ -11,7 +11,6 @@ import functools
 import os
 import time
 from collections.abc import Generator, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -37,7 +36,7 @@ from rr_actors.base.values.canonical import encode
 from rr_actors.managers.keeper import comparing
 from rr_actors.managers.keeper.comparing import Report, Seen, Slot, Steps, Wanted
 from rr_actors.managers.keeper.desired import Desired, Replica, Request, changes, parse_desired
-from rr_actors.managers.planning.last_good import LastGood, Sources, one_file
+from rr_actors.managers.planning.last_good import LastGood, Sources, one_file, path_of
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
 from rr_actors.managers.planning.setbacks import BACKOFF, Setbacks
 from rr_actors.registrar.declarations import server
@@ -87,7 +86,7 @@ class Keeper(Manager):
         Raises:
             ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
-        path, beginning = Path(file).absolute(), self._beginning()
+        path, beginning = path_of(file, "Keeper", "file"), self._beginning()
         name = "keeper" if beginning is None else beginning.name
         self._group_server = f"{name}/group"
         self._configuration = LastGood(beginning, lambda: one_file(path), self._parse)
@@ -134,8 +133,7 @@ class Keeper(Manager):
         Raises:
             ConfigError: the file cannot be read, or is wrong. Nothing has changed.
         """
-        path = str(Path(file).absolute())
-        return self._apply(one_file(path))
+        return self._apply(one_file(path_of(file, "apply", "file")))
 
     def get(self) -> list[Kept]:
         """Return how all that is kept is."""
@@ -149,8 +147,7 @@ class Keeper(Manager):
         """
         if file is None:
             return self._differences()
-        path = str(Path(file).absolute())
-        return changes(self._desired, self._parse(one_file(path)))
+        return changes(self._desired, self._parse(one_file(path_of(file, "diff", "file"))))
 
     def on_receive(self, message: Any) -> Any:
         """Answer what `rr-actors apply` and `rr-actors keep` ask."""

@@ -45,10 +45,9 @@ import msgspec
 
 from rr_actors.base.errors import ConfigError
 from rr_actors.base.toml import parse_typed, wrong
-from rr_actors.managers.components import ComponentDescription
+from rr_actors.managers.components import ComponentDescription, check_components
 from rr_actors.managers.pipes.chains import Link, Step, Way
 from rr_actors.managers.planning.last_good import last_good_file
-from rr_actors.managers.templates import check_unique
 from rr_actors.registrar.manager import Beginning
 
 TYPE_EXPECTED = "a name of letters, digits and _"
@@ -110,7 +109,7 @@ def read_pipe_file(path: Path, beginning: Beginning | None = None) -> PipeFile:
 
 def _parse_pipe_file(data: bytes, name: str) -> PipeFile:
     path, file = Path(name), parse_typed(data, name, PipeFile)
-    check_unique(path, "component", [component.name for component in file.component])
+    check_components(name, file.component)
     for i, component in enumerate(file.component):
         _check_types(path, f"component[{i}].inputs", component.inputs)
         _check_types(path, f"component[{i}].outputs", component.outputs)

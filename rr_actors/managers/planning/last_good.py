@@ -14,9 +14,10 @@ from typing import Generic, TypeVar
 
 import msgspec
 
+from rr_actors.base.checks import path_text
 from rr_actors.base.errors import ConfigError, GraphError
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.toml import read_bytes
+from rr_actors.base.toml import read_bytes, wrong
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.registrar.manager import Beginning
 
@@ -121,6 +122,18 @@ class LastGood(Generic[C]):
             return str(error)
         changed = sorted(file for file in {*said, *given} if said.get(file) != given.get(file))
         return f"{', '.join(changed)}: changed since it was read"
+
+
+def path_of(given: object, where: str, argument: str) -> Path:
+    """Return the absolute path of a file that is given to a manager; `where` is its class.
+
+    Raises:
+        ConfigError: it is no path.
+    """
+    text = path_text(given)
+    if not text:
+        raise wrong(None, argument, "the path of a file", given, where=where)
+    return Path(text).absolute()
 
 
 def one_file(path: str | Path) -> Sources:
