@@ -254,6 +254,20 @@ def group(name: str, *members: tuple[str, str]) -> str:
     return "".join([f'[[group]]\nname = "{name}"\n', *tables])
 
 
+def test_a_replica_whose_release_has_failed_is_not_ready_when_it_is_wanted_again(make: Make) -> None:
+    place = make(keep("a", replicas=2))
+    place.serve()
+    assert place.wait_kept(Kept("a", 2, 2))
+    place.unload_fails = True
+    place.keeper.apply(place.write("one.toml", keep("a"))).get()
+    assert eventually(lambda: {info.request: info.phase for info in place.things.resources()}["r1"] == "unload_failed")
+    place.keeper.apply(place.write("two.toml", keep("a", replicas=2))).get()
+    assert place.wait_kept(Kept("a", 2, 1, "unload failed"))
+    place.unload_fails = False
+    assert place.wait_kept(Kept("a", 2, 2))
+    assert (place.opened, place.alive) == ({"r0": 1, "r1": 2}, {"r0": 1, "r1": 1})
+
+
 def test_a_changed_group_reaches_what_is_kept_also_if_it_is_in_another_one_or_somebody_shares_it(make: Make) -> None:
     def text(*sensors: str) -> str:
         inner = [("things/thing", one) for one in sensors]

@@ -304,7 +304,8 @@ class Keeper(Manager):
         for one in steps.withdraw:
             self._loop.withdraw(one.slot)
         for one in steps.release:
-            self._release(one, self._parts(one))
+            if one.state is State.FATAL or self._mark_lost(one):
+                self._release(one, self._parts(one))
         for one, priority in steps.prioritise:
             with self._unless_full(), contextlib.suppress(UsageError):  # gone, or the registrar has a `max_priority`
                 self.registrar.set_priority(one.id, priority)
@@ -323,6 +324,15 @@ class Keeper(Manager):
             known = self._errors.get(one.slot) or ended.error
             logger.info("%s %d: %s", one.keep, one.instance, text_of(known))
             self._failures.note(one.slot, time.monotonic(), reason=_reason_of(known), text=text_of(known))
+
+    def _mark_lost(self, one: Seen) -> bool:
+        """Write that a replica is not to be used any more, before its parts go. Return whether that is on disk."""
+        with self._unless_full():
+            self._lost.add(one.id)
+            with contextlib.suppress(UsageError):  # it has just gone
+                self.registrar.send_status(one.id, Status(State.FATAL, "it is being released"))
+            return True
+        return False
 
     def _parts(self, one: Seen) -> list[str]:
         """Return the queries of a replica's parts, the last of them first."""
