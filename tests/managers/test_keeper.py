@@ -459,3 +459,31 @@ def test_a_holder_hears_what_has_changed_while_its_response_was_on_its_way(start
     SlowToAnswer.goes_on.set()
     query = loading.get(timeout=30)
     assert eventually(lambda: query.response.ready == 1)
+
+
+class Defective(Keeper):
+    """It has a defect, which shows once."""
+
+    shows = threading.Event()
+
+    def _look(self, now: float) -> float | None:
+        if self.shows.is_set():
+            self.shows.clear()
+            raise ValueError("a defect")
+        return super()._look(now)
+
+
+def test_a_defect_of_the_loop_is_logged_and_the_keeper_starts_again(
+    start: Start, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "keep.toml").write_text(keep("one", '"only"'))
+    args = (str(tmp_path / "keep.toml"), QUICK)
+    system = start(rr.ChildSpec(Defective, id="keeper", args=args, placement="thread"))
+    keeper = system.ref("keeper").proxy()
+    Defective.shows.set()
+    with pytest.raises(ValueError, match="a defect"):
+        keeper.apply(str(tmp_path / "keep.toml")).get()
+    assert eventually(lambda: [one.event for one in system.supervisor().history() if one.event == "restarted"])
+    assert "ValueError: a defect" in caplog.text
+    system.open_registrar("things").register_server("thing", lambda request: request, lambda request, response: None)
+    assert eventually(lambda: system.ref("keeper").proxy().get().get()[0].ready == 1)

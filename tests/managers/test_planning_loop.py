@@ -5,14 +5,18 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import rr_actors as rr
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from support import eventually
 
 Loop = PlanningLoop[str, str]
 Look = Callable[[float], float | None]
@@ -166,3 +170,71 @@ def test_a_defect_of_a_step_is_loud(watched: Watched, begin: str) -> None:
             reply.set("on")
             watched.loop.tell(lambda: watched.loop.begin("a", "", lambda: reply, defect))
     assert isinstance(watched.failed.get(timeout=60), (RuntimeError, KeyError))
+
+
+class Steps:
+    """A manager that always wants a step of each key in flight, whose steps end by the hand of the test."""
+
+    def __init__(self, keys: Sequence[str]) -> None:
+        self.begun, self.ended = Counter[str](), Counter[str]()
+        self.replies: dict[str, Reply[Any]] = {}
+        self.twice = list[str]()
+        self.keys = list(keys)
+        self.failed: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
+        self.loop = Loop("test", self._look, self.failed.put)
+
+    def _look(self, now: float) -> None:
+        for key in self.keys:
+            if key not in self.loop.in_flight:
+                self.loop.begin(key, key, lambda key=key: self._begin(key), lambda ended, key=key: self._end(key))
+
+    def _begin(self, key: str) -> Reply[Any]:
+        if self.begun[key] > self.ended[key]:
+            self.twice.append(key)
+        self.begun[key] += 1
+        reply = self.replies[key] = Reply[Any]()
+        reply.withdraw = _nothing
+        return reply
+
+    def _end(self, key: str) -> None:
+        self.ended[key] += 1
+
+
+def _nothing() -> None:
+    """Take a step back at no cost."""
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from("abc"), st.sampled_from(["value", "error", "withdraw", "cancel", "wake"])),
+        max_size=12,
+    )
+)
+def test_no_step_is_begun_twice_and_none_is_lost(events: list[tuple[str, str]]) -> None:
+    steps = Steps("abc")
+    steps.loop.start()
+    ends = Counter[str]()
+    for key, event in events:
+        assert steps.loop.look_and_wait(60)
+        reply, before = steps.replies[key], steps.ended[key]
+        match event:
+            case "value":
+                reply.set(1)
+            case "error":
+                reply.set_exception(rr.LoadFailed("no"))
+            case "withdraw":
+                steps.loop.tell(lambda key=key: steps.loop.withdraw(key))
+            case "cancel":
+                reply.cancel()
+            case _:
+                steps.loop.wake()
+                continue
+        ends[key] += 1
+        assert eventually(lambda key=key, before=before: steps.ended[key] > before)
+    assert steps.loop.look_and_wait(60)
+    assert steps.twice == []
+    assert steps.ended == ends
+    assert all(steps.begun[key] == steps.ended[key] + 1 for key in "abc")
+    assert steps.failed.empty()
+    steps.loop.stop()
