@@ -59,6 +59,12 @@ def make_unreadable(file: Path) -> None:
     file.symlink_to(file.name)
 
 
+def make_a_pipe(file: Path) -> None:
+    """Put something there whose reader would wait for ever."""
+    file.unlink()
+    os.mkfifo(file)
+
+
 def make_not_utf8(file: Path) -> None:
     file.write_bytes(b"\xff\xfe")
 
@@ -72,16 +78,16 @@ WAYS: tuple[Callable[[Path], None], ...] = (
     cut_in_half,
     make_a_directory,
     make_unreadable,
+    make_a_pipe,
     make_not_utf8,
     remove_the_folder,
 )
 
 
 def restore(file: Path, text: str) -> None:
-    if file.is_symlink() or file.is_file():
-        file.unlink()
-    elif file.is_dir():
+    if file.is_dir():
         file.rmdir()
+    file.unlink(missing_ok=True)
     file.parent.mkdir(exist_ok=True)
     file.write_text(text)
 

@@ -13,7 +13,7 @@ from rr_actors.managers.actions.action import Action, check_isolation, name_of, 
 from rr_actors.managers.actions.graph_checks import Signature, completed, signature_of
 from rr_actors.managers.actions.graph_documents import parse_graph, read_graph, read_graph_bytes
 from rr_actors.managers.actions.graph_model import ActionGraph, wrong_graph
-from rr_actors.managers.planning.last_good import LastGood, Sources
+from rr_actors.managers.planning.last_good import LastGood, Sources, may_block
 from rr_actors.registrar.manager import Beginning
 
 
@@ -122,7 +122,10 @@ def _by_name(actions: Sequence[type[Action]]) -> dict[str, type[Action]]:
 def _read_folder(folder: Path) -> Sources:
     if not folder.is_dir():
         raise wrong_graph(str(folder), "", "a folder with graphs", None, "none")
-    return {str(path): read_graph_bytes(str(path)) for path in sorted(folder.glob("*.json"))}
+    files = sorted(folder.glob("*.json"))
+    if special := next((file for file in files if may_block(file)), None):
+        raise wrong_graph(str(special), "", "a file", None, "a pipe, a socket or a device")
+    return {str(file): read_graph_bytes(str(file)) for file in files}
 
 
 def _parse_folder(sources: Sources) -> dict[str, ActionGraph]:

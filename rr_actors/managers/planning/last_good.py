@@ -142,7 +142,14 @@ def one_file(path: str | Path) -> Sources:
     Raises:
         ConfigError: it cannot be read.
     """
+    if may_block(Path(path)):
+        raise wrong(str(path), "", "a file", path, said="a pipe, a socket or a device")
     return {str(path): read_bytes(str(path))}
+
+
+def may_block(path: Path) -> bool:
+    """Return whether to read this may wait for ever: a pipe, a socket or a device is in the place of a file."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def last_good_file(beginning: Beginning | None, path: Path, parse: Callable[[bytes, str], C]) -> LastGood[C]:
