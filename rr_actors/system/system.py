@@ -466,8 +466,17 @@ class System:
             f"system {self.name!r} belongs to its process: send references to its actors instead", path=""
         )
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        """Stop the system as stop() does.
+
+        Raises:
+            The errors of stop().
+            SupervisionError: the block ended in order, but the tree had ended by itself, and not in order; as run().
+        """
+        gave_up = self._gave_up()
         self.stop()
+        if error is None and gave_up is not None:
+            raise gave_up from gave_up.__cause__
 
     async def __aenter__(self) -> Self:
         """Start the system as start() does, without blocking the event loop; if cancelled, give the start up."""
@@ -480,9 +489,24 @@ class System:
             raise
         return self
 
-    async def __aexit__(self, *exc: object) -> None:
-        """Stop the system as stop() does, without blocking the event loop; if cancelled, kill what still runs."""
+    async def __aexit__(
+        self, kind: object = None, error: BaseException | None = None, traceback: object = None
+    ) -> None:
+        """Stop the system as __exit__() does, without blocking the event loop; if cancelled, kill what still runs."""
+        gave_up = self._gave_up()
         await _in_thread(functools.partial(self._stop_now, self._check_stop(None)), self._stop_at_once)
+        if error is None and gave_up is not None:
+            raise gave_up from gave_up.__cause__
+
+    def _gave_up(self) -> SupervisionError | None:
+        """Return the error of a running system whose tree has ended by itself, and not in order."""
+        report = self._end
+        if self._node is None or report is None or report.exception is None:
+            return None
+        text = f"system {self.name!r}: its root supervisor has ended: {report.detail or report.reason}"
+        error = SupervisionError(text)
+        error.__cause__ = report.exception
+        return error
 
     def run(self) -> signal.Signals | None:
         """Start the system unless it runs; wait for SIGTERM, Ctrl-C (SIGINT) or its end; then stop it.
@@ -514,23 +538,22 @@ class System:
                 logger.info("system %s: stops, as it got %s", self.name, termination.told.name)
             finally:
                 termination.awaited = False
-                report = self._end
+                gave_up = self._gave_up()
                 try:
                     self.stop()
                 except Unavailable:
                     if not termination.again:
                         raise
                     logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
-        if termination.told is None and report is not None and report.exception is not None:
-            text = f"system {self.name!r}: its root supervisor has ended: {report.detail or report.reason}"
-            raise SupervisionError(text) from report.exception
+        if termination.told is None and gave_up is not None:
+            raise gave_up from gave_up.__cause__
         return termination.told
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the tree ends by itself (restart intensity, auto_shutdown), or the system is stopped.
 
         Returns:
-            Whether the tree ended or the system was stopped, by another thread or a console.
+            Whether the tree ended or the system was stopped, by another thread or a console. `ended` says how it ended.
 
         Raises:
             UsageError: timeout_s is no number of seconds.
