@@ -24,10 +24,10 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
-from rr_actors.base.names import ServerId, check_name, new_id, parse_server, parsed_server
+from rr_actors.base.names import ServerId, check_name, named, new_id, parse_server, parsed_server
 from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.values.canonical import encode
+from rr_actors.base.values.canonical import encode, text_of_value
 from rr_actors.base.values.failure import error_of
 from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.arguments import (
@@ -417,7 +417,8 @@ class Consumer(abc.ABC):
             UnknownQuery: this registrar never held the query, or has unloaded it already.
             NotHolder: another registrar holds the query.
             UnloadFailed: the unload callback raised. The query is still held, and can be unloaded again.
-            UsageError: with `force`, a callback of that resource made the call, and would wait for itself.
+            UsageError: with `force`, a callback of that resource made the call, and would wait for itself. Or the call
+                comes from outside, by a handle, and the query is a part that a resource of this registrar holds.
             Unavailable: the provider did not come back in time. The release is owed, on disk, until it does.
         """
         self._check_open()
@@ -656,6 +657,18 @@ class Registrar(Consumer):
     def _register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
         self._register_spec(pickling.loads(blob), stored=blob)
+
+    @for_handles(repeatable=False)
+    def _unload_from_outside(self, query_id: str, *, timeout_s: float | None = 30.0) -> None:
+        """Release a query as unload() does, for a handle. A part is its whole's to release: its callbacks may."""
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            held = catalog.held.get(query_id)
+            whole = None if held is None or held.hold is Hold.OWED else catalog.resources.get(held.parent)
+            failure = None if whole is None else failures.held_by_whole(query_id, _name_of(whole, self.name))
+        if failure is not None:
+            raise error_of(failure)
+        self.unload(query_id, timeout_s=timeout_s)
 
     @for_handles(repeatable=False)
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
@@ -1202,3 +1215,7 @@ def registrar_of(actor: RegistrarBase | None) -> Registrar | None:
     """Return the Registrar that users call, for its actor; None if there is none."""
     holder = None if actor is None or actor.audience is None else actor.audience.holder
     return holder if isinstance(holder, Registrar) else None
+
+
+def _name_of(resource: Resource, registrar: str) -> str:
+    return named(f"{registrar}/{resource.server}", text_of_value(resource.request))

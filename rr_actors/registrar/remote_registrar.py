@@ -231,16 +231,17 @@ class RemoteGroup:
 class RemoteUnloads:
     """The unloads of a registrar that another process has. From any thread."""
 
-    def __init__(self, calls: RemoteCalls) -> None:
+    def __init__(self, calls: RemoteCalls, release: str = "unload") -> None:
         self._calls = calls
+        self._release = release  # the method that releases a query
 
     def begin(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Begin to release a query, and return a future of its end at once."""
-        return self._begun("unload", query_id, timeout_s=timeout_s)
+        return self._begun(self._release, query_id, timeout_s=timeout_s)
 
     def wait(self, query_id: str, timeout_s: float | None) -> None:
         """Release a query, and return when that is done."""
-        self._calls.ask("unload", query_id, timeout_s=timeout_s)
+        self._calls.ask(self._release, query_id, timeout_s=timeout_s)
 
     def force_begin(self, target: str, timeout_s: float | None) -> Reply[None]:
         """Begin to unload a resource that the registrar serves, even if it is held."""
@@ -363,7 +364,7 @@ class RegistrarHandle(Registrar):
         self._node = node
         self._name = name
         self._far = HandleCalls(node.handle(name), name, patient=patient)
-        self._unload_ways = RemoteUnloads(self._far)
+        self._unload_ways = RemoteUnloads(self._far, "_unload_from_outside")
 
     @property
     def _load_ways(self) -> HandleLoads:

@@ -44,6 +44,12 @@ def not_holder(query_id: str, origin: str, caller: str) -> Failure:
     return Failure("NotHolder", text, {"query_id": query_id, "origin": origin, "caller": caller})
 
 
+def held_by_whole(query_id: str, whole: str) -> Failure:
+    """Return the failure of an Unload from outside of a part, which would leave its whole without it, unheard."""
+    text = f"query {query_id}: it is a part of {whole}; revoke its resource, or unload that with --force (force=True)"
+    return Failure("UsageError", text, {"query_id": query_id, "whole": whole})
+
+
 def no_response_yet(resource: Resource) -> Failure:
     """Return the failure of set_response() for a resource that has no response yet."""
     phase = resource.phase.replace("_", " ")

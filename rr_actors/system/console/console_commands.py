@@ -22,8 +22,10 @@ from rr_actors.base.errors import (
 )
 from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id, short_ids
 from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.base.values.failure import error_of
 from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.model.failures import held_by_whole
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.registrar.queries import response_bytes
@@ -137,6 +139,8 @@ class Unload(Command[c.Done], frozen=True):
         if " " in self.id and len(found.resources) == 1 and found.resources[0].holder_count == 1:
             found = view.find(found.resources[0].holders[0].query_id)
         query = _only_query(self.id, found.queries, found.resources)
+        if query.parent and (wholes := view.find(query.parent).resources):
+            raise error_of(held_by_whole(short_id(query.id), wholes[0].name))
         text = f"query {short_id(query.id)} of {query.origin} on {query.name}"
         facts = {"query_id": query.id, "holder": query.origin, "server": query.server}
         if self.dry_run:
