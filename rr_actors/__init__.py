@@ -77,7 +77,6 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             UsageError,
         )
         from rr_actors.base.values.codecs import codec
-        from rr_actors.hosting.streams import Publisher, Stream, StreamFrame, StreamInfo, StreamReader
         from rr_actors.registrar.declarations import Declared, server
         from rr_actors.registrar.engine.progress import Progress
         from rr_actors.registrar.engine.server import Current, current
@@ -88,6 +87,9 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.registrar.model.rows import State
         from rr_actors.registrar.queries import Query, ResourceInfo
         from rr_actors.registrar.registrar import Registrar
+        from rr_actors.streams.publisher import Publisher
+        from rr_actors.streams.stream import Stream, StreamFrame, StreamInfo
+        from rr_actors.streams.stream_reader import StreamReader
         from rr_actors.supervision.core.rendering import Tree, render
         from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
         from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
@@ -230,7 +232,9 @@ if not TYPE_CHECKING:
         "rr_actors.actors.timers": "Timer send_after",
         "rr_actors.base.config": "RegistrarConfig SystemConfig",
         "rr_actors.base.values.codecs": "codec",
-        "rr_actors.hosting.streams": "Publisher Stream StreamFrame StreamInfo StreamReader",
+        "rr_actors.streams.publisher": "Publisher",
+        "rr_actors.streams.stream": "Stream StreamFrame StreamInfo",
+        "rr_actors.streams.stream_reader": "StreamReader",
         "rr_actors.managers": "Action GraphResult run_graph",
         "rr_actors.registrar.declarations": "Declared server",
         "rr_actors.registrar.engine.progress": "Progress",

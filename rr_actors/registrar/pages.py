@@ -16,12 +16,12 @@ import msgspec
 
 from rr_actors.base.names import named
 from rr_actors.base.values.canonical import json_of, shown_plain, text_of_value
-from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Resource, priority_of
+from rr_actors.streams.stream import StreamRow
 
 HOLDERS_SHOWN = 20
 """How many holders, and how many dependencies, a resource's row lists at most. It also has their total numbers."""

@@ -19,8 +19,7 @@ from rr_actors.base.errors import LoadTimeout, ResourceLost, RrError, Unavailabl
 from rr_actors.base.names import ServerId, check_name, parse_server_id
 from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.values.canonical import Codec, encode, shown_plain
-from rr_actors.hosting.streams import Keep, Source, Stream, StreamReader, Wake, streams_in
+from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.status import Status, state_of, status_of
 from rr_actors.registrar.model.rows import OK, Held, Notice, Phase, ServerType, State
@@ -30,6 +29,9 @@ from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.user_loop import CallersLoop
 from rr_actors.runtime.workers import is_async
+from rr_actors.streams.stream import Keep, Place, Stream, streams_in
+from rr_actors.streams.stream_reader import Source, StreamReader
+from rr_actors.streams.wake import Wake
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
@@ -44,7 +46,7 @@ _KEPT_STATUSES = 256
 _UNLOAD_S = 30.0
 _CANCELLED_S = 2.0  # the release goes on, and the provider gets it when it is back
 
-_lock = threading.Lock()  # guards the list of waiting threads of every query
+_lock = threading.RLock()  # to make the set of those that wait for a status of a query
 
 
 class Holder(Protocol):
@@ -150,7 +152,7 @@ class Query(Generic[Response]):
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
-        self._waiters: list[Flag | Wake | _Over] | None = None
+        self._waiters: dict[Flag | Wake | _Over, None] | None = None  # made for the first
         self._statuses: _Statuses | None = None  # made for the first: most queries hear of none
 
     @property
@@ -268,7 +270,7 @@ class Query(Generic[Response]):
                 self._unwatch(flag)
 
     def stream(
-        self, name: str | None = None, *, keep: Keep = "latest", depth: int = 4, timeout_s: float | None = None
+        self, name: str | Stream | None = None, *, keep: Keep = "latest", depth: int = 4, timeout_s: float | None = None
     ) -> StreamReader:
         """Read a stream that the resource's manager has opened: iterate over it, with ``for`` or ``async for``.
 
@@ -278,17 +280,20 @@ class Query(Generic[Response]):
         that.
 
         Args:
-            name: the stream's name; None: the only one.
+            name: the stream's name; or an rr.Stream of the response, if others there have the same name; None: the
+                only one. The reader goes on with what a new response has in the place of that rr.Stream.
             keep: "latest": a slow reader gets the newest frame. "all": it gets each, and the publisher waits for it.
             depth: with "all", how many frames the reader may be behind until the publisher waits; from 1 to 1000.
-            timeout_s: the longest wait for one frame; None: no limit.
+            timeout_s: the longest wait for one frame; 0: look once; None: no limit.
 
         Raises:
             UnknownQuery: the query is released, or another process holds it.
-            InvalidName, UsageError: an argument is something else, or no name, and there are several streams.
+            InvalidName, UsageError: an argument is something else, or there are several streams that are meant.
             NotFound: the resource has no stream of this name. If it has none at all, the iteration raises this after
                 thirty seconds. `.id`, `.known`
             ResourceLost: by the iteration: the resource was lost.
+            Unavailable: by the iteration: the manager has ended, and its server opens the stream in no callback that
+                runs then. Or a frame cannot be read now; the next call goes on.
             TimeoutError: by the iteration: no frame has come within `timeout_s`.
         """
         limit_s = time_limit(timeout_s)
@@ -296,19 +301,21 @@ class Query(Generic[Response]):
         if self._is_released:
             raise UnknownQuery(f"{self.server_id}: query {self.id} is released: it has no streams", query_id=self.id)
         source = Source(self.resource_id, self.origin, self._is_over, self._named_streams, self._watch, self._unwatch)
-        checked = None if name is None else check_name(name, "stream")
+        checked = name if name is None or isinstance(name, Stream) else check_name(name, "stream")
         return StreamReader(source, checked, keep, depth, limit_s)
 
-    def _named_streams(self) -> list[Stream]:
-        return streams_in(shown_plain(self._response_bytes()))
+    def _named_streams(self) -> list[tuple[Place, Stream]]:
+        return streams_in(self._response_bytes())
 
     def _watch(self, waiter: Flag | Wake | _Over) -> None:
         with _lock:
-            self._waiters = [*(self._waiters or ()), waiter]
+            if self._waiters is None:
+                self._waiters = {}
+        self._waiters[waiter] = None
 
     def _unwatch(self, waiter: Flag | Wake | _Over) -> None:
-        with _lock:
-            self._waiters = [other for other in self._waiters or () if other is not waiter] or None
+        if self._waiters is not None:  # without the lock: a reader's finalizer calls it
+            self._waiters.pop(waiter, None)
 
     def _is_over(self) -> bool:
         """Return whether the query is released; raise ResourceLost if the resource is lost."""
@@ -358,11 +365,8 @@ class Query(Generic[Response]):
         self._wake()
 
     def _wake(self) -> None:
-        if self._waiters is not None:
-            with _lock:
-                waiters = self._waiters
-            for flag in waiters or ():
-                flag.set()
+        for waiter in list(self._waiters or ()):
+            waiter.set()
 
     def _loaded(self, held: Held) -> None:
         """Note that the load has succeeded, with the values of its row. On the loop."""

@@ -29,7 +29,6 @@ from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode, text_of_value
 from rr_actors.base.values.failure import error_of
-from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.arguments import (
     DEFAULTS,
     GroupKeywords,
@@ -92,6 +91,7 @@ from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallba
 from rr_actors.registrar.replacements import Replacements, encoded_response
 from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import time_limit
+from rr_actors.streams.stream import StreamInfo
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar

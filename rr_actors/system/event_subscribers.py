@@ -14,13 +14,13 @@ from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
 
 from rr_actors.base.errors import RrError, UsageError, exact_text, shown
 from rr_actors.base.reporting.log import Log
-from rr_actors.hosting.streams import StreamHappening
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.links.recorder import RECORDED
 from rr_actors.registrar.model.effects import Happening
 from rr_actors.runtime.backlogs import Backlog
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.user_loop import name_of
+from rr_actors.streams.stream import StreamHappening
 
 logger = Log("rr_actors")
 

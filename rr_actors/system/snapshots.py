@@ -10,10 +10,10 @@ import msgspec
 import pykka
 
 from rr_actors.base.errors import NotFound, RrError, shown
-from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.registrar.registrar import Registrar
+from rr_actors.streams.stream import StreamInfo
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Presence

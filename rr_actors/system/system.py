@@ -42,7 +42,6 @@ from rr_actors.base.steps import Steps
 from rr_actors.hosting import forwarded_logs
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.hosting.process_node import SystemInfo
-from rr_actors.hosting.streams import StreamInfo
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import check_not_own, serving
@@ -66,6 +65,7 @@ from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.workers import Workers
 from rr_actors.storage.opening import open_catalog, remove_catalogs
+from rr_actors.streams.stream import StreamInfo
 from rr_actors.supervision.core.rendering import Tree
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.supervision.event_history import TreeLog

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 
 from rr_actors.base.errors import UnknownQuery, UsageError, few, shown
 from rr_actors.base.names import short_id, short_ids
-from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
 from rr_actors.registrar.pages import HolderRow, LoadRow, QueryRow, ResourceRow
+from rr_actors.streams.stream import StreamRow
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Found
 from rr_actors.system.console.console_questions import Find

@@ -12,14 +12,11 @@ nobody waits for a dead reader, a reader that is there gets the newest frame, an
 from __future__ import annotations
 
 import argparse
-import copyreg
 import hashlib
-import io
 import os
 import pickle
 import select
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +24,9 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from rr_actors.hosting.streams import Connected, Keep, KnownReader, PublishedFrame, Stream
+from rr_actors.streams.known_reader import Connected, KnownReader, PublishedFrame
+from rr_actors.streams.stream import Keep, Stream
+from rr_actors.streams.stream_sockets import WISH, packet_of
 from rr_actors.wire.segment_slots import PAGE_BYTES, Slot, Slots
 from rr_actors.wire.segments import Lie, Parcel, places_in
 from simulation.explore import Walk
@@ -35,7 +34,6 @@ from simulation.explore import Walk
 FRAME_PAGES = 2
 _FIRST_NUMBER = 8
 _PACKETS = 4  # that a socket has room for
-_PACKET = tuple[int, float, bytes | Parcel]
 
 Step = tuple[str, *tuple[int, ...]]
 What = Literal["copy", "loan", "abort"]
@@ -45,17 +43,9 @@ class Broken(Exception):
     """A promise of the slots was broken."""
 
 
-class _Packer(pickle.Pickler):
-    """Packs worlds with their locks, which nobody has between two steps. Elsewhere a lock is refused."""
-
-    dispatch_table = {**copyreg.dispatch_table, type(threading.Lock()): lambda _: (threading.Lock, ())}  # noqa: RUF012
-
-
 def packed(world: World) -> bytes:
-    """The world as bytes, to go on from later."""
-    buffer = io.BytesIO()
-    _Packer(buffer).dump(world)
-    return buffer.getvalue()
+    """The world as bytes, to go on from later. It has no lock, which could not be packed."""
+    return pickle.dumps(world)
 
 
 class Segment:
@@ -107,6 +97,14 @@ class Link:
         self.packets.append(packet)
         return len(packet)
 
+    def has_unread(self) -> bool:
+        """Return whether the reader has still to read a packet."""
+        return bool(self.packets) and not self.ended
+
+    def end(self) -> None:
+        """Have the reader hear that it gets nothing more."""
+        raise Broken("the publisher gives a reader up")
+
     def fileno(self) -> int:
         """Return no descriptor: there is none."""
         return -1
@@ -131,6 +129,10 @@ class Sharing:
 
     def __init__(self, slots: Slots) -> None:
         self._slots = slots
+
+    def may_share(self, holder: object, most_bytes: int) -> bool:
+        """Return whether share() would return a parcel."""
+        return self._slots.may_share(holder, most_bytes)
 
     def share(self, parcel: Parcel, holder: object, most_bytes: int) -> Parcel | None:
         """Return a parcel for one more holder."""
@@ -168,13 +170,15 @@ class Reader:
     def ask(self) -> None:
         """Say that it can take one more frame."""
         assert self.link is not None
-        self.link.asked.append(b"\0")
+        self.link.asked.append(WISH)
         self.owes = False
 
     def read(self) -> None:
         """Take the next packet, and have its value in hand."""
         assert self.link is not None
-        number, _, body = msgspec.msgpack.decode(self.link.packets.popleft(), type=_PACKET)
+        number, _, body, note = msgspec.structs.astuple(packet_of(self.link.packets.popleft()))
+        if note:
+            return
         self.owes, self.last = True, number
         assert isinstance(body, Parcel)
         segment = self.link.segment
@@ -322,7 +326,7 @@ class World:
         """Whether it waits for no reader of all frames."""
         if not thread.to or thread.to[0].keep == "latest" or thread.to[0].left:
             return True
-        return thread.to[0].has_room()
+        return thread.to[0].readiness(self._frame(thread)) != "behind"
 
     # -- what happens --------------------------------------------------------------------------------------------------
 
@@ -379,11 +383,12 @@ class World:
         elif thread.to:
             consumer = thread.to.popleft()
             if consumer.keep == "latest" or not consumer.left:
-                consumer.give(
-                    PublishedFrame(thread.number, 0.0, b"", self._body(thread), self.small.most_pages * PAGE_BYTES)
-                )
+                consumer.give(self._frame(thread))
         else:
             self._end(thread)
+
+    def _frame(self, thread: Thread) -> PublishedFrame:
+        return PublishedFrame(thread.number, 0.0, b"", self._body(thread), self.small.most_pages * PAGE_BYTES)
 
     def _body(self, thread: Thread) -> bytes | Parcel:
         if (slot := thread.slot) is None:
@@ -428,6 +433,11 @@ class World:
         self._run()
         if any(thread.program for thread in self.threads):
             raise Broken("a thread waits for a reader that does not come")
+        for link, consumer in self.consumers:
+            before = len(link.packets)
+            consumer.receive()
+            if len(link.packets) > before:
+                raise Broken("a reader wants the frame that waits for it, and nobody hears it")
         self.threads.append(Thread(("copy",)))
         self._run()
         for number, reader in enumerate(self.readers):

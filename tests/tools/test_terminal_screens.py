@@ -21,8 +21,8 @@ import pytest
 from rich.cells import cell_len
 from textual.pilot import Pilot
 
-from rr_actors.hosting.streams import ReaderRow, StreamInfo, StreamRow
 from rr_actors.registrar.pages import HolderRow, LoadRow, QueryRow, ResourceRow
+from rr_actors.streams.stream import ReaderRow, StreamInfo, StreamRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions

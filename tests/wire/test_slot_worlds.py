@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from rr_actors.hosting.streams import Connected, KnownReader, PollSet, Shared, Stream
+from rr_actors.streams.known_reader import Connected, KnownReader, PollSet, Shared
+from rr_actors.streams.stream import Stream
 from rr_actors.wire.segment_slots import Slot, Slots
 from rr_actors.wire.segments import Parcel
 from simulation.explore import Walk
@@ -92,7 +93,7 @@ class _Keeping:
     """Shares slots, and frees none that was not sent."""
 
     def __init__(self, shared: Shared) -> None:
-        self.share, self.take_back = shared.share, shared.take_back
+        self.may_share, self.share, self.take_back = shared.may_share, shared.share, shared.take_back
 
     def discard(self, parcel: Parcel) -> None:
         pass

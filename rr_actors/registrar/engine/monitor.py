@@ -25,7 +25,6 @@ from rr_actors.base.errors import CatalogError, NotSerializable
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.failure import failure_of
 from rr_actors.hosting.process_node import ProcessNode
-from rr_actors.hosting.streams import Publishers
 from rr_actors.registrar.core.decide import Item, refuse_uncommitted
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
 from rr_actors.registrar.engine.registrar_state import DirectPaths, may_be_interrupted, runs_handlers
@@ -36,6 +35,7 @@ from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, 
 from rr_actors.registrar.model.rows import Change, Held, Notice
 from rr_actors.registrar.model.store import Store
 from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
+from rr_actors.streams.publishers import Publishers
 from rr_actors.wire.transport import Exchange, Hello
 
 logger = Log("rr_actors.registrar")

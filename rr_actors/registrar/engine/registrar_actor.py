@@ -12,7 +12,6 @@ from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.base.values.failure import Failure, error_of, failure_of
-from rr_actors.hosting.streams import Publishers
 from rr_actors.registrar.engine.effect_runner import EffectRunner
 from rr_actors.registrar.engine.monitor import Opening, RegistrarBase, RegistrarMonitor
 from rr_actors.registrar.engine.progress import ProgressReports
@@ -27,6 +26,7 @@ from rr_actors.registrar.model.messages import Loaded, LoadRefused
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.runtime.thread_rules import on_loop
+from rr_actors.streams.publishers import Publishers
 from rr_actors.wire.name_service import Presence
 from rr_actors.wire.transport import Attach, Exchange, Hello, Welcome
 

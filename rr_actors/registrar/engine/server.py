@@ -47,7 +47,6 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode, shown_plain, text_of_value
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.base.values.type_shapes import digest_of
-from rr_actors.hosting.streams import Publisher, StreamNews
 from rr_actors.registrar.core.callback_runs import deaths_of, is_given_up, running
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.fields import annotated_types, by_fields, field_names, hints_of
@@ -77,6 +76,8 @@ from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.time_limits import Probes
 from rr_actors.runtime.user_loop import COROUTINE, Done, closing
 from rr_actors.runtime.workers import is_async
+from rr_actors.streams.publisher import Publisher
+from rr_actors.streams.stream import StreamNews
 from rr_actors.wire.name_service import LABELS_BYTES
 
 
@@ -139,6 +140,7 @@ class Current(msgspec.Struct, frozen=True):
     _run: int
     interrupted: bool = False
     _request: bytes = b""
+    _runs_again: bool = True  # a callback runs after a crash of the manager
 
     @property
     def name(self) -> str:
@@ -204,7 +206,8 @@ class Current(msgspec.Struct, frozen=True):
         """Open a stream of the resource, in its load or recover callback: its holders read it with Query.stream().
 
         It is closed when the unload callback has returned. After a crash of the manager, open it again in the callback
-        that runs then: those who read it go on.
+        that runs then: those who read it go on. With recovery="keep" and no recover callback, none runs: the log says
+        so, and the iterations of those who read it end with Unavailable, thirty seconds after a crash.
 
         Raises:
             InvalidName: `name` is none.
@@ -216,7 +219,8 @@ class Current(msgspec.Struct, frozen=True):
             place = "outside" if self._role.reports else "in"
             what = f"{self._registrar.name}/{self.server}: open_stream() {place} its {self._role.name} callback"
             raise UsageError(f"{what}: only load and recover callbacks open streams, while they run")
-        return self._registrar.publishers.open(self.resource_id, name)
+        once = "" if self._runs_again else f"{self._registrar.name}/{self.server}"
+        return self._registrar.publishers.open(self.resource_id, name, once)
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
@@ -425,6 +429,7 @@ class ServerActor:
         self.facts = Server(spec.name, *limits, *has, types, checksum, spec.recover_timeout_s, *idle)  # for decisions
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
+        self._runs_again = spec.recover is not None or self.facts.recovery != "keep"
         if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):
             text = f"{self.origin}: types: {size} bytes are over the limit of {limit} (frame_limit_bytes)"
             raise NotSerializable(f"{text}: have a module that others can import, or raise the limit", path="types")
@@ -877,7 +882,7 @@ class ServerActor:
         counts = role.counted and run is None  # else a reload, whose attempts the row counts
         attempt = deaths_of(catalog, role.counted, resource.id) + 1 if counts else number
         place = resource.id, attempt, holder, self.spec.name, self.registrar
-        current = Current(*place, role, number, interrupted, resource.request)
+        current = Current(*place, role, number, interrupted, resource.request, self._runs_again)
         run = self._runs[role] if run is None else run
         workers = self.registrar.workers
         if self.registrar.node.watched.level[0] > 1:

@@ -16,10 +16,10 @@ from rr_actors.base.names import named
 from rr_actors.base.reporting.tracebacks import ProcessStacks
 from rr_actors.base.values.failure import Failure
 from rr_actors.hosting.forwarded_logs import LogLine
-from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.pages import LoadRow, QueryRow, ResourceRow, ServerRow
+from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.recording.figures import Figure
 

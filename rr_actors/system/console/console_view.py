@@ -27,11 +27,11 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, readable, text_of
 from rr_actors.base.names import child_meant, no_child
 from rr_actors.hosting.forwarded_logs import KeptLogs
-from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.pages import Page, ResourceRow, Wanted, What
 from rr_actors.registrar.registrar import Registrar, Usages, page
 from rr_actors.runtime.processes.lifeline import stopped
+from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.event_history import Record, TreeLog, records_below, records_of
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console import console_messages as c

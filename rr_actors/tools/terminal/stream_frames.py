@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from rr_actors.base.errors import RrError, Unavailable, text_of
-from rr_actors.hosting.streams import Source, Stream, StreamFrame, StreamReader, Wake
+from rr_actors.streams.stream import Stream, StreamFrame
+from rr_actors.streams.stream_reader import Source, StreamReader
+from rr_actors.streams.wake import Wake
 
 _READER = "rr-actors"
 _COLOURS = {1: 0, 3: 2, 4: 6}

@@ -12,9 +12,9 @@ from typing import Protocol, TypeAlias, TypeVar
 from rr_actors.base.errors import NotFound, RrError, UnknownQuery
 from rr_actors.base.names import named, short_id
 from rr_actors.hosting.forwarded_logs import LogLine
-from rr_actors.hosting.streams import StreamRow
 from rr_actors.managers.actions.graph_pictures import ShownGraph, shown_graph
 from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
+from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions

@@ -14,8 +14,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import msgspec
 
 from rr_actors.base.names import named, short_id
-from rr_actors.hosting.streams import StreamRow
 from rr_actors.registrar.pages import CONDITIONS, LoadRow, QueryRow, ResourceRow
+from rr_actors.streams.stream import StreamRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages

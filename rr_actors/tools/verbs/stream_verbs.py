@@ -13,7 +13,7 @@ import typer
 
 from rr_actors.base.errors import NotFound, UsageError, did_you_mean, few, shown, text_of
 from rr_actors.base.names import short_id, short_ids
-from rr_actors.hosting.streams import Stream, StreamFrame, StreamRow
+from rr_actors.streams.stream import Stream, StreamFrame, StreamRow
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_questions import Find
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_table

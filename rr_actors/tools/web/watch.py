@@ -21,8 +21,8 @@ from typing import TypeVar
 import msgspec
 
 from rr_actors.base.errors import RrError
-from rr_actors.hosting.streams import Stream
 from rr_actors.registrar.pages import ResourceRow, ServerRow
+from rr_actors.streams.stream import Stream
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
