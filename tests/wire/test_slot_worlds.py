@@ -165,7 +165,7 @@ FOUND = {
     UsedGivenBack: ("copies", 3),
     ReplacedAndKept: ("copies", 11),
     TakenBackTooSoon: ("a reader is closed", 12),
-    Deaf: ("copies", 5),
+    Deaf: ("copies", 17),
     FreedElsewhere: ("the publisher is killed", 15),
     LineNotKept: ("a reader is closed", 12),
     NeverFreed: ("copies", 1),
