@@ -1175,7 +1175,7 @@ class Registrar(Consumer):
             return
         instead = "start a thread for it, and let the callback return"
         check_not_own(f"registrar {self.name!r}: close()", lambda me: serving(me) is self._actor, instead)
-        self._calls.dispatcher.run(self._node.dismiss(self.name, limit_s))
+        self._calls.dispatcher.run(self._node.dismiss((self.name,), limit_s))
 
 
 def _begun(some: list[tuple[Resource, ServerActor]]) -> dict[str, Future[Measured]]:

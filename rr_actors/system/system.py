@@ -412,8 +412,7 @@ class System:
             if status is Presence.DORMANT and (entry := node.find(name)) is not None:
                 logger.warning("system %s: stops, and registrar %s stays dormant%s", self.name, name, entry.because)
         opened = [name for name, actor in node.registrars.items() if actor.on_failure is None]  # by no manager
-        for name in reversed(opened):
-            await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
+        await steps.take_async("closing the application's registrars", node.dismiss(opened[::-1], limit_s))
         if self._tree is not None and self._end is None:
             await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
         self._tree = None

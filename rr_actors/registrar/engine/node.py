@@ -224,20 +224,37 @@ class Node(ProcessNode):
         entry = self.directory.lookup(registrar_key(name))
         return entry is None or entry.status is not Presence.UP or entry.address == self.transport.address
 
-    async def dismiss(self, name: str, timeout_s: float | None) -> None:
-        """Wind a registrar down, and close it for good.
+    async def dismiss(self, names: Sequence[str], timeout_s: float | None) -> None:
+        """Wind registrars down, each within `timeout_s`, while all of them serve; then close them for good.
+
+        Consumers come before their providers, so a whole is unloaded before its parts, and its releases are answered.
 
         Raises:
-            Exception, ExceptionGroup: the errors of the steps; the registrar is closed all the same.
+            Exception, ExceptionGroup: the errors of the steps; the registrars are closed all the same.
         """
-        steps = Steps()
-        await steps.take_async("releasing what it holds, and unloading what it serves", self.wind_down(name, timeout_s))
-        config = None if (registrar := self.registrars.get(name)) is None else registrar.config
-        steps.take("closing it", self.close_registrar, name, _GONE)
-        if config is not None:
-            self._look_whether_needed(config)
-        self.owners.pop(name, None)
-        steps.end(f"registrar {name!r}: not closed as it should be")
+        steps, left = Steps(), list(names)
+        while left:
+            name = next((name for name in left if not self._provides_for(name, left)), left[0])  # else they form a ring
+            left.remove(name)
+            what = f"releasing what registrar {name!r} holds, and unloading what it serves"
+            await steps.take_async(what, self.wind_down(name, timeout_s))
+        for name in names:
+            config = None if (registrar := self.registrars.get(name)) is None else registrar.config
+            steps.take(f"closing registrar {name!r}", self.close_registrar, name, _GONE)
+            if config is not None:
+                self._look_whether_needed(config)
+            self.owners.pop(name, None)
+        steps.end("not all registrars are closed as they should be")
+
+    def _provides_for(self, provider: str, consumers: Sequence[str]) -> bool:
+        """Return whether one of these registrars holds something at the provider, which is another."""
+        for name in consumers:
+            if name != provider and (registrar := self.registrars.get(name)) is not None:
+                registrar.settle()
+                with registrar.lock:
+                    if registrar.whole().outbound.get(provider):
+                        return True
+        return False
 
     async def wind_down(self, name: str, timeout_s: float | None) -> None:
         """Wind a registrar down for good: release all it holds and unload all it serves, within `timeout_s`."""
