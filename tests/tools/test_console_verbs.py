@@ -294,6 +294,18 @@ def test_resources_are_listed_and_chosen(app: rr.Registrar) -> None:
     assert "1 more" in rr_actors("resources", "--limit", "1").stderr
 
 
+def test_a_list_for_programs_has_all_rows_and_says_what_a_limit_leaves_out(app: rr.Registrar) -> None:
+    for number in range(230):
+        app.load("shop/thing", Order(f"lamp {number}"))
+
+    assert len(json.loads(said("resources", "--json"))) == 230
+    assert len(json.loads(said("resources", "-o", "json"))) == 230
+    assert len(said("resources", "-o", "name").splitlines()) == 230
+    assert "30 more: choose with MATCH, or raise --limit" in rr_actors("resources").stderr
+    for form in (("--json",), ("-o", "name"), ("-o", "json")):
+        assert "225 more" in rr_actors("resources", "--limit", "5", *form).stderr
+
+
 def test_a_resource_is_named_and_every_command_takes_its_name_and_its_short_id(app: rr.Registrar) -> None:
     heard = Calls()
     queries = [app.load("shop/thing", Order(f"lamp {number}"), on_status=heard) for number in range(3)]

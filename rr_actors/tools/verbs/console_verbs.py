@@ -7,7 +7,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -106,6 +106,10 @@ Timeout = Annotated[
     float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=c.TIMEOUT_LIMIT_S, help="How long it may take.")
 ]
 Limit = Annotated[int, typer.Option("--limit", min=1, help="Show at most so many.")]
+RowLimit = Annotated[
+    int | None,
+    typer.Option("--limit", min=1, show_default=False, help=f"Show at most so many; {_SHOWN} in a table, else all."),
+]
 ChildArgument = Annotated[
     str, typer.Argument(metavar="ID", help="A child's id, or its path.", autocompletion=_completing(_children))
 ]
@@ -196,7 +200,7 @@ def resources(
         str, typer.Argument(help="Only those with this text in their id, server, request or status.")
     ] = "",
     registrar: Annotated[str, typer.Option(help="Only this one's.", autocompletion=_completing(_registrars))] = "",
-    limit: Limit = _SHOWN,
+    limit: RowLimit = None,
     status: Annotated[
         list[str] | None, typer.Option(help="Only those in this state, OK or loading for instance; may be repeated.")
     ] = None,
@@ -233,7 +237,7 @@ def _show_resources(
     state: Path | None,
     match: str,
     registrar: str,
-    limit: int,
+    limit: int | None,
     status: list[str] | None,
     holder: str,
     sort_by: str | None,
@@ -244,18 +248,21 @@ def _show_resources(
     if wrong := [one for one in status or () if one.lower() not in known]:
         raise UsageError(f"--status: expected one of {', '.join(reversed(CONDITIONS))}, got {shown(wrong[0])}")
     chooses = bool(status or holder or sort_by)
+    most = _most(limit, "json" if as_json else output)
     with _client(state) as client:
-        page = client.resources(registrar, match, sys.maxsize if chooses else limit)
+        page = client.resources(registrar, match, sys.maxsize if chooses else most)
     if chooses:
-        page = _chosen(page, {one.lower() for one in status or ()}, holder, sort_by, limit)
+        page = _chosen(page, {one.lower() for one in status or ()}, holder, sort_by, most)
     if as_json or output == "json":
         say_json(page.rows)
+        _say_what_is_missing(page.total - len(page.rows), page.notes)
         return
     if not page.rows:
         chosen = match or registrar or status or holder
         say("no resource matches" if chosen else "there are no resources", err=True)
     if output == "name":
         say_lines("\n".join(f"{row.server} {row.request}" for row in page.rows))
+        _say_what_is_missing(page.total - len(page.rows), page.notes)
         return
     table: list[tuple[str, ...]] = []
     ids = short_ids(row.id for row in page.rows)
@@ -267,9 +274,21 @@ def _show_resources(
         heads = ("resource", "state", "priority", "holders", "held by", "id")
         right = ("priority", "holders")
         say_table(heads, table, gives_way=("resource", "state"), right=right, wide=output == "wide")
-    if page.total > len(page.rows):
-        say(f"{page.total - len(page.rows)} more: choose with MATCH, or raise --limit", err=True)
-    for note in page.notes:
+    _say_what_is_missing(page.total - len(page.rows), page.notes)
+
+
+def _most(limit: int | None, output: str | None) -> int:
+    """Return how many rows are shown at most: all in a form for programs, which would take a part for the whole."""
+    if limit is not None:
+        return limit
+    return sys.maxsize if output in ("json", "name") else _SHOWN
+
+
+def _say_what_is_missing(left_out: int, notes: Sequence[str], more: str = "more") -> None:
+    """Say on the error output how many rows are left out, and who was not asked."""
+    if left_out > 0:
+        say(f"{left_out} {more}: choose with MATCH, or raise --limit", err=True)
+    for note in notes:
         say(f"not asked: {note}", err=True)
 
 
@@ -300,7 +319,7 @@ def usage(
     sort_by: Annotated[
         str, typer.Option("--sort-by", metavar="NUMBER", help="The most of it first: cpu or memory_bytes, say.")
     ] = "",
-    limit: Limit = _SHOWN,
+    limit: RowLimit = None,
     output: Output = None,
     watch: WatchOption = False,
     state: StateOption = None,
@@ -311,7 +330,7 @@ def usage(
 
 
 def _show_usages(
-    state: Path | None, match: str, registrar: str, sort_by: str, limit: int, output: str | None, as_json: bool
+    state: Path | None, match: str, registrar: str, sort_by: str, limit: int | None, output: str | None, as_json: bool
 ) -> None:
     with _client(state) as client:
         page = client.usages(registrar, match)
@@ -321,12 +340,14 @@ def _show_usages(
         if sort_by not in names:
             raise UsageError(f"--sort-by: expected one of {', '.join(names) or 'no numbers'}, got {shown(sort_by)}")
         rows.sort(key=lambda row: row.usage.get(sort_by, -math.inf), reverse=True)
-    total, rows = len(rows), rows[:limit]
+    total, rows = len(rows), rows[: _most(limit, "json" if as_json else output)]
     if as_json or output == "json":
         say_json([msgspec.structs.asdict(row) for row in rows])
+        _say_what_is_missing(total - len(rows), page.notes)
         return
     if output == "name":
         say_lines("\n".join(f"{row.server} {row.request}" for row in rows))
+        _say_what_is_missing(total - len(rows), page.notes)
         return
     ids = short_ids(row.id for row in rows)
     table = [
@@ -339,13 +360,10 @@ def _show_usages(
         say_table(heads, table, gives_way=("resource",), right=heads[1:-1], wide=output == "wide")
     elif not rows:
         say("no resource says what it uses", err=True)
-    if total > len(rows):
-        say(f"{total - len(rows)} more: choose with MATCH, or raise --limit", err=True)
     for row in rows:
         if row.failure:
             say(f"not known: {row.name} ({ids[row.id]}): {row.failure}", err=True)
-    for note in page.notes:
-        say(f"not asked: {note}", err=True)
+    _say_what_is_missing(total - len(rows), page.notes)
 
 
 @app.command(epilog="Example: rr-actors loads cameras --sort-by p95 --watch")
@@ -382,19 +400,17 @@ def _show_loads(state: Path | None, match: str, registrar: str, sort_by: str | N
             servers = sorted(servers, key=_LOAD_ORDERS[sort_by], reverse=True)
         if as_json:
             say_json({"waiting": found.rows, "servers": servers})
+            _say_what_is_missing(found.total - len(found.rows), found.notes, "more wait")
             return
         waiting = [waiting_cells(client.ask, row) for row in found.rows[:limit]]
     if waiting:
         say_table(WAITING_HEADS, waiting, gives_way=("to load", "for what", "because"), right=("waits for",))
     else:
         say(NO_LOAD_WAITS)
-    if found.total > len(waiting):
-        say(f"{found.total - len(waiting)} more wait: choose with MATCH, or raise --limit", err=True)
     if servers:
         say("")
         say_table(LOADS_HEADS, [loads_cells(row) for row in servers], gives_way=("server",), right=LOADS_HEADS[1:])
-    for note in found.notes:
-        say(f"not asked: {note}", err=True)
+    _say_what_is_missing(found.total - len(waiting), found.notes, "more wait")
 
 
 _LOAD_ORDERS: dict[str, Callable[[LoadRow], float]] = {
