@@ -44,8 +44,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as state:
         system = rr.System(root, state_dir=state)
         system.subscribe(show)
-        with system:
-            ended.wait(20)
+        try:
+            with system:
+                ended.wait(20)
+        except rr.SupervisionError as error:  # a program that does not catch it ends with exit code 1
+            print(f"the program hears it, too: {type(error.__cause__).__name__}", flush=True)
 
 
 if __name__ == "__main__":

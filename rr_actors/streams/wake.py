@@ -65,8 +65,9 @@ class Wake:
         os.close(fd)
 
     def __del__(self) -> None:
-        if self._fd >= 0:
-            os.close(self._fd)
+        fd, self._fd = self._fd, -1  # finalizers of a cycle run in any order: a reader may set it after this
+        if fd >= 0:
+            os.close(fd)
 
 
 def _end(ready: asyncio.Future[None]) -> None:

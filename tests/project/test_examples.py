@@ -85,6 +85,7 @@ EXPECTED = {
         "4 restarts needed within 5 s, 3 allowed: it gives up",
         "root/innocent: stopped shutdown",
         "the supervisor has ended: shutdown",
+        "the program hears it, too: RestartIntensityExceeded",
     ],
     "escalation": [
         "  root/base/wheel/motor: restarted",

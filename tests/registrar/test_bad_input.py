@@ -950,6 +950,7 @@ def test_a_tree_that_has_ended_is_said_to_be_gone_not_to_be_coming_back(state_di
             actor.ask("anything")
         with pytest.raises(rr.RegistrarDown, match="shelf"):
             app.load("shelf/book", "x")
+        system.stop()
 
 
 class Shelf(rr.Manager):

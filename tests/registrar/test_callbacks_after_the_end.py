@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -397,7 +398,6 @@ CLIENT_ENDS: dict[str, Callable[[rr.System, Any, Any, Any], object]] = {
     "unload_all": lambda system, client, registrar, query: registrar.unload_all(),
     "registrar.close": lambda system, client, registrar, query: registrar.close(),
     "client.close": lambda system, client, registrar, query: client.close(),
-    "stop": lambda system, client, registrar, query: system.stop(),
 }
 
 
@@ -412,6 +412,32 @@ def test_no_status_callback_of_a_client_begins_after_an_end_has_returned(
     listens: str,
     end: Callable[[rr.System, Any, Any, Any], object],
 ) -> None:
+    with begun(provider, state_dir, slow, listens) as (client, registrar, query):
+        end(system, client, registrar, query)
+
+        slow.check_nothing_more()
+
+
+@pytest.mark.usefixtures("runtime_dir")
+@pytest.mark.parametrize("listens", ["the query", "the query, async", "the server"])
+def test_the_one_status_that_a_client_hears_after_a_stop_is_that_the_system_has_ended(
+    system: rr.System, provider: rr.Registrar, state_dir: Path, slow: Slow, listens: str
+) -> None:
+    with begun(provider, state_dir, slow, listens):
+        system.stop()
+        slow.gate.open()
+
+        _, last = slow.begun.wait(2)
+        assert (last.state, last.reason) == ("FATAL", "ended")
+        with pytest.raises(AssertionError, match="expected 3 calls"):
+            slow.begun.wait(3, NOTHING_S)
+
+
+@contextlib.contextmanager
+def begun(
+    provider: rr.Registrar, state_dir: Path, slow: Slow, listens: str
+) -> Iterator[tuple[rr.Client, Any, rr.Query[Any]]]:
+    """A client whose callback has begun to hear the first of many statuses."""
     serve(provider, "camera")
     serve(provider, "door")
     with rr.connect(state_dir) as client:
@@ -431,7 +457,4 @@ def test_no_status_callback_of_a_client_begins_after_an_end_has_returned(
         eventually(lambda: query.fetch_state() == "WARNING")
         busy.open()
         slow.begun.wait()
-
-        end(system, client, registrar, query)
-
-        slow.check_nothing_more()
+        yield client, registrar, query

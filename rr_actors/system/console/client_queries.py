@@ -86,6 +86,11 @@ class ClientQuery(Query[Response]):
         super().__init__(*place)
         self._lost = None
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the system has ended while the query was held."""
+        return self._lost is not None
+
     def lose(self, error: NotRunning) -> None:
         """Note that the system has ended: what waits for a status or a frame raises the error."""
         self._lost = error
@@ -115,10 +120,13 @@ class ClientViews:
 
     Args:
         is_open: returns whether the client has the registrar open. When it has not, no callback begins any more.
+        is_connected: returns whether the system's side is open, too. When it is not, the one status that a callback
+            still hears is that the system has ended.
     """
 
-    def __init__(self, is_open: Callable[[], bool]) -> None:
-        self._is_open = is_open
+    def __init__(self, is_open: Callable[[], bool], is_connected: Callable[[], bool]) -> None:
+        self.is_open = is_open
+        self._is_connected = is_connected
         self._lock = threading.Lock()
         self._held: dict[str, tuple[ClientQuery, StatusCallback | None]] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
@@ -205,12 +213,10 @@ class ClientViews:
             except Exception as error:
                 log_raised(logger, error, "a status callback for %s raised", query.server_id)
 
-    def is_open(self) -> bool:
-        """Return whether the client has the registrar open."""
-        return self._is_open()
-
     def _hears(self, query_id: str) -> bool:
-        return query_id in self._held and self._is_open()
+        if (held := self._held.get(query_id)) is None or not self.is_open():
+            return False
+        return held[0].is_lost or self._is_connected()
 
     def _while_held(self, query_id: str, callback: StatusCallback) -> Callable[[Status], Coroutine[Any, Any, None]]:
         async def begin(status: Status) -> None:

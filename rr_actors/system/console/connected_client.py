@@ -255,7 +255,7 @@ class ClientRegistrar(Consumer):
             raise
         self._name: str = done.facts["registrar"]
         closed = self._closed
-        self._views = ClientViews(lambda: not (closed.is_set() or connections.is_closed))
+        self._views = ClientViews(lambda: not (closed.is_set() or connections.is_closed), self._lifeline.is_open)
         calls = _ClientCalls(connections, self._name, self._views)
         self._client_loads = _ClientLoads(calls, self)
         self._unload_ways = RemoteUnloads(calls)

@@ -35,3 +35,4 @@ def main(state_dir: str, max_restarts: int = 3) -> None:
         system.wait(60)
         print(f"the tree has ended: {system.ended.reason if system.ended else 'not yet'}", flush=True)
         time.sleep(3)
+        system.stop()  # else the end of the block would raise that the tree has given up
