@@ -79,6 +79,8 @@ def load(decision: Decision, message: Load) -> None:
     resource_id = catalog.joinable(server, message.request)
     if resource_id is None:
         _load_first(decision, message)
+    elif ring := _ring_of_holds(catalog, message, resource_id):
+        decision.cause(refuse(decision, message.origin, message.query_id, failures.own_part(catalog, ring)))
     elif resource_id in catalog.recovering:
         park(decision, resource_id, message)
         _look_for_ring(decision, message, catalog.resources[resource_id])
@@ -140,10 +142,32 @@ def join(catalog: Catalog, message: Load) -> ServedQuery | None:
         return None
     if catalog.shut or message.priority or resource.id in catalog.ranked:
         return None
+    if message.parent and message.origin == catalog.name and _ring_of_holds(catalog, message, resource.id):
+        return None
     id = message.query_id
     if id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
         return None
     return _query_of(message, resource.id)
+
+
+def _ring_of_holds(catalog: Catalog, message: Load, resource_id: str) -> list[str]:
+    """Return the resources from one that is loaded to the parent of a Load that would make it its own part, or [].
+
+    Such a ring of holds would never be released. Only rings within this registrar are seen here.
+    """
+    if message.origin != catalog.name or not message.parent or catalog.resources[resource_id].phase is not LOADED:
+        return []
+    ways = {message.parent: [message.parent]}
+    left = [message.parent]
+    while left:
+        id = left.pop()
+        if id == resource_id:
+            return ways[id][::-1]
+        for query in catalog.queries_of(id):
+            if query.parent and query.origin == catalog.name and query.parent not in ways:
+                ways[query.parent] = [*ways[id], query.parent]
+                left.append(query.parent)
+    return []
 
 
 def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:

@@ -163,6 +163,13 @@ def left_behind(catalog: Catalog, resources: Sequence[Resource]) -> Failure:
     return Failure("UnloadFailed", text, {"resource_id": first.id, "server": origin}, [(origin, first.message)])
 
 
+def own_part(catalog: Catalog, ring: Sequence[str]) -> Failure:
+    """Return the failure of a load that would make a resource its own part, directly or through its parts."""
+    names = [catalog.origin_of(catalog.resources[id]) for id in ring]
+    text = f"{names[0]}: resource {ring[0]} would be its own part: {' -> '.join([*names, names[0]])}"
+    return Failure("CircularDependency", text, {"ring": names})
+
+
 def circular(ring: list[str], blocked: Held) -> Failure:
     """Return the failure of a load that would wait for itself; `blocked`: the query that closes the ring."""
     names = " -> ".join([*ring, ring[0]])
