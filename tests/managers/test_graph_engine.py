@@ -49,13 +49,18 @@ class FakeManager:
     def is_closing(self) -> bool:
         return False
 
-    def begin_run(self, graph_id: str, graph: Any, node: str, run: Any, control: Any) -> Any:
+    def begin_run(self, graph_id: str, graph: Any, node: str, run: Any, key: str) -> Any:
         self.begun(node)
         if node in self._errors:
             raise self._errors[node]
         return SimpleNamespace(unload=lambda: None)
 
-    def end_of(self, query: Any, node: str, run: Any, control: Any) -> Ended:
+    def tell_run(self, actor: str, key: str, word: Any, step: int) -> Callable[[float], str]:
+        return lambda within_s: ""
+
+    def wait_over(self, actor: str, key: str) -> None: ...
+
+    def end_of(self, query: Any, node: str, run: Any) -> Ended:
         return Ended(node, run.number, "on_true")
 
 

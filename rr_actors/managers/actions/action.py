@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, cast
 
 import msgspec
+import pykka
 from msgspec import inspect
 
+from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.checks import is_number
-from rr_actors.base.errors import UsageError, shown
+from rr_actors.base.errors import LoadFailed, UsageError, shown
 from rr_actors.managers.actions.graph_checks import Signature
 from rr_actors.managers.actions.graph_model import Parameter
 from rr_actors.managers.actions.parameters import SEPARATOR, flat, nested
@@ -21,6 +24,8 @@ from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.runtime.processes.isolated import Events
+
+_LOOK_S = 0.05  # how often a load looks whether the run is to stop: nobody notifies of the event
 
 OnStatus = Callable[[Status], object]
 _WITH_FIELDS = (inspect.StructType, inspect.DataclassType, inspect.NamedTupleType, inspect.TypedDictType)
@@ -111,6 +116,7 @@ class Action(ABC):
 
         Raises:
             RrError: as Registrar.load().
+            LoadFailed: the action is told to stop while it waits: the load is withdrawn.
             UsageError: the action is isolated.
         """
         me, registrar = self._current, self._registrar
@@ -123,9 +129,19 @@ class Action(ABC):
             if status.state is State.FATAL and not status.is_handled:
                 self.stopping.set()
 
-        if priority is None:
-            return registrar.load(server, request, on_status=heard, timeout_s=timeout_s, parent=me)
-        return registrar.load(server, request, on_status=heard, timeout_s=timeout_s, parent=me, priority=priority)
+        was_stopping = self.stopping.is_set()  # what a run needs to come to its end is loaded
+        options: dict[str, Any] = {} if priority is None else {"priority": priority}
+        begun: object = registrar.load(
+            server, request, on_status=heard, timeout_s=timeout_s, parent=me, block=False, **options
+        )
+        loading = cast("Reply[Query]", begun)
+        while not was_stopping and not loading.done():
+            with contextlib.suppress(pykka.Timeout):
+                return loading.get(timeout=_LOOK_S)
+            if self.stopping.is_set() and loading.cancel():
+                text = f"{name_of(type(self))}: it was told to stop while it waited for {server}: the load is withdrawn"
+                raise LoadFailed(text, server=server)
+        return loading.get()
 
     def _not_running(self) -> UsageError:
         if self._stopping is not None:
@@ -238,12 +254,27 @@ def result_of(kind: type[Action], returned: Any) -> tuple[str, dict[str, Any]]:
     succeeded = True
     if isinstance(returned, tuple) and len(cast("tuple[object, ...]", returned)) == 2:
         succeeded, output = cast("tuple[bool, object]", returned)
+        if not isinstance(succeeded, bool):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise _wrong_end(kind, cast("object", returned))
     if isinstance(output, bool) or output is None:
         return ("on_false" if output is False else "on_true"), {}
     if kind.Output is not None and isinstance(output, kind.Output):
-        output = msgspec.to_builtins(output)
+        output = _table(output, inspect.type_info(kind.Output))
     if not isinstance(output, dict):
-        expected = "an Output, a dict of outputs, True, False, None, or (False, outputs)"
-        raise UsageError(f"{kind.__name__}.run(): expected {expected}, got {shown(cast('object', returned))}")
+        raise _wrong_end(kind, cast("object", returned))
     leaves = {name for name, one in signature_of_class(kind).outputs.items() if one.type == "any"}
     return ("on_true" if succeeded else "on_false"), flat(cast("dict[str, Any]", output), leaves)
+
+
+def _wrong_end(kind: type[Action], returned: object) -> UsageError:
+    expected = "an Output, a dict of outputs, True, False, None, or (False, outputs)"
+    return UsageError(f"{kind.__name__}.run(): expected {expected}, got {shown(returned)}")
+
+
+def _table(value: Any, kind: Any) -> Any:
+    """Return what has fields as a table, and the tables in it. All other values stay as they are, with their types."""
+    if not isinstance(kind, _WITH_FIELDS):
+        return value
+    if isinstance(kind, inspect.TypedDictType):
+        return {one.encode_name: _table(value[one.name], one.type) for one in kind.fields if one.name in value}
+    return {one.encode_name: _table(getattr(value, one.name), one.type) for one in kind.fields}

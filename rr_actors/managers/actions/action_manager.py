@@ -8,23 +8,36 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from rr_actors.base import pickling
 from rr_actors.base.checks import is_number
-from rr_actors.base.errors import LoadFailed, NotFound, RrError, UsageError, shown
+from rr_actors.base.errors import (
+    LoadFailed,
+    LoadTimeout,
+    NotFound,
+    RegistrarDown,
+    RrError,
+    Unavailable,
+    UnknownRegistrar,
+    UsageError,
+    shown,
+)
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.actions.action import Action, bind, given_to, name_of, result_of, run_alone
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_engine import GraphEngine
 from rr_actors.managers.actions.graph_library import GraphLibrary
-from rr_actors.managers.actions.graph_model import ActionGraph
+from rr_actors.managers.actions.graph_model import ActionGraph, wrong_graph
 from rr_actors.managers.actions.graph_runs import (
+    ENDED,
+    LIVE,
     OVER,
     Begin,
     Change,
@@ -42,7 +55,7 @@ from rr_actors.managers.actions.graph_runs import (
     run_in,
 )
 from rr_actors.managers.actions.parameters import flat
-from rr_actors.managers.actions.run_controls import RunControl
+from rr_actors.managers.actions.run_controls import RunControl, Word
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
@@ -71,6 +84,30 @@ class RunAction:
     run: str = field(default_factory=new_id)
     attempt: int = 1
     engine: str = ""
+
+
+@dataclass(frozen=True)
+class ControlRun:
+    """The request to tell a run what holds for it, or, if `ask`, to say that of a run of one of the graphs here.
+
+    Attributes:
+        run: identifies the run.
+        word: "run", "pause" or "stop"; "over": stop, and answer when the run has ended.
+        step: of its graph.
+    """
+
+    run: str
+    word: Literal["run", "pause", "stop", "over", "ask"]
+    step: int = 0
+    id: str = field(default_factory=new_id)
+
+
+@dataclass(frozen=True)
+class RunControlled:
+    """The response: what holds for the run, and since which step of its graph."""
+
+    word: str
+    step: int
 
 
 @dataclass(frozen=True)
@@ -124,8 +161,8 @@ class Actions(Manager):
         self._lock = threading.Lock()
         self._engines: dict[str, GraphEngine] = {}
         self._instances: dict[str, str] = {}  # ids of graphs, by what their requests identify them by
-        self._controls: dict[str, RunControl] = {}
-        self._acting: dict[str, Action] = {}
+        self._controls: dict[str, RunControl] = {}  # of the runs that are here, by their keys
+        self._acting: set[Action] = set()
         self._closing = False
 
     def on_start(self) -> None:
@@ -133,6 +170,9 @@ class Actions(Manager):
 
         A graph whose load was interrupted is loaded again, and may run already.
         """
+        for query in self.registrar.queries():
+            if query.server == "control":  # the crash came between an answer and its release
+                threading.Thread(target=query.unload, kwargs={"timeout_s": None}, daemon=True).start()
         found = [info for info in self.registrar.resources() if info.server == "graph" and info.phase == LOADED]
         graphs = [info for info in found if info.id not in self._engines]
         go_on = [self._restored(info.id, info.request, info.response) for info in graphs]
@@ -143,7 +183,7 @@ class Actions(Manager):
         """Tell all actions to end. Those whose graph is not released run again when the manager starts again."""
         with self._lock:
             self._closing = True
-            acting = list(self._acting.values())
+            acting = list(self._acting)
         for action in acting:
             action.stopping.set()
 
@@ -158,23 +198,29 @@ class Actions(Manager):
                 raise UsageError(f"{self.registrar.name}: expected a message to Actions, got {shown(message)}")
 
     def stop_graph(self, graph: str) -> None:
-        """End a graph: stop its actions. Its state is STOPPED when they have ended.
+        """End a graph: stop its actions. Its state is STOPPED when they have ended. No action begins after the return.
 
         Args:
             graph: the id of the graph's resource.
 
         Raises:
             NotFound: no graph of this id runs here. `.id`, `.known`
+            Unavailable: the manager of an action has not confirmed within 5 s that the action is to stop, so it may run
+                on. It is told when that manager answers again.
         """
-        self._engine(graph).tell(Halt())
+        self._say(graph, Halt())
 
     def pause_graph(self, graph: str) -> None:
         """Pause a graph: no action begins until it is resumed, and `pausing` is set in those that run.
 
         Raises:
             NotFound: no graph of this id runs here. `.id`, `.known`
+            GraphError: it has ended.
+            Unavailable: as for stop_graph().
         """
-        self._engine(graph).tell(Pause())
+        if (state := self._engine(graph).run.state) in ENDED:
+            raise wrong_graph("", "graph_state", "one of RUNNING, PAUSED, HALTED", state)
+        self._say(graph, Pause())
 
     def resume_graph(self, graph: str, start: str = "") -> None:
         """Resume a graph that is paused or halted.
@@ -184,9 +230,13 @@ class Actions(Manager):
 
         Raises:
             NotFound: no graph of this id runs here. `.id`, `.known`
-            GraphError: it has no such action.
+            GraphError: it has no such action, or has ended; or it runs, and `start` is given.
+            Unavailable: as for stop_graph().
         """
-        self._engine(graph).tell(Resume(start))
+        state = self._engine(graph).run.state
+        if state in ENDED or (start and state not in ("PAUSED", "HALTED")):
+            raise wrong_graph("", "graph_state", "one of PAUSED, HALTED", state)
+        self._say(graph, Resume(start))
 
     def change_graph(self, graph: str, new: str | dict[str, Any], start: str = "", file: str = "") -> None:
         """Go on with another graph: one commit puts it in the place of the one that runs.
@@ -206,8 +256,12 @@ class Actions(Manager):
             GraphError: the new graph is wrong, or has no action `start`, or that lacks an input; or the graph that is
                 to be changed has ended. `.file`, `.path`, `.expected`, `.got`
         """
-        engine = self._engine(graph)
-        engine.tell(Change(self._library.find(new, file), start))
+        self._engine(graph)
+        self._say(graph, Change(self._library.find(new, file), start))
+
+    def _say(self, graph: str, event: Event) -> None:
+        if unconfirmed := self._engine(graph).tell(event):
+            raise Unavailable("; ".join(unconfirmed))
 
     def _engine(self, graph: str) -> GraphEngine:
         with self._lock:
@@ -228,31 +282,74 @@ class Actions(Manager):
             text = f"{request.action}: a crash has interrupted it, and its graph runs it again as the next attempt"
             raise LoadFailed(text, server=f"{self.registrar.name}/action")
         action = kind()
-        with self._lock:
-            control = self._controls.get(request.run)
-            self._acting[request.run] = action
-            closing = self._closing
         bind(action, self.registrar, request.attempt + current().attempt - 1)
+        control = RunControl(action)
+        with self._lock:
+            self._controls[request.run] = control
+            self._acting.add(action)
+            closing = self._closing
         try:
-            if control is not None:
-                control.attach_action(action)
             if closing:
                 action.stopping.set()
-            end = ActionEnd(*self._run(kind, action, request.inputs))
+            if request.engine:
+                self._ask(control, request)
+            end = ActionEnd(*self._run(kind, action, request.inputs, control))
         finally:
-            del self._acting[request.run]
+            with self._lock:
+                self._acting.discard(action)
+                if self._controls.get(request.run) is control:
+                    del self._controls[request.run]
+            control.over.set()
         if self._closing and action.stopping.is_set():
             raise LoadFailed(f"{request.action}: its manager stops", server=f"{self.registrar.name}/action")
         return end
 
-    def _run(self, kind: type[Action], action: Action, inputs: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    def _ask(self, control: RunControl, request: RunAction) -> None:
+        """Ask the engine whether a run may begin: it may have been stopped or paused on the way here."""
+        if request.engine == self.registrar.name:
+            control.tell(*self._said(request.run))
+            return
+        ask = ControlRun(request.run, "ask")
+        with self.registrar.load(f"{request.engine}/control", ask, timeout_s=None, response_type=RunControlled) as said:
+            control.tell(_WORDS[said.response.word], said.response.step)
+
+    def _said(self, key: str) -> tuple[Word, int]:
+        with self._lock:
+            engine = self._engines.get(key.partition("/")[0])
+        return ("stop", 0) if engine is None else engine.said(key)
+
+    @server("control", recovery="keep")
+    def control_run(self, request: ControlRun) -> RunControlled:
+        """Tell a run of this manager what holds for it, or say that of a run of one of its graphs."""
+        if request.word == "ask":
+            return RunControlled(*self._said(request.run))
+        control = self._control_of(request.run)
+        if control is not None:
+            control.tell("stop" if request.word == "over" else _WORDS[request.word], request.step)
+        while request.word == "over" and control is not None and not control.over.wait(0.1):
+            if current().stopping.is_set():
+                raise LoadFailed(f"{request.run}: it has not ended", server=f"{self.registrar.name}/control")
+        return RunControlled(request.word, request.step)
+
+    def _control_of(self, key: str) -> RunControl | None:
+        with self._lock:
+            return self._controls.get(key)
+
+    def _run(
+        self, kind: type[Action], action: Action, inputs: dict[str, Any], control: RunControl
+    ) -> tuple[str, dict[str, Any]]:
         """Run an action here or in a process of its own, and return its result and outputs."""
         if not kind.isolate:
+            if not control.begin():
+                text = f"{name_of(kind)}: it was told to stop before it began"
+                raise LoadFailed(text, server=f"{self.registrar.name}/action")
             return result_of(kind, action.run(given_to(kind, inputs)))
         name = f"{self.registrar.name}/{name_of(kind)}"
         call = pickling.dumps(functools.partial(run_alone, kind, inputs, action.attempt), f"the isolated action {name}")
         events, spawner = Events(action.stopping, action.pausing), self._node.spawner
-        ended = run_isolated(spawner, call, events, name=name, timeout_s=kind.timeout_s, grace_s=self._stop_s)
+        ended = run_isolated(
+            spawner, call, events, control.begin, name=name, timeout_s=kind.timeout_s, grace_s=self._stop_s
+        )
         if ended.why:
             error = LoadFailed(f"{name_of(kind)}: {ended.why}", server=f"{self.registrar.name}/action")
             if ended.trace:
@@ -273,7 +370,9 @@ class Actions(Manager):
         inputs = checked_inputs(graph, _flat_inputs(graph, request.inputs))
         run = first_run(graph)
         engine = self._add(current().resource_id, request.instance, graph, run)
-        begins = Begin(inputs), current().loaded
+        instance = request.instance
+        around = lambda: self._said(instance)[0] if instance.partition("/")[0] in self._engines else "run"  # noqa: E731
+        begins = Begin(inputs), current().loaded, around
         threading.Thread(target=engine.begin, args=begins, name=f"graph {graph.name}", daemon=True).start()
         return feedback(graph, run)
 
@@ -293,7 +392,7 @@ class Actions(Manager):
             engine.close(self._stop_s)
 
     def _add(self, id: str, instance: str, graph: ActionGraph, run: GraphRun) -> GraphEngine:
-        engine = GraphEngine(self, id, graph, run)
+        engine = GraphEngine(self, id, graph, run, self._stop_s)
         with self._lock:
             self._engines[id] = engine
             self._instances[instance] = id
@@ -326,41 +425,69 @@ class Actions(Manager):
         """Return whether this manager stops, so that ends of actions mean nothing."""
         return self._closing
 
-    def begin_run(self, graph_id: str, graph: ActionGraph, node: str, run: NodeRun, control: RunControl) -> Query:
+    def begin_run(self, graph_id: str, graph: ActionGraph, node: str, run: NodeRun, key: str) -> Query:
         """Run an action or a sub-graph; return its query when that has ended, or when the sub-graph has begun."""
         action = graph.nodes[node]
-        with self._lock:
-            self._controls[control.key] = control
-        try:
-            if not action.actor and action.action not in self._library.actions:
-                request: RunGraph | RunAction = RunGraph(action.action, run.inputs, control.key)
-                return self.registrar.load(f"{self.registrar.name}/graph", request, parent=graph_id, timeout_s=None)
-            request = RunAction(action.action, run.inputs, control.key, run.attempt, self.registrar.name)
-            actor = action.actor or self.registrar.name
-            return self.registrar.load(f"{actor}/action", request, parent=graph_id, timeout_s=None)
-        finally:
-            del self._controls[control.key]
+        if not action.actor and action.action not in self._library.actions:
+            request: RunGraph | RunAction = RunGraph(action.action, run.inputs, key)
+            return self.registrar.load(f"{self.registrar.name}/graph", request, parent=graph_id, timeout_s=None)
+        request = RunAction(action.action, run.inputs, key, run.attempt, self.registrar.name)
+        actor = action.actor or self.registrar.name
+        return self.registrar.load(f"{actor}/action", request, parent=graph_id, timeout_s=None)
 
-    def end_of(self, query: Query, node: str, run: NodeRun, control: RunControl) -> Ended:
+    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended:
         """Return how a run has ended whose query is held; of a sub-graph, wait for that."""
         response = query.response
         if isinstance(response, ActionEnd):
             return Ended(node, run.number, response.result, response.outputs)
-        control.attach(lambda what: self._tell_graph(query.resource_id, what))
         ended = wait_ended(query, None)
         result = "on_error" if ended.result == "on_halted" else ended.result
         return Ended(node, run.number, result, ended.outputs, ended.why)
 
-    def _tell_graph(self, id: str, what: str) -> None:
-        events: dict[str, Event] = {"stop": Halt(), "pause": Pause(), "resume": Resume()}
+    def tell_run(self, actor: str, key: str, word: Word, step: int) -> Callable[[float], str]:
+        """Tell a run what holds for it, here or in another manager. Return a function that waits until the run has it.
+
+        The manager of the run may not answer now. A run that begins there later asks first, and one that runs is told
+        when the manager answers: each word has its step, so that none comes too late.
+        """
+        if actor and actor != self.registrar.name:
+            told = threading.Event()
+            threading.Thread(target=self._tell_there, args=(actor, key, word, step, told), daemon=True).start()
+            text = f"{actor} has not confirmed that {key.partition('/')[2]} is to {word}"
+            return lambda within_s: "" if told.wait(within_s) else text
+        if (control := self._control_of(key)) is not None:
+            control.tell(word, step)
         with self._lock:
-            engine = self._engines.get(id)
-        if engine is not None:  # else it is being released
-            engine.tell(events[what])
+            sub_graph = self._engines.get(self._instances.get(key, ""))
+        said = sub_graph.tell(_EVENTS[word]) if sub_graph is not None else []
+        return lambda within_s: "; ".join(said)
+
+    def _tell_there(self, actor: str, key: str, word: Word | Literal["over"], step: int, told: threading.Event) -> None:
+        try:
+            with self.registrar.load(f"{actor}/control", ControlRun(key, word, step), timeout_s=None):
+                pass
+        except (RegistrarDown, UnknownRegistrar):  # it is gone, and with it its runs
+            logger.info("%s: %s is gone", key, actor)
+        except RrError as error:
+            logger.warning("%s: %s cannot be told to %s: %s", key, actor, word, error)
+            return
+        told.set()
+
+    def wait_over(self, actor: str, key: str) -> None:
+        """Stop a run of another manager that a crash of this one has left there, and wait until it has ended."""
+        if actor != self.registrar.name:
+            self._tell_there(actor, key, "over", sys.maxsize, threading.Event())
 
 
-def wait_ended(query: Query, timeout_s: float | None) -> GraphRun:
+_WORDS: dict[str, Word] = {"run": "run", "pause": "pause", "stop": "stop"}
+_EVENTS: dict[Word, Event] = {"run": Resume(), "pause": Pause(), "stop": Halt()}
+
+
+def wait_ended(query: Query, timeout_s: float | None, whole_s: float | None = None) -> GraphRun:
     """Return the run of a graph when it has ended or is halted.
+
+    Args:
+        whole_s: the time limit that errors name; None: `timeout_s`.
 
     Raises:
         LoadFailed: the graph is lost.
@@ -369,10 +496,19 @@ def wait_ended(query: Query, timeout_s: float | None) -> GraphRun:
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
     while (run := run_in(query.response)).state not in OVER:
         left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
-        status = query.wait_status(timeout_s=left_s)
+        try:
+            status = query.wait_status(timeout_s=left_s)
+        except LoadTimeout as error:
+            raise _not_ended(query, run_in(query.response), whole_s or timeout_s or 0.0) from error
         if status.state is State.FATAL:
             raise LoadFailed(f"{query.server_id}: the graph is lost: {status.message}", server=query.server_id)
     return run
+
+
+def _not_ended(query: Query, run: GraphRun, timeout_s: float) -> LoadTimeout:
+    live = ", ".join(f"{name} {node.state}" for name, node in run.nodes.items() if node.state in LIVE) or "none"
+    text = f"{query.server_id}: the graph has not ended within {timeout_s:g} s: {run.state}, running: {live}"
+    return LoadTimeout(text, server=query.server_id, timeout_s=timeout_s)
 
 
 def _flat_inputs(graph: ActionGraph, inputs: dict[str, Any]) -> dict[str, Any]:

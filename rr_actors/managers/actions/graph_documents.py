@@ -7,12 +7,14 @@ stay in the document.
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import msgspec
 
+from rr_actors.base.errors import did_you_mean
 from rr_actors.managers.actions.graph_model import (
     DEFAULT_CONDITIONS,
     RESPONSES,
@@ -24,6 +26,26 @@ from rr_actors.managers.actions.graph_model import (
     wrong_graph,
 )
 from rr_actors.managers.actions.parameters import SEPARATOR, is_of_type
+
+_KEYS = {
+    "graph": ("graph_name", "graph_description", "graph_entry", "graph_exit", "graph_state", "actions", "umrf_actions"),
+    "action": (
+        *("name", "id", "instance_id", "type", "effect", "actor", "parents", "children", "input_parameters"),
+        *("output_parameters", "execute_first", "package_name", "description", "library_path", "notation", "state"),
+        *("stop_when_received", "suffix"),
+    ),
+    "relation": ("name", "id", "instance_id", "conditions", "required", "remap"),
+    "parameter": (
+        "pvf_type",
+        "pvf_value",
+        "value",
+        "pvf_allowed_values",
+        "pvf_required",
+        "pvf_updatable",
+        "pvf_example",
+    ),
+}
+"""The keys of both dialects, also those that mean nothing here. Others are kept, unless they look like one of these."""
 
 T = TypeVar("T")
 Table = dict[str, Any]
@@ -67,6 +89,7 @@ def parse_graph(data: bytes, file: str) -> ActionGraph:
     """
     try:
         document = msgspec.json.decode(data)
+        json.loads(data, object_pairs_hook=lambda pairs: _check_once(pairs, file))
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise wrong_graph(file, "", "a JSON object", str(error), f"no JSON: {error}") from error
     return read_graph(document, file)
@@ -80,6 +103,7 @@ def read_graph(document: object, file: str = "") -> ActionGraph:
     """
     reader = _Reader(file)
     table = reader.as_table(document, "")
+    reader.check_keys(table, "graph", "")
     dialect = 1 if "umrf_actions" in table else 2
     key = "umrf_actions" if dialect == 1 else "actions"
     actions = reader.list_at(table, key, "", required=True)
@@ -106,6 +130,20 @@ def read_graph(document: object, file: str = "") -> ActionGraph:
     return ActionGraph(name, file, dialect, nodes, tuple(entry), exit, table)
 
 
+def _check_once(pairs: list[tuple[str, object]], file: str) -> None:
+    """Refuse an object that has a key twice: JSON readers take the last of them, and lose the others."""
+    keys: set[str] = set()
+    for key, _ in pairs:
+        if key in keys:
+            raise wrong_graph(file, key, "a key that its object has once", key, "it twice")
+        keys.add(key)
+
+
+def _kind_of(kind: str) -> str:
+    """Return a kind of object with its article."""
+    return f"{'an' if kind[0] == 'a' else 'a'} {kind}"
+
+
 class _Reader:
     """Reads the parts of one document; each error has the place."""
 
@@ -125,6 +163,14 @@ class _Reader:
 
     def list_at(self, table: Table, key: str, path: str, *, required: bool = False) -> list[object]:
         return cast("list[object]", self.get(table, key, list, path, required=required))
+
+    def check_keys(self, table: Table, kind: str, path: str) -> None:
+        """Refuse a key that looks like a known one, and is none."""
+        for key in table:
+            known = _KEYS[kind]
+            if key not in known and (hint := did_you_mean(key, known)):
+                place = f"{path}.{key}".lstrip(".")
+                raise wrong_graph(self.file, place, f"a key of {_kind_of(kind)}", key, f"an unknown key{hint}")
 
     def get(
         self, table: Table, key: str, kind: type[T], path: str, default: T | None = None, *, required: bool = False
@@ -146,14 +192,15 @@ class _Reader:
         return words[value]
 
     def node(self, table: Table, path: str, number: str, dialect: int) -> ActionNode:
+        self.check_keys(table, "action", path)
         name = self.full_name(table, path, number)
         outputs = self.parameters(self.table_at(table, "output_parameters", path), f"{path}.output_parameters")
         parents = {
-            self.full_name(parent, place, number): self.relation(parent, place)
+            self.related(parent, place, number): self.relation(parent, place)
             for place, parent in self.tables(table, "parents", path)
         }
         children = {
-            self.full_name(child, place, number): self.remap(child, place)
+            self.related(child, place, number): self.remap(child, place)
             for place, child in self.tables(table, "children", path)
         }
         return ActionNode(
@@ -169,6 +216,10 @@ class _Reader:
             children=children,
         )
 
+    def related(self, table: Table, path: str, number: str) -> str:
+        self.check_keys(table, "relation", path)
+        return self.full_name(table, path, number)
+
     def full_name(self, table: Table, path: str, number: str) -> str:
         name = self.get(table, "name", str, path, required=True)
         if not name:
@@ -183,11 +234,12 @@ class _Reader:
 
     def ends(self, table: Table, key: str, number: str) -> dict[str, ParentRelation]:
         return {
-            self.full_name(one, place, number): self.relation(one, place) for place, one in self.tables(table, key, "")
+            self.related(one, place, number): self.relation(one, place) for place, one in self.tables(table, key, "")
         }
 
     def relation(self, table: Table, path: str) -> ParentRelation:
         conditions = dict(DEFAULT_CONDITIONS)
+        stated: dict[str, str] = {}
         for i, text in enumerate(self.list_at(table, "conditions", path)):
             place = f"{path}.conditions[{i}]"
             result, arrow, response = self.checked(text, str, place).partition("->")
@@ -195,6 +247,8 @@ class _Reader:
             if not arrow or result not in RESULTS or response not in RESPONSES:
                 expected = f"one of {', '.join(RESULTS)}, then ->, then one of {', '.join(RESPONSES)}"
                 raise wrong_graph(self.file, place, expected, text)
+            if stated.setdefault(result, response) != response:
+                raise wrong_graph(self.file, place, f"one response to {result}: {stated[result]}", text)
             conditions[result] = response
         return ParentRelation(self.get(table, "required", bool, path, True), conditions)
 
@@ -219,6 +273,7 @@ class _Reader:
         return found
 
     def parameter(self, table: Table, path: str) -> Parameter:
+        self.check_keys(table, "parameter", path)
         type_name = self.get(table, "pvf_type", str, path, required=True)
         listed: object = table.get("pvf_allowed_values", ())
         allowed = tuple(cast("list[object]", listed)) if isinstance(listed, (list, tuple)) else (listed,)

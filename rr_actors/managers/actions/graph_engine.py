@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Set
 from typing import Any, Protocol
 
-from rr_actors.base.errors import CatalogError, RrError, Unavailable, UsageError
+from rr_actors.base.errors import CatalogError, RrError, Unavailable, UnknownQuery, text_of
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.actions.graph_model import ActionGraph
 from rr_actors.managers.actions.graph_runs import (
@@ -24,12 +24,14 @@ from rr_actors.managers.actions.graph_runs import (
     Ended,
     Event,
     GraphRun,
+    Halt,
     NodeRun,
+    Pause,
     Restored,
     decide,
     feedback,
 )
-from rr_actors.managers.actions.run_controls import RunControl
+from rr_actors.managers.actions.run_controls import Word
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
@@ -38,7 +40,9 @@ from rr_actors.registrar.registrar import Registrar
 logger = Log("rr_actors.managers.actions")
 
 _NO_ROOM_S = 0.1  # how soon it tries again to write what the disk has refused
-_TOLD = {"STOPPING": "stop", "PAUSED": "pause"}
+CONFIRMED_S = 5.0
+"""How long a message waits until the managers of the runs have confirmed what they were told."""
+_WORDS: dict[str, Word] = {"RUNNING": "run", "PAUSED": "pause", "STOPPING": "stop"}
 
 
 class Runner(Protocol):
@@ -50,12 +54,23 @@ class Runner(Protocol):
         """Return whether the manager stops, so that ends of actions mean nothing."""
         ...
 
-    def begin_run(self, graph_id: str, graph: ActionGraph, node: str, run: NodeRun, control: RunControl) -> Query:
+    def begin_run(self, graph_id: str, graph: ActionGraph, node: str, run: NodeRun, key: str) -> Query:
         """Run an action, and return its query when it has ended."""
         ...
 
-    def end_of(self, query: Query, node: str, run: NodeRun, control: RunControl) -> Ended:
+    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended:
         """Return how a run has ended whose query is held; of a sub-graph, wait for that."""
+        ...
+
+    def tell_run(self, actor: str, key: str, word: Word, step: int) -> Callable[[float], str]:
+        """Tell a run what holds for it. Return a function that waits for so many seconds until the run has it.
+
+        The function returns what is wrong if the manager of the run has not confirmed it by then, or else "".
+        """
+        ...
+
+    def wait_over(self, actor: str, key: str) -> None:
+        """Stop a run of another manager that a crash of this one has left there, and wait until it has ended."""
         ...
 
 
@@ -66,11 +81,12 @@ class GraphEngine:
         graph_id: the id of the resource.
     """
 
-    def __init__(self, runner: Runner, graph_id: str, graph: ActionGraph, run: GraphRun) -> None:
+    def __init__(self, runner: Runner, graph_id: str, graph: ActionGraph, run: GraphRun, stop_s: float = 5.0) -> None:
         self.graph_id = graph_id
+        self._stop_s = stop_s
         self._runner, self._graph, self._run = runner, graph, run
-        self._controls: dict[str, RunControl] = {}
         self._kept: dict[str, Query] = {}
+        self._stops: dict[str, threading.Timer] = {}  # of the runs that were told to stop, by their keys
         self._threads: set[threading.Thread] = set()
         self._changing = threading.RLock()
         self._closed = False
@@ -83,18 +99,28 @@ class GraphEngine:
         """The run as it is on disk."""
         return self._run
 
-    def begin(self, event: Begin, loaded: threading.Event | None = None) -> None:
+    def begin(
+        self, event: Begin, loaded: threading.Event | None = None, word: Callable[[], Word] = lambda: "run"
+    ) -> None:
         """Tell the first event, when the load of the graph itself is on disk. In a thread of the engine's own.
 
         Args:
             loaded: says that it is; None: it was on disk before.
+            word: returns what holds for a sub-graph in the graph around it.
         """
         if loaded is not None:
             loaded.wait()
         try:
+            match word():
+                case "stop":
+                    self._begun.set()
+                    self._insist(Halt())
+                    return
+                case "pause":
+                    event = Begin(event.inputs, in_pause=True)
+                case _:
+                    pass
             self._insist(event)
-        except (UsageError, Unavailable) as error:  # the load has failed, or the process stops
-            logger.info("%s: %s", self._graph.name, error)
         finally:
             self._begun.set()
 
@@ -117,18 +143,30 @@ class GraphEngine:
                 elif query is not None:
                     self._release(query)
             elif query is not None:
-                self._in_thread(name, self._follow, node, self._told_again(name, node), query)
+                self._in_thread(name, self._follow, node, query)
+                self._tell_run(name, node)
             elif (end := ends.get(self._key(name, node))) is not None:
-                self.tell(Ended(name, node.number, *end))
+                self._in_thread(name, self._take_end, Ended(name, node.number, *end))
+            elif node.actor:
+                self._in_thread(name, self._wait_over, node)
             else:
                 lost.append(name)
         for query in held.values():
             self._release(query)
         if lost:
-            self.tell(Restored(tuple(lost)))
+            self._in_thread("restored", self._take_end, Restored(tuple(lost)))
 
-    def tell(self, event: Event, query: Query | None = None) -> None:
+    def said(self, key: str) -> tuple[Word, int]:
+        """Return what holds for the run with this key, and since which step of the graph."""
+        run = self._run
+        runs = {self._key(name, node): node for some in (run.nodes, run.leaving) for name, node in some.items()}
+        state = runs[key].state if key in runs and not self._closed else ""
+        return _WORDS.get(state, "stop"), run.steps
+
+    def tell(self, event: Event, query: Query | None = None) -> list[str]:
         """Take an event: decide, commit, and do what follows from it.
+
+        Return what the managers of runs have not confirmed in time: what is told to them is told later.
 
         Args:
             query: of the run that has ended. What it has loaded is released after the commit, and before others begin,
@@ -143,8 +181,10 @@ class GraphEngine:
             self._begun.wait()
         with self._changing:
             if self._closed:
-                return
+                return []
             graph = event.graph if isinstance(event, Change) else self._graph
+            if isinstance(event, Ended) and (timer := self._stops.pop(self._run_key(event.node, event.number), None)):
+                timer.cancel()
             left = self._run.leaving
             run, effects = decide(self._graph, self._run, event)
             stale: list[Query] = []
@@ -156,30 +196,53 @@ class GraphEngine:
                 self._graph, self._run = graph, run
             if query is not None and isinstance(event, Ended):
                 stale += [query] if event.node in left else self._replaced(event.node, query)
-            controls = [self._control(effect.node, run.node(effect.node), effect) for effect in effects]
         self._release_all(stale)
-        for effect, control in zip(effects, controls, strict=True):
-            self._carry_out(graph, effect, run.node(effect.node), control)
+        waits = [self._carry_out(graph, effect, run.node(effect.node), run.steps) for effect in effects]
+        if not is_new and isinstance(event, Pause | Halt):  # asked again: not all may have confirmed it before
+            waits = [self._tell_run(name, node) for name, node in _live(run) if node.state != "RUNNING"]
         if is_new and run.state in ENDED:
             self._end_of_all()
+        deadline = time.monotonic() + CONFIRMED_S
+        return [*filter(None, (wait(max(0.0, deadline - time.monotonic())) for wait in waits))]
 
     def _insist(self, event: Event, query: Query | None = None) -> None:
-        """Tell an event that has happened already. While the disk refuses it, try again: nobody else tells it."""
+        """Tell an event that has happened already. While the disk refuses it, try again: nobody else tells it.
+
+        If it cannot be told for another reason, the action ends with on_error, or else the graph is lost: no state on
+        disk waits for what nobody tells.
+        """
         while True:
             try:
-                self.tell(event, query)
+                for unconfirmed in self.tell(event, query):
+                    logger.warning("%s: %s", self._graph.name, unconfirmed)
                 return
             except CatalogError as error:
                 logger.warning("%s: waits until it can be written: %s", self._graph.name, error)
                 time.sleep(_NO_ROOM_S)
+            except (UnknownQuery, Unavailable) as error:  # the graph is released, or the process ends
+                logger.info("%s: %s", self._graph.name, error)
+                return
+            except Exception as error:
+                if not isinstance(event, Ended) or event.result == "on_error":
+                    self._lose(error)
+                    return
+                logger.warning("%s: %s: its end cannot be kept", self._graph.name, event.node, exc_info=error)
+                event = Ended(event.node, event.number, "on_error", why=f"its end cannot be kept: {text_of(error)}")
+
+    def _lose(self, error: Exception) -> None:
+        logger.error("%s: it cannot go on", self._graph.name, exc_info=error)
+        status = Status(State.FATAL, f"the graph cannot go on: {text_of(error)}")
+        self._quietly(lambda: self._runner.registrar.send_status(self.graph_id, status))
 
     def close(self, stop_s: float) -> None:
         """Stop what runs, and wait so many seconds for that and for releases: the graph is being unloaded."""
         with self._changing:
             self._closed = True
-            controls, threads = list(self._controls.values()), list(self._threads)
-        for control in controls:
-            control.tell("stop")
+            threads, run = list(self._threads), self._run
+            for timer in self._stops.values():
+                timer.cancel()
+        for name, node in _live(run):
+            self._runner.tell_run(node.actor, self._key(name, node), "stop", run.steps + 1)
         deadline = time.monotonic() + stop_s
         for thread in threads:
             thread.join(max(0.0, deadline - time.monotonic()))
@@ -206,47 +269,68 @@ class GraphEngine:
     # -- one action ------------------------------------------------------------------------------------------------
 
     def _key(self, name: str, node: NodeRun) -> str:
-        return f"{self.graph_id}/{name}/{node.number}"
+        return self._run_key(name, node.number)
 
-    def _control(self, name: str, node: NodeRun, effect: Effect | None = None) -> RunControl:
-        """Return the control of the run that goes on, or make one."""
-        key = self._key(name, node)
-        control = self._controls.get(name)
-        if control is None or control.key != key or (effect is not None and effect.do == "run"):
-            control = self._controls[name] = RunControl(key)
-        return control
+    def _run_key(self, name: str, number: int) -> str:
+        return f"{self.graph_id}/{name}/{number}"
 
-    def _told_again(self, name: str, node: NodeRun) -> RunControl:
-        """Return the control of a run after a crash, with what the run was told before."""
-        control = self._control(name, node)
-        if node.state in _TOLD:
-            control.tell(_TOLD[node.state])
-        return control
-
-    def _carry_out(self, graph: ActionGraph, effect: Effect, node: NodeRun, control: RunControl) -> None:
+    def _carry_out(self, graph: ActionGraph, effect: Effect, node: NodeRun, step: int) -> Callable[[float], str]:
         if effect.do == "run":
-            self._in_thread(effect.node, self._act, graph, node, control)
-        else:
-            control.tell(effect.do)
+            self._in_thread(effect.node, self._act, graph, node)
+            return _confirmed
+        if effect.do == "stop":
+            self._watch_stop(effect.node, node)
+        word: Word = "run" if effect.do == "resume" else effect.do
+        return self._runner.tell_run(node.actor, self._key(effect.node, node), word, step)
 
-    def _act(self, name: str, graph: ActionGraph, node: NodeRun, control: RunControl) -> None:
+    def _tell_run(self, name: str, node: NodeRun) -> Callable[[float], str]:
+        """Tell a run again what holds for it."""
+        return self._runner.tell_run(node.actor, self._key(name, node), _WORDS[node.state], self._run.steps)
+
+    def _watch_stop(self, name: str, node: NodeRun) -> None:
+        """Say so if an action has not ended some time after it was told to stop."""
+
+        def look() -> None:
+            now = self._run.leaving.get(name) or self._run.nodes.get(name)
+            if self._closed or now is None or (now.state, now.number) != ("STOPPING", node.number):
+                return
+            text = f"{name} has not ended within {self._stop_s:g} s of stopping"
+            logger.warning("%s: %s", self._graph.name, text)
+            self._quietly(lambda: self._runner.registrar.send_status(self.graph_id, Status(State.WARNING, text)))
+
+        timer = threading.Timer(self._stop_s, look)
+        timer.daemon = True
+        with self._changing:
+            if not self._closed:
+                self._stops[self._key(name, node)] = timer
+                timer.start()
+
+    def _act(self, name: str, graph: ActionGraph, node: NodeRun) -> None:
         """Run an action of a graph until its end."""
         try:
-            query = self._runner.begin_run(self.graph_id, graph, name, node, control)
-        except RrError as error:
+            query = self._runner.begin_run(self.graph_id, graph, name, node, self._key(name, node))
+        except Exception as error:
             if not self._runner.is_closing():
-                self._insist(Ended(name, node.number, "on_error", why=str(error)))
+                self._insist(Ended(name, node.number, "on_error", why=_why(error)))
             return
-        self._follow(name, node, control, query)
+        self._follow(name, node, query)
 
-    def _follow(self, name: str, node: NodeRun, control: RunControl, query: Query) -> None:
+    def _follow(self, name: str, node: NodeRun, query: Query) -> None:
         """Take the end of an action whose load is held, and release what it has loaded."""
         try:
-            end = self._runner.end_of(query, name, node, control)
-        except RrError as error:
-            end = Ended(name, node.number, "on_error", why=str(error))
+            end = self._runner.end_of(query, name, node)
+        except Exception as error:
+            end = Ended(name, node.number, "on_error", why=_why(error))
         if not self._runner.is_closing():
             self._insist(end, query)
+
+    def _wait_over(self, name: str, node: NodeRun) -> None:
+        """Wait until a run in another manager has ended, which lives on after a crash of this one."""
+        self._runner.wait_over(node.actor, self._key(name, node))
+        self._insist(Restored((name,)))
+
+    def _take_end(self, name: str, event: Event) -> None:
+        self._insist(event)
 
     def _replaced(self, name: str, query: Query) -> list[Query]:
         """Keep what an action has loaded until the graph ends, or it has run again; return what is to be released."""
@@ -280,7 +364,10 @@ class GraphEngine:
         """
 
         def run() -> None:
-            self._quietly(lambda: do(name, *args))
+            try:
+                self._quietly(lambda: do(name, *args))
+            except Exception as error:
+                self._lose(error)
             with self._changing:
                 self._threads.discard(thread)
 
@@ -289,3 +376,17 @@ class GraphEngine:
             if not self._closed:
                 self._threads.add(thread)
                 thread.start()
+
+
+def _live(run: GraphRun) -> list[tuple[str, NodeRun]]:
+    """Return the actions that run, with those that leave."""
+    return [(name, node) for some in (run.nodes, run.leaving) for name, node in some.items() if node.state in LIVE]
+
+
+def _confirmed(within_s: float) -> str:
+    """Return that nothing is wrong: nobody has to confirm it."""
+    return ""
+
+
+def _why(error: Exception) -> str:
+    return str(error) if isinstance(error, RrError) else text_of(error)

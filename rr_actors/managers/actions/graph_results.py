@@ -60,6 +60,6 @@ def run_graph(
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
     with app.load(f"{manager}/graph", RunGraph(graph, inputs or {}, file=file), timeout_s=timeout_s) as query:
         left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
-        run = wait_ended(query, left_s)
+        run = wait_ended(query, left_s, timeout_s)
     states = {name: node.state for name, node in run.nodes.items()}
     return GraphResult(run.result, run.outputs, states, run.why)

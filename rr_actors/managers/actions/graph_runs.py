@@ -42,6 +42,9 @@ class NodeRun(msgspec.Struct, frozen=True, omit_defaults=True):
         inputs: what it runs with, while it runs.
         again: whether it runs again when it has stopped.
         why: the error that it ended with.
+        result: how its newest run has ended.
+        actor: the manager that runs it; "": that of the graph.
+        lost: whether a crash has ended its run while it was paused: it begins anew when it is resumed.
     """
 
     state: str = "UNINITIALIZED"
@@ -52,6 +55,9 @@ class NodeRun(msgspec.Struct, frozen=True, omit_defaults=True):
     inputs: dict[str, Any] = {}
     again: bool = False
     why: str = ""
+    result: str = ""
+    actor: str = ""
+    lost: bool = False
 
 
 class GraphRun(msgspec.Struct, frozen=True):
@@ -85,9 +91,10 @@ class GraphRun(msgspec.Struct, frozen=True):
 
 
 class Begin(msgspec.Struct, frozen=True):
-    """Run the entries, with these inputs by flat names."""
+    """Run the entries, with these inputs by flat names; if it begins in a pause, when that is over."""
 
     inputs: dict[str, Any] = {}
+    in_pause: bool = False
 
 
 class Ended(msgspec.Struct, frozen=True):
@@ -161,7 +168,7 @@ def decide(graph: ActionGraph, run: GraphRun, event: Event) -> tuple[GraphRun, t
     decision = _Decision(graph, run)
     match event:
         case Begin():
-            decision.begin(event.inputs)
+            decision.begin(event.inputs, event.in_pause)
         case Ended():
             decision.ended(event)
         case Halt():
@@ -233,11 +240,11 @@ class _Decision:
 
     # -- events ----------------------------------------------------------------------------------------------------
 
-    def begin(self, inputs: dict[str, Any]) -> None:
+    def begin(self, inputs: dict[str, Any], in_pause: bool) -> None:
         if self.state != "INITIALIZED":
             return
         checked_inputs(self.graph, inputs)
-        self.state = "RUNNING"
+        self.state = "PAUSED" if in_pause else "RUNNING"
         for name in self.graph.entry:
             known = self.graph.nodes[name].inputs
             self.put(name, given={key: value for key, value in inputs.items() if key in known})
@@ -252,7 +259,8 @@ class _Decision:
             return
         result = "on_stopped" if node.state == "STOPPING" else event.result
         failed = result == "on_error"
-        self.put(event.node, state="ERROR" if failed else "FINISHED", why=event.why if failed else "", inputs={})
+        state, why = ("ERROR", event.why) if failed else ("FINISHED", "")
+        self.put(event.node, state=state, why=why, inputs={}, result=result, lost=False)
         if self.ending:
             return
         if node.again:
@@ -301,14 +309,14 @@ class _Decision:
             node = self.leaving.get(name) or self.nodes[name]
             if node.state == "STOPPING":
                 self.ended(Ended(name, node.number, "on_stopped"))
+            elif node.state == "PAUSED":  # nothing begins in a pause, and what a crash ends there is no attempt
+                self.put(name, lost=True)
             elif node.state in LIVE and node.attempt >= MOST_ATTEMPTS:
                 why = f"a crash has interrupted {name} in {MOST_ATTEMPTS} attempts"
                 self.ended(Ended(name, node.number, "on_error", why=why))
             elif node.state in LIVE:
                 self.put(name, attempt=node.attempt + 1)
                 self.effects.append(Effect("run", name))
-                if node.state == "PAUSED":
-                    self.effects.append(Effect("pause", name))
 
     def settle(self) -> None:
         """See whether the graph has come to its end, or cannot go on."""
@@ -318,10 +326,23 @@ class _Decision:
             failed = [name for name, node in self.nodes.items() if node.state == "ERROR"]
             if self.graph.dialect == 2:
                 self.state, self.result = "HALTED", "on_halted"
-                self.why = self.nodes[failed[0]].why if failed else "every child ignores the result, and nothing runs"
+                self.why = self.nodes[failed[0]].why if failed else self.why_halted()
             else:
                 self.state, self.result = ("ERROR", "on_error") if failed else ("FINISHED", "on_true")
                 self.why = self.nodes[failed[0]].why if failed else ""
+
+    def why_halted(self) -> str:
+        """Return what the actions that have not run wait for."""
+        for name, node in self.nodes.items():
+            required = [parent for parent, one in self.graph.nodes[name].parents.items() if one.required]
+            waits_for = [parent for parent in required if parent not in node.heard]
+            if node.heard and waits_for:
+                return f"nothing runs: {name} waits for {', '.join(waits_for)}"
+            if self.is_ready(name) and (
+                lacks := _lacking(self.graph.nodes[name], _values(self.graph.nodes[name], node.given))
+            ):
+                return f"nothing runs: {name} has no value for {', '.join(lacks)}"
+        return "every child ignores the result, and nothing runs"
 
     # -- another graph ---------------------------------------------------------------------------------------------
 
@@ -361,6 +382,8 @@ class _Decision:
     def leave(self, name: str) -> bool:
         """Stop an action that the new graph does not have; return whether it is to run there as that says."""
         node = self.nodes[name]
+        if node.lost:
+            return True
         if node.state in LIVE:
             self.leaving[name] = msgspec.structs.replace(node, state="STOPPING", again=False)
         if node.state in ("RUNNING", "PAUSED"):
@@ -370,13 +393,25 @@ class _Decision:
     def taken_over(self, name: str, before: ActionGraph, stay: set[str]) -> NodeRun:
         """Return an action of the new graph with what it has heard, and been given, in the graph before."""
         node, definition = self.nodes.get(name, NodeRun()), self.graph.nodes[name]
-        heard = _still_heard(node.heard, definition.parents, stay)
+        known = self.ended_before(definition.parents, before.nodes[name].parents if name in before.nodes else {})
+        heard = _still_heard(known | node.heard, definition.parents, stay)
         if name in stay:
             return msgspec.structs.replace(node, heard=heard)
         given = _given(before.nodes[name], node) if name in before.nodes else {}
         taken = {key: value for key, value in given.items() if _takes(definition, key, value)}
         left = self.leaving.get(name, node)
         return NodeRun(number=1 + max(self.before.steps, node.number, left.number), heard=heard, given=taken)
+
+    def ended_before(self, relations: dict[str, ParentRelation], before: dict[str, ParentRelation]) -> dict[str, str]:
+        """Return what the parents that are new to an action would have told it when they ended."""
+        results = {name: self.before.nodes[name].result for name in relations if name in self.before.nodes}
+        responses = {
+            name: (relations[name].conditions[result], result)
+            for name, result in results.items()
+            if result and name not in before and self.before.nodes[name].state not in LIVE
+        }
+        runs = {name: result for name, (response, result) in responses.items() if response in ("run", "restart")}
+        return runs | {name: "" for name, (response, _) in responses.items() if response == "ignore"}
 
     def left(self, event: Ended) -> None:
         """Take the end of an action that the graph does not have any more: it means nothing to the others."""
@@ -434,11 +469,17 @@ class _Decision:
             inputs=inputs,
             again=False,
             why="",
+            result="",
+            actor=self.graph.nodes[name].actor,
         )
         self.effects.append(Effect("run", name))
 
     def stop(self, name: str) -> None:
-        if self.nodes[name].state in ("RUNNING", "PAUSED"):
+        node = self.nodes[name]
+        if node.lost:
+            self.put(name, state="STOPPING", again=False, lost=False)
+            self.ended(Ended(name, node.number, "on_stopped"))
+        elif self.nodes[name].state in ("RUNNING", "PAUSED"):
             self.put(name, state="STOPPING", again=False)
             self.effects.append(Effect("stop", name))
         elif self.nodes[name].state in ("INITIALIZED", "STOPPING"):
@@ -446,6 +487,8 @@ class _Decision:
             self.put(name, state=state, again=False)
 
     def restart(self, name: str) -> None:
+        if self.nodes[name].lost:
+            self.put(name, state="UNINITIALIZED", lost=False)
         self.stop(name)
         if self.nodes[name].state == "STOPPING":
             self.put(name, again=True)
@@ -458,8 +501,9 @@ class _Decision:
             self.effects.append(Effect("pause", name))
 
     def resume_node(self, name: str) -> None:
-        self.put(name, state="RUNNING")
-        self.effects.append(Effect("resume", name))
+        node = self.nodes[name]
+        self.effects.append(Effect("run" if node.lost else "resume", name))
+        self.put(name, state="RUNNING", number=node.number + node.lost, lost=False)
 
     # -- relations -------------------------------------------------------------------------------------------------
 
@@ -600,7 +644,21 @@ def feedback(graph: ActionGraph, run: GraphRun) -> dict[str, Any]:
     names = list(graph.nodes)  # in the order of the document
     tables: list[dict[str, Any]] = graph.document[key]
     actions = [{**table, "state": run.nodes[name].state} for name, table in zip(names, tables, strict=True)]
-    return {**graph.document, key: actions, "graph_state": run.state, KEY: msgspec.to_builtins(run)}
+    return {**graph.document, key: actions, "graph_state": run.state, KEY: _table(run)}
+
+
+def _table(run: GraphRun) -> dict[str, Any]:
+    """Return a run as a table. Inputs and outputs keep their types, as to_builtins() would not have it."""
+    nodes = [{name: _without_defaults(node) for name, node in some.items()} for some in (run.nodes, run.leaving)]
+    return {**msgspec.structs.asdict(run), "nodes": nodes[0], "leaving": nodes[1]}
+
+
+def _without_defaults(node: NodeRun) -> dict[str, Any]:
+    table = msgspec.structs.asdict(node)
+    return {key: value for key, value in table.items() if value != getattr(_FIRST, key)}
+
+
+_FIRST = NodeRun()
 
 
 def run_in(response: dict[str, Any]) -> GraphRun:

@@ -11,6 +11,7 @@ import socket
 import struct
 import threading
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rr_actors.base import pickling
@@ -23,7 +24,8 @@ from rr_actors.runtime.processes.process import Process, Spawner, signal_name
 _ENTRY = f"{__name__}:main"
 _LOOK_S = 0.05
 _LENGTH = struct.Struct("Q")
-_STOP, _PAUSE, _RESUME = b"s", b"p", b"r"
+_GO_S = 5.0  # the longest wait for a process that lets its call begin, or has been killed
+_STOP, _PAUSE, _RESUME, _GO = b"s", b"p", b"r", b"g"
 
 
 class Events(NamedTuple):
@@ -42,13 +44,22 @@ class Outcome(NamedTuple):
 
 
 def run_isolated(
-    spawner: Spawner, call: bytes, events: Events, *, name: str, timeout_s: float | None, grace_s: float
+    spawner: Spawner,
+    call: bytes,
+    events: Events,
+    begin: Callable[[Callable[[], None]], bool],
+    *,
+    name: str,
+    timeout_s: float | None,
+    grace_s: float,
 ) -> Outcome:
     """Run a call in a process of its own, and wait for its end. Not for the loop's thread.
 
     Args:
         call: a pickled callable; it is called with its process's own Events.
         events: what happens to these, happens to the call's.
+        begin: called when the process can begin. It calls its argument, which lets the call begin and returns when it
+            has, and returns True. Or it returns False: the call does not begin.
         timeout_s: seconds after which the call's `stopping` is set; None: no limit.
         grace_s: seconds that it has to stop; then its process is killed.
 
@@ -57,13 +68,13 @@ def run_isolated(
     """
     child = spawner.start(_ENTRY, call, name=name)
     try:
-        return _Watch(child, events, timeout_s, grace_s).outcome()
+        return _Watch(child, events, timeout_s, grace_s).outcome(begin)
     finally:
-        was_alive = child.kill()
+        child.kill()
         lifeline.kill_group(child.pid)
+        child.wait(_GO_S)  # what it has started in other sessions is found when it is dead
         child.close()
-        if was_alive:
-            spawner.sweep()
+        spawner.sweep()
 
 
 class _Watch:
@@ -78,8 +89,13 @@ class _Watch:
         self._got = bytearray()
         child.control.settimeout(_LOOK_S)
 
-    def outcome(self) -> Outcome:
-        """Return the outcome when it has come whole, or when there will be none."""
+    def outcome(self, begin: Callable[[Callable[[], None]], bool]) -> Outcome:
+        """Let the call begin; return the outcome when it has come whole, or when there will be none."""
+        while not self._got and not self._events.stopping.is_set() and self._child.wait(0.0) is None:
+            self._receive()
+        del self._got[:1]
+        if not begin(self._let_begin):
+            return Outcome(why="it was told to stop before it began")
         while not self._is_whole():
             has_ended = self._child.wait(0.0) is not None  # before the last look: what it has sent is there
             if not self._receive():
@@ -88,6 +104,15 @@ class _Watch:
                 self._child.wait(_LOOK_S)  # its socket may be closed already; a result that came meanwhile is read next
             self._tell()
         return Outcome(*pickling.loads(bytes(self._got[_LENGTH.size :])))
+
+    def _let_begin(self) -> None:
+        """Let the call begin, and return when it does, or never will."""
+        self._send(_GO)
+        deadline = time.monotonic() + _GO_S
+        while not self._got and time.monotonic() < deadline and self._child.wait(0.0) is None:
+            self._receive()
+        del self._got[:1]
+        self._began = time.monotonic()
 
     def _is_whole(self) -> bool:
         size = len(self._got) - _LENGTH.size
@@ -140,7 +165,6 @@ def main(inherited: Inherited) -> int:
     interpreter.begin()
     interpreter.name_process(f"rr: {inherited.name.rpartition('/')[2]}")
     events = Events(threading.Event(), threading.Event())
-    threading.Thread(target=_listen, args=(inherited.control, events), name="rr-isolated", daemon=True).start()
     message = _message(inherited, events)
     inherited.control.sendall(_LENGTH.pack(len(message)) + message)
     return 0
@@ -148,10 +172,23 @@ def main(inherited: Inherited) -> int:
 
 def _message(inherited: Inherited, events: Events) -> bytes:
     try:
-        return pickling.dumps((pickling.loads(inherited.payload)(events), "", ""), f"the result of {inherited.name}")
+        try:
+            call = pickling.loads(inherited.payload)
+        finally:
+            _wait_to_begin(inherited.control, events)
+        return pickling.dumps((call(events), "", ""), f"the result of {inherited.name}")
     except Exception as error:
         raised = raised_by(error)
         return pickling.dumps((None, raised.text, raised.trace))
+
+
+def _wait_to_begin(control: socket.socket, events: Events) -> None:
+    """Say that the call can begin, wait until the parent lets it, and say that it begins."""
+    control.sendall(_GO)
+    while control.recv(1) not in (_GO, b""):
+        pass  # the parent tells nothing else before it, but it may have ended
+    threading.Thread(target=_listen, args=(control, events), name="rr-isolated", daemon=True).start()
+    control.sendall(_GO)
 
 
 def _listen(control: socket.socket, events: Events) -> None:
