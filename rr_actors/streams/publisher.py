@@ -359,7 +359,8 @@ class Publisher:
         why = ""
         if readers and not body:
             body, why = self._body_of(publishing.value)
-            if not body and publishing.waits and any(map(_frees_memory, readers)):
+            fits = len(publishing.value) <= self._limit_bytes  # else no reader can free enough for it
+            if not body and fits and publishing.waits and any(map(_frees_memory, readers)):
                 return False
         if publishing.given_up:  # the value may have changed while it was copied
             if isinstance(body, Parcel) and publishing.lent is None:

@@ -7,6 +7,7 @@ set `is_taken`, just before it returns the frame. What follows from that is done
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
 import threading
 from collections import deque
@@ -35,6 +36,7 @@ from rr_actors.streams.stream_sockets import (
 from rr_actors.wire.segments import Lie, Parcel, Segments
 from rr_actors.wire.shared_values import Claim
 
+_ENDS_S = 0.5  # the longest time from when a process ends to the end of its connections
 _NEWER_S = 0.1  # the longest wait for the publisher's answer whether there is a newer frame
 
 
@@ -214,7 +216,10 @@ class PublisherLink:
             self.close()
             return None
         except (OSError, MemoryError) as error:
+            ended = isinstance(error, PermissionError) and self._has_ended()
             self.close()
+            if ended:
+                return None
             raise Unavailable(f"a frame cannot be read: {wanted_by(error) or text_of(error)}") from error
         self._number = packet.number
         try:
@@ -226,6 +231,12 @@ class PublisherLink:
         frame = StreamFrame(value, packet.number, packet.published_at, missed, self._stream)
         self._offered_to = threading.get_ident()
         return frame
+
+    def _has_ended(self) -> bool:
+        """Return whether the publisher ends now: the descriptors of a process that ends cannot be opened any more."""
+        poll = select.poll()
+        poll.register(self._line.socket, 0)
+        return bool(poll.poll(_ENDS_S * 1000))
 
     @staticmethod
     def _packet(raw: bytes) -> Packet | None:

@@ -1,0 +1,443 @@
+"""Streams when something goes wrong: what is lost is counted, what can go on does, and nothing waits for ever."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import pickle
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from support import eventually
+
+Start = Callable[..., rr.System]
+
+MB = 2**20
+
+
+class Boards(rr.Manager):
+    """Each resource has the streams of its request."""
+
+    def __init__(self) -> None:
+        self.streams: dict[str, rr.Publisher] = {}
+        self.sent: list[int] = []
+        self.threads: list[threading.Thread] = []
+
+    @rr.server("board", recovery="reload")
+    def open_board(self, names: list[str]) -> list[rr.Stream]:
+        for name in names:
+            self.streams[name] = rr.current().open_stream(name)
+        return [self.streams[name].stream for name in names]
+
+    @open_board.unload
+    def close_board(self, names: list[str], response: list[rr.Stream]) -> None: ...
+
+    @rr.server("once")
+    def open_once(self) -> None:
+        self.streams["once"] = rr.current().open_stream("once")
+
+    def publish(self, name: str, *values: object, timeout_s: Any = None) -> list[int]:
+        return [self.streams[name].publish(value, timeout_s=timeout_s) for value in values]
+
+    def publish_buffers(self, name: str, size: int, count: int, timeout_s: float | None = None) -> list[int]:
+        return [self._publish_buffer(name, size, fill % 256, timeout_s) for fill in range(count)]
+
+    def _publish_buffer(self, name: str, size: int, fill: int, timeout_s: float | None) -> int:
+        return self.streams[name].publish(pickle.PickleBuffer(bytearray([fill]) * size), timeout_s=timeout_s)
+
+    def publish_buffers_in_thread(self, name: str, size: int, count: int) -> None:
+        """Publish without a limit of time, in a thread."""
+
+        def run() -> None:
+            for fill in range(count):
+                self.sent.append(self._publish_buffer(name, size, fill % 256, None))
+
+        self.threads.append(threading.Thread(target=run, daemon=True))
+        self.threads[-1].start()
+
+    def results(self) -> list[int]:
+        for thread in self.threads:
+            thread.join(20)
+        return self.sent
+
+    def loan_in_time(self, name: str, timeout_s: float) -> float:
+        began = time.monotonic()
+        with self.streams[name].loan((300, 300), "u1", timeout_s=timeout_s) as picture:
+            picture[:] = 1
+        return time.monotonic() - began
+
+    def publish_in_child(self, name: str) -> str:
+        """Have a child of fork publish; return what it raises."""
+        return in_child(lambda: self.streams[name].publish(1))
+
+    def wanted(self, name: str) -> int:
+        return self.streams[name].row("", "").info.consumers
+
+    def pid(self) -> int:
+        return os.getpid()
+
+
+def in_child(run: Callable[[], object]) -> str:
+    """Return what a function raises in a child of fork, or what it returns, as text."""
+    read, write = os.pipe()
+    pid = os.fork()
+    if not pid:
+        try:
+            shown = repr(run())
+        except BaseException as error:
+            shown = f"{type(error).__name__}: {error}"
+        os.write(write, shown.encode())
+        os._exit(0)
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        shown = pipe.read()
+    os.waitpid(pid, 0)
+    return shown
+
+
+@dataclass
+class Pair:
+    left: rr.Stream
+    right: rr.Stream
+
+
+@dataclass
+class Part:
+    resource_id: str
+    name: str
+
+
+class Pairs(rr.Manager):
+    """A response with two streams of one name, and one that only looks like a stream."""
+
+    @rr.server("pair")
+    def load_pair(self) -> Pair:
+        boards = [self.registrar.load(Boards.open_board, [side, "eyes"]).response for side in ("left", "right")]
+        return Pair(boards[0][1], boards[1][1])
+
+    @rr.server("arm")
+    def load_arm(self) -> Part:
+        self.torques = rr.current().open_stream("torques")
+        return Part(rr.current().resource_id, "other")
+
+
+@pytest.fixture
+def system(start: Start) -> rr.System:
+    return start(rr.ChildSpec(Boards, id="boards"))
+
+
+@pytest.fixture
+def boards(system: rr.System) -> Any:
+    return system.ref("boards").proxy()
+
+
+def load(system: rr.System, *names: str) -> rr.Query[Any]:
+    return system.open_registrar("app").load(Boards.open_board, [*names])
+
+
+def when_wanted(boards: Any, name: str = "a", count: int = 1) -> None:
+    def wanted() -> bool:
+        try:
+            return boards.wanted(name).get() == count
+        except (rr.ActorUnavailable, rr.ActorDeadError, KeyError):  # it is being respawned
+            return False
+
+    eventually(wanted)
+
+
+# -- the publisher ends ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keep", ["latest", "all"])
+def test_reading_goes_on_when_the_manager_was_killed_before_its_first_large_frame_was_read(
+    system: rr.System, boards: Any, keep: Any
+) -> None:
+    reader = load(system, "a").stream("a", keep=keep, timeout_s=20)
+    when_wanted(boards)
+    if keep == "latest":
+        assert asyncio.run(first_within(reader, 0.05)) is None  # so the publisher may send one
+    assert boards.publish_buffers("a", MB, 1).get() == [1]
+
+    os.kill(boards.pid().get(), signal.SIGKILL)
+
+    reading = threading.Thread(target=lambda: frames.append(next(reader)))
+    frames: list[rr.StreamFrame] = []
+    reading.start()
+    when_wanted(boards)
+    assert boards.publish("a", "after").get() == [1]
+    reading.join(20)
+    assert [frame.value for frame in frames] == ["after"]
+    reader.close()
+
+
+async def first_within(reader: rr.StreamReader, limit_s: float) -> rr.StreamFrame | None:
+    try:
+        return await asyncio.wait_for(anext(reader), limit_s)
+    except TimeoutError:
+        return None
+
+
+def test_frames_of_the_next_process_that_a_busy_reader_did_not_get_are_missed(system: rr.System, boards: Any) -> None:
+    with load(system, "a").stream("a", keep="all", timeout_s=20) as reader:
+        when_wanted(boards)
+        boards.publish("a", "before").get()
+        assert next(reader).value == "before"
+        pid = boards.pid().get()
+        os.kill(pid, signal.SIGKILL)
+        eventually(lambda: when_back(lambda: boards.publish("a", 1, 2, 3).get()) == [0, 0, 0])
+        reading = threading.Thread(target=lambda: frames.append(next(reader)))
+        frames: list[rr.StreamFrame] = []
+        reading.start()
+        when_wanted(boards)
+        boards.publish("a", "after").get()
+        reading.join(20)
+
+    assert [(frame.value, frame.number, frame.missed) for frame in frames] == [("after", 4, 3)]
+
+
+def when_back(call: Callable[[], Any]) -> Any:
+    try:
+        return call()
+    except (rr.ActorUnavailable, rr.ActorDeadError, KeyError):
+        return None
+
+
+def test_two_streams_of_one_name_are_told_apart_by_the_stream_itself(start: Start) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards"), rr.ChildSpec(Pairs, id="pairs"))
+    app = system.open_registrar("app")
+    pair = app.load(Pairs.load_pair)
+    with pytest.raises(rr.UsageError, match="has 2 streams 'eyes': give the rr"):
+        pair.stream("eyes")
+    for stream in (pair.response.left, pair.response.right):
+        reader = pair.stream(stream, timeout_s=0)
+        with pytest.raises(TimeoutError):
+            next(reader)
+        reader.close()
+    with pytest.raises(rr.UsageError, match="neither the resource nor its response"):
+        pair.stream(rr.Stream("0" * 32, "eyes"))
+    with app.load(Pairs.load_arm).stream(timeout_s=0) as reader, pytest.raises(TimeoutError, match="stream: no frame"):
+        next(reader)
+
+
+@pytest.mark.parametrize("name", [b"\0caf\xe9", b"\0new\nline"])
+def test_any_name_of_a_socket_on_the_machine_does_no_harm(system: rr.System, boards: Any, name: bytes) -> None:
+    query = load(system, "a")
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(name)
+        with query.stream(timeout_s=20), pytest.raises(rr.NotFound, match="did you mean 'a'"):
+            query.stream("aa")
+
+
+# -- tasks and time limits ---------------------------------------------------------------------------------------------
+
+
+def test_tasks_that_wait_for_quiet_streams_hold_no_thread(system: rr.System, boards: Any) -> None:
+    names = [f"quiet{number}" for number in range(40)]
+    query = load(system, "busy", *names)
+
+    async def read_busy() -> tuple[object, str]:
+        waiting = [asyncio.create_task(anext(query.stream(name))) for name in names]
+        reader = query.stream("busy")
+        arriving = asyncio.create_task(anext(reader))
+        while not arriving.done():
+            await asyncio.to_thread(lambda: boards.publish("busy", "frame").get())
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
+        return arriving.result().value, await asyncio.to_thread(lambda: "ran")
+
+    assert asyncio.run(asyncio.wait_for(read_busy(), 20)) == ("frame", "ran")
+
+
+def test_a_cancelled_task_loses_no_frame(system: rr.System, boards: Any) -> None:
+    numbers: list[int] = []
+    with load(system, "a").stream("a", keep="all", depth=50) as reader:
+        when_wanted(boards)
+        publishing = threading.Thread(target=lambda: [boards.publish("a", *range(20)).get() for _ in range(20)])
+        publishing.start()
+
+        async def read() -> None:
+            while len(numbers) < 400:
+                if (frame := await first_within(reader, 0.0005)) is not None:
+                    numbers.append(frame.number)
+                    assert frame.missed == 0
+
+        asyncio.run(asyncio.wait_for(read(), 30))
+        publishing.join()
+    assert numbers == [*range(1, 401)]
+
+
+@pytest.mark.parametrize("size", [10, 100_000])
+def test_the_frame_after_a_time_out_is_the_newest_there_is(system: rr.System, boards: Any, size: int) -> None:
+    with load(system, "a").stream("a", timeout_s=0.2) as reader:
+        when_wanted(boards)
+        with pytest.raises(TimeoutError):
+            next(reader)
+        boards.publish("a", *(bytes([number]) * size for number in range(50))).get()
+        frame = next(reader)
+        assert (frame.value[0], frame.number, frame.missed) == (49, 50, 0)
+        boards.publish("a", "next").get()
+        assert next(reader).value == "next"
+
+
+def test_a_time_limit_of_0_looks_once(system: rr.System, boards: Any) -> None:
+    with load(system, "a").stream("a", timeout_s=0) as reader:
+        when_wanted(boards)
+        with pytest.raises(TimeoutError, match="no frame within 0 s"):
+            next(reader)
+        boards.publish("a", "there").get()
+        assert next(reader).value == "there"
+
+
+@pytest.mark.parametrize("limit", ["1", -1, float("nan")])
+def test_a_time_limit_of_publish_is_checked(system: rr.System, boards: Any, limit: Any) -> None:
+    load(system, "a")
+    with pytest.raises(rr.UsageError, match="timeout_s: expected seconds, 0 or more"):
+        boards.publish("a", 1, timeout_s=limit).get()
+    assert boards.publish("a", 1, timeout_s=1e10).get() == [0]
+
+
+# -- memory ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("readers", [1, 3])
+def test_the_publisher_waits_for_memory_that_readers_of_all_frames_have_still_to_read(
+    start: Start, readers: int
+) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards"), config=rr.SystemConfig(segments_limit_bytes=16 * MB))
+    boards = system.ref("boards").proxy()
+    query = load(system, "a")
+    reads = [query.stream("a", keep="all", depth=64, timeout_s=20) for _ in range(readers)]
+    when_wanted(boards, count=readers)
+    boards.publish_buffers_in_thread("a", MB, 60).get()
+
+    for number in range(1, 61):
+        frames = [next(reader) for reader in reads]
+        assert [(frame.number, frame.missed) for frame in frames] == [(number, 0)] * readers
+        assert all(frame.value[0] == number - 1 for frame in frames)
+
+    assert boards.results().get() == [readers] * 60
+    del frames
+    for reader in reads:
+        reader.close()
+
+
+def test_a_frame_that_fits_nowhere_is_missed_and_everybody_hears_why(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    system = start(
+        rr.ChildSpec(Boards, id="boards", placement="thread"), config=rr.SystemConfig(segments_limit_bytes=0)
+    )
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", keep="all", timeout_s=0.5) as reader:
+        when_wanted(boards)
+        assert boards.publish("a", bytes(130_000), bytes(140_000), bytes(220_000), 1).get() == [1, 0, 0, 1]
+        assert [next(reader).missed for _ in range(2)] == [0, 2]
+        assert boards.publish("a", bytes(6_000_000)).get() == [0]
+        with pytest.raises(TimeoutError, match="there is no shared memory, and a frame of 6000"):
+            next(reader)
+        assert boards.publish("a", 2).get() == [1]
+        assert next(reader).value == 2
+        assert boards.wanted("a").get() == 1
+    assert caplog.text.count("its readers miss frames") == 1
+
+
+def test_a_reader_that_is_stuck_is_waited_for_once(system: rr.System, boards: Any) -> None:
+    query = load(system, "a")
+    stuck = query.stream("a", keep="all", depth=1)
+    when_wanted(boards)
+    assert boards.publish("a", 1).get() == [1]
+
+    began = time.monotonic()
+    assert boards.publish("a", *range(20), timeout_s=0.3).get() == [0] * 20
+    assert time.monotonic() - began < 3
+    assert boards.loan_in_time("a", 0.1).get() < 3
+
+    assert next(stuck).value == 1
+    reading = threading.Thread(target=lambda: next(stuck))  # which says that it can take one
+    reading.start()
+    eventually(lambda: boards.publish("a", "again", timeout_s=0.3).get() == [1])
+    reading.join()
+    stuck.close()
+
+
+# -- finalizers, signal handlers, children of fork ---------------------------------------------------------------------
+
+
+def test_publish_in_a_finalizer_waits_for_nobody(start: Start) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards", placement="thread"))
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", timeout_s=20):
+        when_wanted(boards)
+        publisher = system.ref("boards").proxy().streams.get()["a"]
+        ended = threading.Event()
+
+        def publish() -> None:
+            for number in range(300):
+                cycle: list[object] = [Closing(publisher, number)]
+                cycle.append(cycle)
+                del cycle
+                publisher.publish([{}, [], number])
+            ended.set()
+
+        thread = threading.Thread(target=publish, daemon=True)
+        before = gc.get_threshold()
+        gc.set_threshold(7)
+        try:
+            thread.start()
+            assert ended.wait(20)
+        finally:
+            gc.set_threshold(*before)
+        assert system.streams()[0].consumers == 1
+
+
+class Closing:
+    """Publishes a last note when it is collected."""
+
+    def __init__(self, publisher: rr.Publisher, number: int) -> None:
+        self._publisher = publisher
+        self._number = number
+
+    def __del__(self) -> None:
+        self._publisher.publish(f"closed {self._number}")
+
+
+def test_a_signal_handler_publishes_while_the_main_thread_does(start: Start) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards", placement="thread"))
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", timeout_s=20) as reader:
+        when_wanted(boards)
+        publisher = boards.streams.get()["a"]
+        rung: list[int] = []
+        before = signal.signal(signal.SIGALRM, lambda *_: rung.append(publisher.publish("from the handler")))
+        signal.setitimer(signal.ITIMER_REAL, 0.002, 0.002)
+        try:
+            for number in range(500):
+                publisher.publish(number)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
+        assert rung
+        publisher.publish("last")
+        assert next(reader).missed >= 0
+
+
+def test_a_child_of_fork_uses_no_end_of_a_stream(start: Start) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards"))
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", timeout_s=20) as reader:
+        when_wanted(boards)
+        assert f"UsageError: stream 'a': process {os.getpid()} has opened it" in in_child(lambda: next(reader))
+        assert in_child(reader.close).startswith("UsageError")
+        assert "has opened it, and this is another" in boards.publish_in_child("a").get()
+        assert boards.publish("a", "goes on").get() == [1]
+        assert next(reader).value == "goes on"
