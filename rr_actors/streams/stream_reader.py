@@ -351,6 +351,7 @@ class StreamReader:
             return
         is_new = self._publisher and link.pid != self._publisher  # it counts from 1
         link.last = 0 if is_new else self._last
+        self._is_once = self._is_once and not is_new
         self._link, self._before, self._publisher, self._apart_at = link, None, link.pid, None
 
     def _part(self) -> None:
@@ -359,6 +360,6 @@ class StreamReader:
         if link is not None:
             link.settle()
             self._last = link.last
-            self._is_once = link.opened_once
+            self._is_once = self._is_once or link.opened_once  # else one that a dying publisher did not take in
             self._apart_at = time.monotonic()
             link.close()

@@ -32,6 +32,16 @@ _COPIES_S = 30.0  # the longest wait for a child, which copies gigabytes in a se
 _Range = tuple[mmap.mmap, int, int]
 
 
+_in_use: dict[int, _Range] = {}
+"""The memory of the claims of this process, by their keys."""
+
+_later: list[tuple[mmap.mmap, int, object]] = []
+"""What was given up while the process forked."""
+
+_forks: dict[int, tuple[int, int] | None] = {}
+"""The threads that fork now, each with a pipe from its child."""
+
+
 class Claim:
     """The right to one slot of a segment, which lasts until nothing uses the memory of the slot.
 
@@ -91,37 +101,29 @@ class Claim:
         return pickling.loads_large(parts[0], parts[1:])
 
     def __del__(self) -> None:
-        if self._armed:
-            _free(self._key, self._map, self._slot, self._pid, self._keeps)
+        if getattr(self, "_armed", False):  # else it was not all made
+            try:
+                self._free()
+            except BaseException:  # of a signal handler
+                if self._armed:
+                    self._free()
+                raise
 
-
-_in_use: dict[int, _Range] = {}
-"""The memory of the claims of this process, by their keys."""
-
-_later: list[tuple[mmap.mmap, int, object]] = []
-"""What was given up while the process forked."""
-
-_forks: dict[int, tuple[int, int] | None] = {}
-"""The threads that fork now, each with a pipe from its child."""
-
-
-def _free(
-    key: int,
-    mapped: mmap.mmap,
-    slot: int,
-    pid: int,
-    keeps: object,
-    getpid: Callable[[], int] = os.getpid,
-    in_use: dict[int, _Range] = _in_use,
-    forks: dict[int, tuple[int, int] | None] = _forks,
-    later: list[tuple[mmap.mmap, int, object]] = _later,
-) -> None:
-    """Free a slot. In a finalizer, perhaps when the interpreter has taken the names of this module away."""
-    in_use.pop(key, None)  # first: a child that is forked after this has no use for the value
-    if forks:
-        later.append((mapped, slot, keeps))
-    elif getpid() == pid:  # a child of fork has the same map
-        mapped[slot] = FREE
+    def _free(
+        self,
+        getpid: Callable[[], int] = os.getpid,
+        in_use: dict[int, _Range] = _in_use,
+        forks: dict[int, tuple[int, int] | None] = _forks,
+        later: list[tuple[mmap.mmap, int, object]] = _later,
+    ) -> None:
+        """Free the slot. In a finalizer, perhaps when the interpreter has taken the names of this module away."""
+        in_use.pop(self._key, None)  # first: a child that is forked after this has no use for the value
+        is_here = getpid() == self._pid  # a child of fork has the same map
+        if forks:
+            later.append((self._map, self._slot, self._keeps))
+        elif is_here:
+            self._map[self._slot] = FREE
+        self._armed = False
 
 
 # -- fork --------------------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ import pytest
 
 import rr_actors as rr
 from support import eventually
+from support_interrupts import interrupted
 
 Start = Callable[..., rr.System]
 
@@ -169,13 +170,19 @@ def test_reading_goes_on_when_the_manager_was_killed_before_its_first_large_fram
 
     os.kill(boards.pid().get(), signal.SIGKILL)
 
-    reading = threading.Thread(target=lambda: frames.append(next(reader)))
-    frames: list[rr.StreamFrame] = []
+    values: list[object] = []  # that of the killed process is among them if it could still be opened
+
+    def read() -> None:
+        while "after" not in values:
+            values.append(next(reader).value)
+
+    reading = threading.Thread(target=read)
     reading.start()
     when_wanted(boards)
     assert boards.publish("a", "after").get() == [1]
     reading.join(20)
-    assert [frame.value for frame in frames] == ["after"]
+    assert values[-1:] == ["after"]
+    values.clear()
     reader.close()
 
 
@@ -209,6 +216,24 @@ def when_back(call: Callable[[], Any]) -> Any:
         return call()
     except (rr.ActorUnavailable, rr.ActorDeadError, KeyError):
         return None
+
+
+def test_a_stream_that_no_callback_opens_again_is_warned_of_and_its_readers_end(
+    system: rr.System, boards: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.streams.stream_reader._OPENS_S", 0.5)
+    once = system.open_registrar("app").load("boards/once")
+    reader = once.stream("once", timeout_s=20)
+    when_wanted(boards, "once")
+    eventually(lambda: "boards/once has recovery='keep' and no recover callback" in caplog.text)
+    boards.publish("once", "before").get()
+
+    assert next(reader).value == "before"
+    os.kill(boards.pid().get(), signal.SIGKILL)
+
+    for _ in range(2):
+        with pytest.raises(rr.Unavailable, match="nobody opens the stream again"):
+            next(reader)
 
 
 def test_two_streams_of_one_name_are_told_apart_by_the_stream_itself(start: Start) -> None:
@@ -320,6 +345,7 @@ def test_the_publisher_waits_for_memory_that_readers_of_all_frames_have_still_to
     when_wanted(boards, count=readers)
     boards.publish_buffers_in_thread("a", MB, 60).get()
 
+    frames: list[rr.StreamFrame] = []
     for number in range(1, 61):
         frames = [next(reader) for reader in reads]
         assert [(frame.number, frame.missed) for frame in frames] == [(number, 0)] * readers
@@ -441,3 +467,48 @@ def test_a_child_of_fork_uses_no_end_of_a_stream(start: Start) -> None:
         assert "has opened it, and this is another" in boards.publish_in_child("a").get()
         assert boards.publish("a", "goes on").get() == [1]
         assert next(reader).value == "goes on"
+
+
+# -- interrupts --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [10, 100_000])
+@pytest.mark.parametrize("keep", ["latest", "all"])
+def test_publish_that_is_interrupted_anywhere_breaks_nothing(start: Start, size: int, keep: Any) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards", placement="thread"))
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", keep=keep, depth=1000, timeout_s=20) as reader:
+        when_wanted(boards)
+        publisher = boards.streams.get()["a"]
+        point, where = 0, "at first"
+        while where:
+            point += 1
+            where = interrupted(lambda: publisher.publish(bytes(size)), point).where
+        publisher.publish("last")
+        while next(reader).value != "last":
+            pass
+        for number in range(20):
+            assert publisher.publish(bytes([number]) * size) == 1
+            assert next(reader).value == bytes([number]) * size
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # an interrupt in __del__ goes nowhere
+@pytest.mark.parametrize("size", [10, 100_000])
+@pytest.mark.parametrize("keep", ["latest", "all"])
+def test_next_that_is_interrupted_anywhere_loses_no_frame(start: Start, size: int, keep: Any) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards", placement="thread"))
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", keep=keep, depth=4, timeout_s=20) as reader:
+        when_wanted(boards)
+        point, where, number = 0, "at first", 0
+        while where:
+            point += 1
+            number += 1
+            assert boards.publish("a", bytes([number % 256]) * size).get() == [1]
+            frames: list[rr.StreamFrame] = []
+            where = interrupted(lambda: frames.append(next(reader)), point).where  # noqa: B023
+            if not frames:
+                frames = [next(reader)]
+            assert (frames[0].number, frames[0].missed, frames[0].value[0]) == (number, 0, number % 256)
+        assert point > 20
+    gc.collect()  # errors refer to frames
