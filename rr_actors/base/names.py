@@ -105,6 +105,11 @@ def new_id() -> str:
     return f"{(now_ns // _MS_NS << 80) + next(_numbers):032x}"
 
 
+def made_at(id: str) -> float:
+    """Return when an id of new_id() was made, in seconds since 1970. A resource's id is made of such a one."""
+    return int(id[:12], 16) / 1000
+
+
 def _renew() -> None:
     """Take new random bits: a forked child must not repeat its parent's ids."""
     global _numbers

@@ -7,9 +7,10 @@ from rr_actors.managers.actions.action import Action
 from rr_actors.managers.actions.action_manager import ActionEnd, Actions, RunAction, RunGraph
 from rr_actors.managers.actions.graph_pictures import draw_graph
 from rr_actors.managers.actions.graph_results import GraphResult, run_graph
-from rr_actors.managers.budgets.budget_manager import Budgets, PoolInfo, Share, Supply
+from rr_actors.managers.budgets.budget_manager import Budgets
 from rr_actors.managers.budgets.measures import Measure
 from rr_actors.managers.budgets.pools import Pool, Reserve
+from rr_actors.managers.budgets.requests import PoolInfo, Share, Supply
 from rr_actors.managers.choices.alternatives import Alternative
 from rr_actors.managers.choices.choice_manager import Choices
 from rr_actors.managers.choices.chosen import Choose, Chosen

@@ -90,7 +90,7 @@ from rr_actors.registrar.pages import Page, Wanted, counted_loads, load_rows, pa
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, response_bytes
 from rr_actors.registrar.replacements import Replacements, encoded_response
 from rr_actors.runtime.event_loop import check_asyncio
-from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.time_limits import finite_time, time_limit
 from rr_actors.streams.stream import StreamInfo
 
 if TYPE_CHECKING:
@@ -738,9 +738,7 @@ class Registrar(Consumer):
             UnloadFailed: the unload callback raised.
         """
         self._check_open()
-        seconds = time_limit(grace_s, "grace_s")
-        if seconds is None:
-            raise UsageError(f"revoke: grace_s: expected seconds, 0 or more, got {shown(grace_s)}")
+        seconds = finite_time(grace_s, "revoke: grace_s")
         target, limit_s = target_id(query_or_resource_id), time_limit(timeout_s)
         self._unloads.revoke(target, message_text(why), seconds, limit_s)
 
@@ -1209,6 +1207,30 @@ def page(registrar: Registrar, wanted: Wanted) -> Page:
         RegistrarDown: the registrar is closed, or does not run.
     """
     return registrar._page(wanted)  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def served(registrar: Registrar) -> list[tuple[Resource, list[QueryRow]]]:
+    """Return the rows of all resources that a registrar of this process serves, with those of their queries.
+
+    Raises:
+        RegistrarDown: the registrar is closed.
+    """
+    rows = registrar._calls.call(registrar._resources_now)  # pyright: ignore[reportPrivateUsage]  # same file
+    return [(resource, queries) for resource, _, queries in rows]
+
+
+def on_happened(registrar: Registrar, happened: Callable[[], object]) -> None:
+    """Have `happened` called on the event loop after each event of a resource that a registrar of this process serves.
+
+    It must not wait. It is called before the answer of the call that has caused the event.
+    """
+    registrar._actor.on_happened = happened  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def begin_revocation(registrar: Registrar, resource_id: str, why: str, grace_s: float) -> Reply[None]:
+    """Begin to revoke a resource, and return a future of its end at once; see Registrar.revoke()."""
+    actor, calls = registrar._actor, registrar._calls  # pyright: ignore[reportPrivateUsage]  # same file
+    return calls.start(functools.partial(actor.revoke, resource_id, message_text(why), round(grace_s * 1000)))
 
 
 def registrar_of(actor: RegistrarBase | None) -> Registrar | None:

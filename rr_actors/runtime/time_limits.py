@@ -17,6 +17,8 @@ from rr_actors.base.errors import UsageError, exact_number, is_a, shown
 from rr_actors.runtime.thread_rules import any_thread, on_loop
 
 _LONGEST_S = 2_000_000  # 23 days
+LONGEST_GRACE_S = _LONGEST_S - 1.0
+"""The longest time that a timer is set for."""
 _SLICE_S = 0.25  # the longest wait before the clock is read again,
 _SLICE = 1 / 16  # and the same as a part of the limit
 
@@ -38,6 +40,18 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
     if not number >= 0:  # NaN is not
         raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {shown(timeout_s)}")
     return number if number < _LONGEST_S else None
+
+
+def finite_time(seconds: object, name: str) -> float:
+    """Return a time that must end, in seconds.
+
+    Raises:
+        UsageError: it is not a number of 0 or more, or is longer than LONGEST_GRACE_S.
+    """
+    number = exact_number(seconds) if is_a(seconds, (int, float)) and not is_a(seconds, bool) else -1.0
+    if not 0 <= number <= LONGEST_GRACE_S:  # NaN is not
+        raise UsageError(f"{name}: expected seconds, from 0 to {LONGEST_GRACE_S:,.0f}, got {shown(seconds)}")
+    return number
 
 
 def deadline_of(limit_s: float | None) -> float:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rr_actors.managers.budgets.planner import Asked, Plan, Running, Spare, Step, plan
+from rr_actors.managers.budgets.planner import LEAST, Asked, Plan, Running, Spare, Step, plan, urgencies
 from support_steps import steps_of
 
 ALL: tuple[Step, ...] = ("reclaim", "supply", "preempt", "wait")
@@ -125,6 +125,39 @@ def test_a_reserve_stops_when_nobody_needs_it() -> None:
     assert plan(170, ALL, running((90, 0)), reserves=reserves) == Plan(stop=["s1", "s0"])
     assert plan(170, ALL, running((110, 0)), reserves=reserves) == Plan(stop=["s1"])
     assert plan(170, ALL, running((160, 0)), [Asked("a", 20)], reserves) == Plan(wait=["a"])
+
+
+def test_the_least_priority_makes_no_room() -> None:
+    shares, trial = running((60, None)), [Asked("a", 50, LEAST)]
+
+    assert plan(100, ALL, shares, trial, [Spare("s0", 50)]) == Plan(wait=["a"])
+    assert plan(110, ALL, shares, trial) == Plan(admit=["a"])
+
+
+def test_steps_after_wait_are_for_one_that_may_not_wait() -> None:
+    policy: tuple[Step, ...] = ("wait", "preempt")
+
+    assert plan(100, policy, running((70, 1)), [Asked("a", 60, 9)]) == Plan(wait=["a"])
+    assert plan(100, policy, running((70, 1)), [Asked("a", 60, 9, patient=False)]) == Plan(revoke=["r0"], wait=["a"])
+
+
+def test_one_that_has_waited_long_is_passed_over_by_nobody_who_comes_later() -> None:
+    large, small = Asked("large", 100, 0, 1, holds=True), Asked("small", 10, 0, 2)
+
+    assert plan(100, ALL, running((50, 0)), [large, small]) == Plan(wait=["large", "small"])
+    assert plan(100, ALL, running((50, 0)), [Asked("large", 100, 0, 1), small]) == Plan(admit=["small"], wait=["large"])
+
+
+def test_a_reserve_that_has_not_been_on_for_long_enough_stays_on() -> None:
+    assert plan(150, ALL, running((50, 0)), reserves=[Spare("s0", 50, "on", may_stop=False)]) == Plan()
+
+
+def test_a_reserve_is_as_urgent_as_the_first_that_would_not_fit_without_it() -> None:
+    on = [Spare("s0", 50, "on"), Spare("s1", 50, "on")]
+
+    assert urgencies(50, running((100, 9)), [], on[:1]) == {"s0": 9}
+    assert urgencies(50, running((50, 9), (40, 1)), [], on) == {"s0": 1, "s1": LEAST + 1}
+    assert urgencies(50, [], [Asked("a", 80, 5), Asked("b", 500, 9)], on[:1]) == {"s0": 5}
 
 
 levels = st.none() | st.integers(-2, 2)
@@ -319,7 +352,8 @@ class Pools(RuleBasedStateMachine):
         room = self.total() - self.used(staying=True)
         first = max(self.asked.values(), key=lambda one: (rank(one.priority), -one.since), default=None)
         starts = any(spare.state in ("starting", "late") for spare in self.spares.values())
-        if first is not None and room < first.amount - 1e-6 and not starts:
+        makes_room = first is not None and first.priority is not None  # an idle one takes what is free
+        if first is not None and makes_room and room < first.amount - 1e-6 and not starts:
             lower = [
                 one.amount
                 for one in self.running.values()

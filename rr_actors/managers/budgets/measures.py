@@ -16,7 +16,7 @@ class Measure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a pool's capacity is measured. The pool's own `capacity` is the most that it can be.
 
     With `probe` alone a reading is the capacity. A lower one counts at once, and a higher one if it is more than
-    `step` higher: readings that waver take away as little as they can.
+    `step` higher, or the most that there can be: readings that waver take away as little as they can.
 
     With `shed_at` and `restore_at` a reading is a sign of strain: a frequency, a temperature, a pressure. At
     `shed_at`, or beyond it, the capacity falls by `step`; at `restore_at`, or beyond it, it rises by `step`. Between
@@ -62,7 +62,8 @@ def next_capacity(measure: Measure, most: float, before: float, reading: float) 
     shed_at, restore_at = measure.shed_at, measure.restore_at
     if shed_at is None or restore_at is None:
         reading = min(max(reading, 0.0), most)
-        return reading if reading < before or reading > before + measure.step else before
+        counts = reading < before or reading > before + measure.step or reading == most
+        return reading if counts else before
     sign = 1 if shed_at > restore_at else -1
     if sign * reading >= sign * shed_at:
         return max(0.0, before - measure.step)

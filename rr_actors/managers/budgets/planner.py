@@ -1,7 +1,8 @@
 """The planner: decides who may have a share of a pool, and who has to give one back. Pure.
 
 It looks at everybody who asks at once, the highest priority first, then the oldest. Who fits is admitted. For who does
-not, the steps of the pool's policy make room, and the room that they make is his: nobody who comes later gets it.
+not, the steps of the pool's policy make room, and the room that they make is his: nobody who comes later gets it. The
+least priority makes no room for itself: a share that has it takes what is free, or nothing.
 """
 
 from __future__ import annotations
@@ -13,8 +14,11 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from rr_actors.managers.budgets.victims import fewest_newest, first_that_do, total
+from rr_actors.registrar.model.rows import LOWEST
 
 Step = Literal["reclaim", "supply", "preempt", "wait"]
+LEAST = LOWEST
+"""The priority that makes no room for itself, and that a supply needs more than: what has it may be paused soon."""
 _IDLE = -math.inf
 _TOLERANCE = 1e-9  # of the capacity: 0.1 + 0.2 fits into 0.3
 
@@ -30,24 +34,32 @@ class Running(msgspec.Struct, frozen=True):
 
 
 class Asked(msgspec.Struct, frozen=True):
-    """A share that is asked for; `patient`: it may still wait."""
+    """A share that is asked for.
+
+    Attributes:
+        patient: it may still wait. The steps of the policy after "wait" are for who may not.
+        holds: it has waited so long that nobody who comes after it is admitted before it.
+    """
 
     id: str
     amount: float
     priority: int | None = 0
     since: float = 0.0
     patient: bool = True
+    holds: bool = False
 
 
 class Spare(msgspec.Struct, frozen=True):
     """A reserve that could add to the capacity. What an `on` one adds is in the capacity already.
 
-    A `late` one has been starting for so long that what is over the capacity cannot wait for it.
+    A `late` one has been starting for so long that what is over the capacity cannot wait for it. Without `may_stop`, it
+    has not been on for long enough.
     """
 
     id: str
     amount: float
     state: Literal["off", "starting", "late", "on"] = "off"
+    may_stop: bool = True
 
 
 class Plan(msgspec.Struct):
@@ -91,6 +103,36 @@ def plan(
         planning.place(one, policy)
     planning.rest()
     return planning.made
+
+
+def urgencies(
+    capacity: float, running: Sequence[Running], asked: Sequence[Asked], reserves: Sequence[Spare]
+) -> dict[str, int]:
+    """Return how urgent each reserve is that is on or starting: as the most urgent share that would not fit without it.
+
+    Without a reserve, those that are preferred to it are still there. A share that does not fit with all of them counts
+    for none. A reserve that nobody needs has the priority above the least, as it still gives.
+
+    Args:
+        capacity: without the reserves.
+        running, asked: the shares that stay, and those that wait.
+    """
+    used = [spare for spare in reserves if spare.state != "off"]
+    slack = (capacity + total(reserves)) * _TOLERANCE
+    most = capacity + total(used) + slack
+    sums: list[tuple[float, float]] = []  # with each share, the most urgent first: the sum so far, and its rank
+    needed = 0.0
+    for share in sorted([*running, *asked], key=lambda one: (-_rank(one.priority), one.since)):
+        if isinstance(share, Asked) and needed + share.amount > most:
+            continue
+        needed += share.amount
+        sums.append((needed, _rank(share.priority)))
+    found: dict[str, int] = {}
+    for spare in used:
+        rank = next((rank for needed, rank in sums if needed > capacity + slack), _IDLE)
+        found[spare.id] = int(max(rank, LEAST + 1))
+        capacity += spare.amount
+    return found
 
 
 def _rank(priority: int | None) -> float:
@@ -147,9 +189,14 @@ class _Planning:
     def place(self, one: Asked, policy: Sequence[Step]) -> None:
         """Admit one, or make room for it, or let it wait, or refuse it."""
         need = one.amount - self.ahead - self._slack
-        room = self._make_room(need, _rank(one.priority), policy) if need > 0 else _Room([], [])
+        waits = one.patient and "wait" in policy
+        steps = policy[: policy.index("wait")] if waits else policy
+        room = self._make_room(need, _rank(one.priority), steps) if need > 0 else _Room([], [])
         if room is None:
-            (self.made.wait if one.patient and "wait" in policy else self.made.refuse).append(one.id)
+            (self.made.wait if waits else self.made.refuse).append(one.id)
+            if waits and one.holds:
+                self.free -= one.amount
+                self.ahead -= one.amount
             return
         if not self.holding:
             self._revoke(room.first)
@@ -171,7 +218,7 @@ class _Planning:
             return
         spare_room = min(self.free, self.ahead)
         for spare in reversed(self._reserves):
-            if spare.state == "on" and spare.amount <= spare_room + self._slack:
+            if spare.state == "on" and spare.may_stop and spare.amount <= spare_room + self._slack:
                 self.made.stop.append(spare.id)
                 spare_room -= spare.amount
 
@@ -206,6 +253,8 @@ class _Planning:
 
     def _groups(self, rank: float, policy: Sequence[Step]) -> list[float | None]:
         """Return the priorities that may give way to this rank, and None for the reserves, in the policy's order."""
+        if rank <= LEAST:
+            return []
         lower = sorted(level for level in self._levels if level < rank)
         groups: list[float | None] = []
         for step in policy:

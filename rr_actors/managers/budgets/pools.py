@@ -44,12 +44,17 @@ POLICY: tuple[Step, ...] = get_args(Step)
 class Reserve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A resource that adds `amount` to the capacity by a supply of its own, and is loaded when that is needed.
 
-    Without a `request` it is loaded as `load(server)` does: each field of its request has its default.
+    Without a `request` it is loaded as `load(server)` does: each field of its request has its default. Its priority is
+    that of the most urgent share that would not fit without it.
+
+    Attributes:
+        least_on_s: seconds for which it stays on at least, so that what goes on and off does not switch it, too.
     """
 
     server: str
     amount: float
     request: Any = None
+    least_on_s: float = 5.0
 
 
 class Pool(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -60,7 +65,7 @@ class Pool(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         capacity: how much there is without supplies. With a measure, at most.
         policy: what makes room for a share that does not fit, in this order. "reclaim": revoke shares that are idle.
             "supply": load a reserve. "preempt": revoke shares of lower priority. "wait": wait until others release
-            theirs. What is left out is not done.
+            theirs; what comes after it is done when the share may not wait any longer. What is left out is not done.
         reserve: what can be loaded to add to the capacity, the preferred first.
         measure: how the capacity is measured.
     """
@@ -117,6 +122,7 @@ def _check_pool(file: str | None, key: str, pool: Pool) -> None:
     for j, reserve in enumerate(pool.reserve):
         _check_server(file, f"{key}.reserve[{j}].server", reserve.server)
         check_amount(file, f"{key}.reserve[{j}].amount", reserve.amount)
+        check_amount(file, f"{key}.reserve[{j}].least_on_s", reserve.least_on_s)
     if unknown := [step for step in pool.policy if step not in POLICY]:
         raise wrong(file, f"{key}.policy", f"of {', '.join(POLICY)}", unknown[0], where="Budgets")
     if again := [step for i, step in enumerate(pool.policy) if step in pool.policy[:i]]:

@@ -9,17 +9,19 @@ import msgspec
 from rr_actors.base.errors import shown
 from rr_actors.base.names import in_short
 
-_NAMED = 3  # shares that a text names
+NAMED = 3
+"""Shares that a text names; of the others it has the number."""
 _LONGEST = 400  # characters: a report of progress has at most 500
 
 
 class Around(msgspec.Struct, frozen=True):
     """What is around a share that waits, by ids: who is ahead, who gives way for room, who has the room.
 
-    `reserves`: how many reserves start.
+    `more_ahead`: how many are ahead beside those that are named. `reserves`: how many reserves start.
     """
 
     ahead: Sequence[str] = ()
+    more_ahead: int = 0
     leaving: Sequence[str] = ()
     holding: Sequence[str] = ()
     reserves: int = 0
@@ -31,7 +33,7 @@ def waits(room: str, around: Around, name_of: Callable[[str], str]) -> str:
     parts = (f"{_several(around.leaving, name_of)} {give} way" if around.leaving else "", _reserves(around.reserves))
     said = ", ".join(filter(None, parts)) or f"held by {_several(around.holding, name_of) or 'nobody'}"
     if around.ahead:
-        said = f"behind {_several(around.ahead, name_of)}"
+        said = f"behind {_several(around.ahead, name_of, around.more_ahead)}"
     return in_short(f"waits for room in {room}; {said}", _LONGEST)
 
 
@@ -50,9 +52,10 @@ def gives_way(pool: str, capacity: float | None, needing: Sequence[str], name_of
     return in_short(f"pool {shown(pool)} has no room for it: {why}".removesuffix(": "), _LONGEST)
 
 
-def _several(ids: Sequence[str], name_of: Callable[[str], str]) -> str:
-    more = f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else ""
-    return ", ".join(map(name_of, ids[:_NAMED])) + more
+def _several(ids: Sequence[str], name_of: Callable[[str], str], also: int = 0) -> str:
+    left = max(0, len(ids) - NAMED) + also
+    more = f" and {left} more" if left else ""
+    return ", ".join(map(name_of, ids[:NAMED])) + more
 
 
 def _reserves(count: int) -> str:

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import awaits_trial, is_given_up, note_begun
 from rr_actors.registrar.core.notices import drop_notice, drop_superseded, notify, own_notices
+from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import owe
 from rr_actors.registrar.core.unloading import begin_unload, stay_lost
 from rr_actors.registrar.model import failures
@@ -59,6 +60,8 @@ def spread(
 
 def _note(decision: Decision, resource: Resource, said: Notice) -> Resource:
     lasting = State.FATAL if resource.state is State.FATAL else said.state
+    if lasting is not resource.state and lasting is State.FATAL:
+        touch(decision, resource.id)  # it needs its parts no more
     response = resource.response if said.response is None else said.response
     resource = replace(resource, state=lasting, message=said.message, response=response)
     decision.put(resource)

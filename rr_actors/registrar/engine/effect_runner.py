@@ -20,7 +20,7 @@ from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import OWED, Resource, is_revocation
-from rr_actors.runtime.thread_rules import on_loop, with_lock
+from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
 from rr_actors.wire.transport import Link
 
 logger = Log("rr_actors.registrar")
@@ -97,13 +97,13 @@ class EffectRunner:
         """Return a function that any thread may call to carry out the effects; None if the loop has to.
 
         A thread may send only the answer to one direct line, which has no order with other messages. Watchers hear of
-        an event before the answer, so while anybody watches, the loop sends both.
+        an event before the answer, so while anybody hears of events, the loop sends both.
         """
         answer: e.SendReply | None = None
         for effect in effects:
             if type(effect) is e.SendReply and answer is None:
                 answer = effect
-            elif type(effect) is not e.Happened or self._registrar.node.watched.level[0]:
+            elif type(effect) is not e.Happened or self._is_heard():
                 return None
         return _nothing if answer is None else self._consumers.by_line(answer.message)
 
@@ -271,8 +271,15 @@ class EffectRunner:
     def _answer(self, effect: e.AnswerCall) -> None:
         effect.ticket(None if effect.failure is None else error_of(effect.failure))
 
+    @any_thread
+    def _is_heard(self) -> bool:
+        """Return whether anybody hears of events."""
+        return self._registrar.on_happened is not None or self._registrar.node.watched.level[0] > 0
+
     def _happened(self, effect: e.Happened) -> None:
         registrar, resource = self._registrar, effect.resource
+        if registrar.on_happened is not None:
+            registrar.on_happened()
         if not registrar.node.watched.level[0]:
             return
         facts: dict[str, Any] = {"request": text_of_value(resource.request), "detail": effect.detail}

@@ -120,6 +120,7 @@ class RegistrarBase(DirectPaths, abc.ABC):
         monitor, progress, publishers: three parts that the others use.
         path: the path of the manager that serves it; without one, that of its process.
         serving: whether on_start has returned, and consumers are let in.
+        on_happened: called on the loop after each event of a resource; None: nobody asks.
         listeners: those that hear how far a load has come.
     """
 
@@ -135,6 +136,7 @@ class RegistrarBase(DirectPaths, abc.ABC):
         self.path = self.node.path
         self.serving = False
         self.audience: Audience | None = None
+        self.on_happened: Callable[[], object] | None = None
         self.callback_failures = 0
         self.listeners = ProgressListeners()
 

@@ -325,9 +325,13 @@ class Catalog:
     def inherited(self, resource_id: str) -> int:
         """Return the priority that the parts of a resource inherit.
 
-        A resource that its server pauses needs its parts until it is paused, and before it is resumed. One that could
-        not be unloaded is not paused any more: its server may go and come back, and that changes nothing.
+        A resource that is FATAL is lost, and needs them no more. A resource that its server pauses needs its parts
+        until it is paused, and before it is resumed. One that could not be unloaded is not paused any more: its server
+        may go and come back, and that changes nothing.
         """
+        lost = self.resources.get(resource_id)
+        if lost is not None and lost.state is State.FATAL:
+            return STANDBY
         priority = min(self.priority_of(resource_id), self.max_priority)
         row = self.resources.get(resource_id) if priority <= STANDBY else None
         if row is not None and row.phase not in (PAUSED, UNLOAD_FAILED):

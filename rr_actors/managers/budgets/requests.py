@@ -1,0 +1,93 @@
+"""The requests of a Budgets manager, a share and a supply, and what it says of a pool."""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.base.checks import is_number
+from rr_actors.base.errors import UsageError, shown
+from rr_actors.base.names import new_id
+from rr_actors.registrar.engine.server import current, current_or_none
+
+
+def _whose() -> str:
+    """Return the resource whose callback runs here; outside of callbacks a new id, so no two requests are the same."""
+    callback = current_or_none()
+    return new_id() if callback is None else callback.resource_id
+
+
+def _whose_name() -> str:
+    callback = current_or_none()
+    return "" if callback is None else callback.name
+
+
+class Share(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The request for a part of a pool. Load it as a part, in the load callback of what needs it.
+
+    Attributes:
+        pool: the pool's name.
+        amount: how much of it, at least 0.
+        wait_s: how many seconds it may wait for others to release theirs. Room that is being made by a reserve, or by
+            others that are revoked, is waited for in any case. `timeout_s` of the load should be longer.
+        instance: a name that distinguishes requests that are otherwise the same, which would be one share. By default
+            the resource whose callback makes the request; outside of callbacks each Share is one of its own.
+        whose: for people, the name of what the share is for. By default that of the same resource.
+    """
+
+    pool: str
+    amount: float
+    wait_s: float = 0.0
+    instance: str = msgspec.field(default_factory=_whose)
+    whose: str = msgspec.field(default_factory=_whose_name)
+
+
+class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The request to add to a pool's capacity. Load it as a part, as the last of the load callback.
+
+    It adds while what it is a part of is needed: not while that is idle, paused, or FATAL, or has the priority -1000.
+    """
+
+    pool: str
+    amount: float
+    instance: str = msgspec.field(default_factory=_whose)
+
+
+class PoolInfo(msgspec.Struct, frozen=True):
+    """A pool at one moment: `capacity` with its supplies, `used`, and how many loads are `waiting`.
+
+    `problem`: what is wrong with the probe of its measure; meanwhile the last measured capacity holds. `enforced`:
+    external programs can use no more of it than their shares. That is so of the pools "cpu" and "memory_bytes", where
+    control groups can be made.
+    """
+
+    name: str
+    capacity: float
+    used: float
+    waiting: int
+    problem: str = ""
+    enforced: bool = False
+
+    @property
+    def free(self) -> float:
+        """What is left of the capacity, at least 0."""
+        return max(0.0, self.capacity - self.used)
+
+
+def check_request(request: Share | Supply) -> None:
+    """Refuse a request whose numbers are wrong, or that would be the same one as somebody else's.
+
+    Raises:
+        UsageError: a number is wrong, or the request is a dict without an `instance`.
+    """
+    _check_number(request.amount, "amount")
+    if isinstance(request, Share):
+        _check_number(request.wait_s, "wait_s")
+    if request.instance == current().resource_id:  # made here, where the request was read
+        expected = "a name that no other request has; Share(...) and Supply(...) make one by themselves"
+        raise UsageError(f"instance: expected {expected}, got none", field="instance", expected=expected, got="")
+
+
+def _check_number(value: float, field: str) -> None:
+    if not is_number(value) or value < 0:
+        expected = "a number of at least 0"
+        raise UsageError(f"{field}: expected {expected}, got {shown(value)}", field=field, expected=expected, got=value)
