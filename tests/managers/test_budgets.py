@@ -462,3 +462,66 @@ def test_a_capacity_that_was_set_holds_until_the_file_says_something_else_and_ne
         says(7)  # nobody asks for the file to be read
         wait_respawned(system, "budgets", kill(system, "budgets"))
         assert eventually(lambda holds=holds: budgets.pools().get()[0].capacity == holds)
+
+
+def test_what_a_lost_generator_gives_counts_no_more(house: House) -> None:
+    house.app.load("devices/generator", 50.0)
+    assert house.pool().capacity == 150
+    (generator,) = house.devices.resources()
+    house.devices.send_status(generator, rr.Status(rr.State.FATAL, "out of diesel"))
+    assert eventually(lambda: house.pool().capacity == 100)
+
+
+def test_what_an_idle_generator_gives_counts_when_it_is_needed_again(house: House) -> None:
+    generator = house.app.load("devices/generator", 50.0)
+    generator.standby()
+    assert eventually(lambda: house.pool().capacity == 100)
+    generator.priority = 3
+    assert eventually(lambda: house.pool().capacity == 150)
+
+
+def test_a_reserve_is_as_urgent_as_what_it_was_started_for(start: Start) -> None:
+    house = House(start, Pool("watts", 50, reserve=(Reserve("devices/generator", 60, 60.0),)))
+    pump = house.run("pump", 100, priority=9)
+
+    def priorities() -> list[int | None]:
+        return [info.priority for info in house.devices.resources() if info.server == "generator"]
+
+    assert eventually(lambda: priorities() == [9])
+    pump.priority = 4
+    assert eventually(lambda: priorities() == [4])
+
+
+def test_a_patient_share_is_not_refused_for_a_reserve_that_has_failed_once(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/choking", 50),)))
+    tries = Calls()
+
+    def choke() -> None:
+        tries("try")
+        if len(tries.items) == 1:
+            raise OSError("choked")
+        house.devices.load("budgets/supply", Supply("watts", 50))
+
+    house.devices.register_server("choking", choke)
+    assert house.run("oven", 140, wait_s=50).response == "oven"
+
+
+def test_a_refusal_names_the_reserve_that_could_not_be_loaded(start: Start) -> None:
+    house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, -1.0),)))
+    with pytest.raises(OverCapacity, match="reserve devices/generator cannot be loaded: .*no fuel"):
+        house.run("oven", 140)
+
+
+def test_shares_that_are_no_parts_are_a_share_each(house: House) -> None:
+    house.app.load("budgets/share", Share("watts", 60))
+    with pytest.raises(OverCapacity):
+        house.devices.load("budgets/share", Share("watts", 60))
+    with pytest.raises(rr.RrError, match="instance: expected a name that no other request has"):
+        house.app.load("budgets/share", {"pool": "watts", "amount": 1})
+
+
+def test_a_grace_without_an_end_is_one(start: Start) -> None:
+    house = House(start, Pool("watts", 100), grace_s=1e9)
+    house.run("heater", 60, priority=1)
+    house.run("pump", 60, priority=9)
+    assert house.ended.items == ["heater"]

@@ -90,7 +90,7 @@ class Budgets(Manager):
         self._waiting: dict[str, _Waiting] = {}
         self._admitted: set[str] = set()  # shares whose rows do not say yet that they are loaded
         self._leaving: set[str] = set()  # shares that were chosen to give way
-        self._why: dict[str, str] = {}  # they are told
+        self._why: dict[str, str] = {}  # the text of their revocation
         self._refused: Setbacks[str] = Setbacks()  # revocations that could not begin
         self._infos: list[PoolInfo] = []
         self._measured = dict.fromkeys(self._pools, math.inf)
