@@ -508,7 +508,7 @@ def test_a_patient_share_is_not_refused_for_a_reserve_that_has_failed_once(start
 
 def test_a_refusal_names_the_reserve_that_could_not_be_loaded(start: Start) -> None:
     house = House(start, Pool("watts", 100, reserve=(Reserve("devices/generator", 50, -1.0),)))
-    with pytest.raises(OverCapacity, match="reserve devices/generator cannot be loaded: .*no fuel"):
+    with pytest.raises(OverCapacity, match=r"reserve devices/generator cannot be loaded: .*no fuel"):
         house.run("oven", 140)
 
 
