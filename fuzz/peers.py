@@ -107,7 +107,7 @@ class _Shop:
             client = actor.clients.pop(_MISTAKEN, None)
             if client is not None:
                 client.close()
-            actor.monitor.receive(Gone(_MISTAKEN), _MISTAKEN)
+            actor.receive(Gone(_MISTAKEN), _MISTAKEN)
 
     def _attach(self, role: int, link: UnixLink, hello: Hello) -> UnixLink | None:
         provider = _actor_of(self.provider)

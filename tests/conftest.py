@@ -22,8 +22,8 @@ import pytest
 from hypothesis import settings
 
 import rr_actors as rr
+from rr_actors.actors import turns
 from rr_actors.base.reporting import log
-from rr_actors.registrar.engine import registrar_state
 from rr_actors.runtime import thread_rules
 from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, serve
 
@@ -154,8 +154,8 @@ def _describe(pid: int) -> str:
 @pytest.fixture(autouse=True)
 def short_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The handler of pytest-timeout raises, and waits for nothing: with it the main thread may take short cuts."""
-    handlers = tuple(number for number in registrar_state.CATCHABLE_SIGNALS if number is not signal.SIGALRM)
-    monkeypatch.setattr(registrar_state, "CATCHABLE_SIGNALS", handlers)
+    handlers = tuple(number for number in turns.CATCHABLE_SIGNALS if number is not signal.SIGALRM)
+    monkeypatch.setattr(turns, "CATCHABLE_SIGNALS", handlers)
 
 
 _handler: Any = pytest.LogCaptureFixture.handler

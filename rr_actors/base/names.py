@@ -19,6 +19,19 @@ from rr_actors.base.errors import InvalidName, NotFound, did_you_mean, exact_tex
 CLIENTS = "client."
 """The prefix of the registrars of clients (rr.connect()); no other registrar has it."""
 
+REGISTRAR = "registrar"
+"""The last id in the path of a manager's registrar, "root/cameras/registrar"."""
+
+PROVIDERS = "clients"
+"""The id in the paths of a registrar's clients, one for each provider, "root/cameras/registrar/clients/maps"."""
+
+
+def is_part(path: str) -> bool:
+    """Return whether the path of an actor is one of a part: a manager's registrar, or the application's, or below."""
+    ids = path.split("/")
+    return REGISTRAR in ids[1:] or len(ids) == 1 or ids[1] == PROVIDERS
+
+
 NAME_RULE = "1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'"
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 

@@ -16,6 +16,7 @@ from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import InvalidName, NotFound, Unavailable, shown
 from rr_actors.base.folder import Place
+from rr_actors.base.names import is_part
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import ProcessStacks, stacks_here
 from rr_actors.base.steps import Steps
@@ -23,7 +24,7 @@ from rr_actors.hosting.run_files import RunKeeper, Watched
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.wire.local_transport import LocalTransport
-from rr_actors.wire.name_service import Directory, NameEntry, Presence, actor_key, registrar_key
+from rr_actors.wire.name_service import Directory, NameEntry, Presence, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Welcome
 from rr_actors.wire.unix_transport import UnixTransport
 
@@ -207,12 +208,25 @@ class ProcessNode(abc.ABC):
         found = [path for path in known if path.endswith(f"/{id}")]
         if len(found) == 1:
             return ref_to(found[0])
+        if not found and (part := self.part(id)) is not None:
+            return part
         text = f"several have this id: {', '.join(found)}" if found else f"there are: {', '.join(known) or 'none'}"
         raise NotFound(f"ref({shown(id)}): expected the id or the path of one actor; {text}", id=id, known=tuple(known))
 
+    def part(self, id: str) -> ActorRef[Any] | None:
+        """Return a reference to an actor that is a part of another one; None if the directory knows none of this path.
+
+        Args:
+            id: "cameras/registrar" for the registrar of a manager, "app" for one of the application; "/clients/maps"
+                behind it for its client of a provider.
+        """
+        top = self.path.partition("/")[0]
+        paths = (f"{top}/{id}", id) if is_part(id) else (id,)
+        return next((ref_to(path) for path in paths if is_part(path) and self._is_actor(path)), None)
+
     def _is_actor(self, path: str) -> bool:
         try:
-            entry = self.directory.lookup(actor_key(path))
+            entry = self.directory.actor(path)
         except InvalidName:
             return False
         return entry is not None and entry.status is not Presence.GONE

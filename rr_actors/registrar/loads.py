@@ -20,13 +20,13 @@ from typing import Any, Protocol, TypeVar
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.actors.turns import has_a_turn
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.base.values.failure import Failure, error_of, failure_of
 from rr_actors.registrar.arguments import LoadOptions, check_allowed
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
-from rr_actors.registrar.engine.registrar_state import is_deciding
 from rr_actors.registrar.engine.server import Current, check_not_own, serving
 from rr_actors.registrar.links.provider_link import ProviderLink
 from rr_actors.registrar.model import commands as c
@@ -66,7 +66,7 @@ class Calls:
 
     def check_may_wait(self) -> None:
         """Raise UsageError in a finalizer that the garbage collector runs in the middle of a decision."""
-        if is_deciding():
+        if has_a_turn():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
 
@@ -106,7 +106,7 @@ class Calls:
         return reply.get()
 
     def _run_in_order(self, reply: Reply[T], answered: Flag, fn: Callable[..., T], args: tuple[Any, ...]) -> None:
-        self.actor.monitor.decide_waiting()
+        self.actor.take_turns()
         try:
             reply.set(fn(*args))
         except Exception as error:
@@ -145,9 +145,9 @@ class Calls:
             RrError: the answer is this error.
         """
         self.check_open()
-        if not (is_deciding() or self.dispatcher.is_behind()) and self.dispatcher.may_block():
+        if not (has_a_turn() or self.dispatcher.is_behind()) and self.dispatcher.may_block():
             done = threading.Event()
-            answer = self.actor.monitor.answer_here(command, done.set)
+            answer = self.actor.answer_here(command, done.set)
             if answer is not None:
                 if not done.wait(CALL_TIMEOUT_S):
                     raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {CALL_TIMEOUT_S:g} s")
@@ -316,7 +316,7 @@ class Loads:
             RrError: how the load ended.
         """
         dispatcher = self.calls.dispatcher
-        if is_deciding() or asyncio._get_running_loop() is not None:  # else this thread is no loop's
+        if has_a_turn() or asyncio._get_running_loop() is not None:  # else this thread is no loop's
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
             self.calls.check_may_wait()
         hearer = None if options.progress is False else hearer_of(options.progress, self.actor)
@@ -545,7 +545,7 @@ _DOING = {
 # -- unloads -----------------------------------------------------------------------------------------------------------
 #
 # The registrar's actor releases a query; or a thread that waits does so, on a connection of its own. The thread writes
-# that the release is owed, asks the provider, and forgets the query (DirectPaths). If the provider is down,
+# that the release is owed, asks the provider, and forgets the query (RegistrarState). If the provider is down,
 # the thread hears so when its time is up. The release stays owed, on disk, until the provider is back.
 
 
@@ -607,7 +607,7 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        if is_deciding():  # a finalizer, which the garbage collector runs: it cannot wait
+        if has_a_turn():  # a finalizer, which the garbage collector runs: it cannot wait
             self.begin(query_id, timeout_s)
         elif not self._directly(query_id, timeout_s):
             self._finish(self.begin(query_id, timeout_s))
@@ -729,7 +729,7 @@ class Unloads:
             answer = exchanged(actor, client, line, unload, deadline)
             connections.give_back(line)
             if type(answer) is Unloaded and not actor.forget_released(query_id):
-                self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
+                self.calls.dispatcher.call(actor.receive, answer, client.provider)
         except OSError:  # also TimeoutError, and then no time is left
             connections.drop_mine()
         except BaseException:  # such as KeyboardInterrupt: the loop goes on with the release

@@ -102,11 +102,10 @@ class Manager(Actor):
     async def _before_start(self, place: Any) -> None:
         node: Node = place.node
         self._node = node
-        actor = await node.open_registrar(place.id, node.config.registrar(place.id))
+        actor = await node.open_registrar(place.id, node.config.registrar(place.id), place.path)
         self.registrar = Registrar(node, actor)
         self._served = actor
-        actor.on_failure = self._failed
-        actor.path = place.path
+        actor.on_defect = self._failed
         place.abandoned = functools.partial(self._close_registrar, None)
         try:
             await node.dispatcher.workers.run(self._register_servers, actor)

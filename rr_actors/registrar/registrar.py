@@ -46,9 +46,9 @@ from rr_actors.registrar.arguments import (
     target_id,
 )
 from rr_actors.registrar.declarations import Declared
-from rr_actors.registrar.engine.monitor import RegistrarBase
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.server import (
     RECOVER_S,
     Current,
@@ -66,6 +66,7 @@ from rr_actors.registrar.engine.server import (
     status_callback_of,
 )
 from rr_actors.registrar.engine.status import Status, message_text
+from rr_actors.registrar.links.provider_link import ListQueries
 from rr_actors.registrar.links.remote_calls import for_handles
 from rr_actors.registrar.load_groups import Group, GroupWays, LoadWanted, Queries, wanted
 from rr_actors.registrar.loads import CALL_TIMEOUT_S, Calls, Loads, LoadWays, Unloads, UnloadWays, settle
@@ -937,7 +938,7 @@ class Registrar(Consumer):
             if not future.done():
                 settle(future, error, queries)
 
-        self._calls.dispatcher.call(lambda: self._actor.client(registrar).fetch(fetched))
+        self._calls.dispatcher.call(lambda: self._actor.client(registrar).deliver(ListQueries(fetched)))
         rows = self._calls.finish(future, limit_s, f"fetching from {registrar!r}")
         return [self._fetched_view(registrar, row) for row in rows]
 

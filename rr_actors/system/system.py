@@ -411,7 +411,7 @@ class System:
         for name, status in node.statuses().items():
             if status is Presence.DORMANT and (entry := node.find(name)) is not None:
                 logger.warning("system %s: stops, and registrar %s stays dormant%s", self.name, name, entry.because)
-        opened = [name for name, actor in node.registrars.items() if actor.on_failure is None]  # by no manager
+        opened = [name for name, actor in node.registrars.items() if actor.on_defect is None]  # by no manager
         await steps.take_async("closing the application's registrars", node.dismiss(opened[::-1], limit_s))
         if self._tree is not None and self._end is None:
             await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
@@ -639,7 +639,9 @@ class System:
     def ref(self, id: str) -> ActorRef[Any]:
         """Return a reference to a child actor anywhere in the tree, by its id or its path ("inner/a").
 
-        An id is searched for under the root supervisor first, then below. If several children have it, use a path.
+        An id is searched for under the root supervisor first, then below. If several children have it, use a path. A
+        manager's registrar is "cameras/registrar", one of the application's has its name ("app"), and a client of a
+        registrar is "cameras/registrar/clients/maps" or "app/clients/cameras".
 
         Raises:
             NotFound: no child has this id, or several have it. The error has their paths.
@@ -647,6 +649,9 @@ class System:
             pykka.Timeout: the process of such a supervisor has not answered within 60 s.
         """
         path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
+        part = self._running().part(id)
+        if part is not None and path:
+            return part
         supervisor = self._supervisor_ref(path)
         try:
             supervisor.get_childspec(child_id)
@@ -654,6 +659,8 @@ class System:
             meant = paths_to(child_id, self.supervisor())
             if not path and len(meant) == 1:
                 return ref_to(meant[0])
+            if not meant and part is not None:
+                return part
             if not meant:
                 raise
             raise NotFound(f"{error}; did you mean {' or '.join(map(repr, meant))}?", id=id) from error

@@ -43,7 +43,7 @@ from rr_actors.base.errors import (
     shown,
 )
 from rr_actors.base.folder import Folder, NotOurs, Place, make_directories
-from rr_actors.base.names import check_name
+from rr_actors.base.names import REGISTRAR, check_name, is_part
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
@@ -129,6 +129,18 @@ def actor_key(path: str) -> str:
     if len(key) > _PATH_CHARACTERS:
         key = f"{key[: _PATH_CHARACTERS - 40]}{_BELOW}{_BELOW}{hashlib.sha256(key.encode()).hexdigest()[:32]}"
     return f"a.{key}"
+
+
+def _owner_key(path: str) -> str:
+    """Return the key of the actor of which that at `path` is a part; "" if it is a part of none.
+
+    The owner of "root/cameras/registrar" is the manager; that of "app" and "app/clients/maps" the application's
+    registrar.
+    """
+    ids = path.split("/")
+    if REGISTRAR in ids[1:]:
+        return actor_key("/".join(ids[: ids.index(REGISTRAR, 1)]))
+    return registrar_key(ids[0]) if is_part(path) else ""
 
 
 class Directory:
@@ -256,6 +268,16 @@ class Directory:
         mark, _, why = content.partition(_WHY)
         entry = _MARKS.get(mark)
         return entry if entry is None or not why else NameEntry(entry.status, "", why)
+
+    def actor(self, path: str) -> NameEntry | None:
+        """Return the entry of an actor; of a part, such as a manager's registrar, the entry of that of which it is one.
+
+        Raises:
+            InvalidName: this is no path.
+        """
+        entry = self.lookup(actor_key(path))
+        owner = _owner_key(path) if entry is None else ""
+        return self.lookup(owner) if owner else entry
 
     def names(self) -> list[str]:
         """Return the names of all entries, sorted."""

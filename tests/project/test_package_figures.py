@@ -8,9 +8,9 @@ from package_figures import (
     MACHINERY,
     function_lengths,
     imports_up,
-    monitor_entries,
     passed,
     private_uses,
+    registrar_entries,
     shared_class_names,
     untyped_hubs,
 )
@@ -38,7 +38,7 @@ def test_functions_are_as_short_as_they_were() -> None:
 
 
 def test_a_load_a_status_and_a_restore_pass_no_more_files_than_they_did() -> None:
-    assert len(monitor_entries("load")) <= 3
+    assert len(registrar_entries("load")) <= 3
     assert len(passed("load")) <= 25
     assert len(passed("status")) <= 25
     assert len(passed("restore")) <= 58

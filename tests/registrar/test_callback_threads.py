@@ -16,7 +16,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.engine.commit_log import CommitLog
-from rr_actors.registrar.engine.monitor import RegistrarMonitor
+from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
@@ -53,14 +53,14 @@ def behind(gate: Gate) -> Callable[[str], str]:
 def told(monkeypatch: pytest.MonkeyPatch) -> Calls:
     """Whether the threads that ran callbacks decided that themselves, one after another."""
     calls = Calls()
-    decide_here: Callable[[RegistrarMonitor, Any], bool] = RegistrarMonitor.decide_here
+    decide_here: Callable[[RegistrarBase, Any], bool] = RegistrarBase.decide_here
 
-    def noted(monitor: RegistrarMonitor, done: Any) -> bool:
+    def noted(monitor: RegistrarBase, done: Any) -> bool:
         outcome = decide_here(monitor, done)
         calls(outcome)
         return outcome
 
-    monkeypatch.setattr(RegistrarMonitor, "decide_here", noted)
+    monkeypatch.setattr(RegistrarBase, "decide_here", noted)
     return calls
 
 
@@ -373,7 +373,7 @@ def test_the_thread_that_forked_decides_nothing_in_the_child_and_waits_for_nobod
     if child == 0:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(10)  # it would wait for ever
-        os._exit(actor.monitor.decide_here(c.LoadDone(id, 1, b"")))
+        os._exit(actor.decide_here(c.LoadDone(id, 1, b"")))
     forked.set()
     holder.join()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
@@ -404,16 +404,16 @@ def test_who_begins_to_watch_hears_nothing_of_what_a_thread_decided_before(
 def answered(monkeypatch: pytest.MonkeyPatch) -> Calls:
     """Whether the threads that called for the owner decided that themselves, one after another."""
     calls = Calls()
-    answer_here = RegistrarMonitor.answer_here
+    answer_here = RegistrarBase.answer_here
 
     def noted(
-        monitor: RegistrarMonitor, command: Callable[[object], c.Command], done: Callable[[], object]
+        monitor: RegistrarBase, command: Callable[[object], c.Command], done: Callable[[], object]
     ) -> AnswerCall | None:
         answer = answer_here(monitor, command, done)
         calls(answer is not None)
         return answer
 
-    monkeypatch.setattr(RegistrarMonitor, "answer_here", noted)
+    monkeypatch.setattr(RegistrarBase, "answer_here", noted)
     return calls
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.engine.effect_runner import EffectRunner
+from rr_actors.registrar.links.provider_link import ListQueries
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.messages import Fetched, Unload
@@ -65,11 +66,11 @@ def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answ
         heard.append(sorted(query.query_id for query in queries))
 
     held_back.on = True
-    call(client.fetch, hear)
+    call(client.deliver, ListQueries(hear))
     eventually(lambda: held_back.messages)
     second = app.load("provider/thing", "second")
     held_back.on = False
-    for what in ((client.fetch, hear), (client.fetch, hear), (held_back.messages[0],)):
+    for what in (*[(client.deliver, ListQueries(hear))] * 2, (held_back.messages[0],)):
         call(*what)
 
     eventually(lambda: len(heard) == 3)
@@ -98,7 +99,7 @@ def test_a_fetch_ends_when_its_registrar_is_closed(
     heard: list[Any] = []
 
     async def fetch() -> None:
-        client.fetch(lambda *answer: heard.append(answer))  # one that the loop takes after the close
+        client.deliver(ListQueries(lambda *answer: heard.append(answer)))  # one that the loop takes after the close
 
     actor_of(app).node.dispatcher.run(fetch(), timeout_s=LIMIT_S)
     assert [type(error) for _, error in heard] == [rr.RegistrarDown]

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors.turns import has_a_turn
 from rr_actors.registrar.core.decide import decide
-from rr_actors.registrar.engine.registrar_state import is_deciding
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.effects import SendRequest
@@ -88,7 +88,7 @@ def test_to_open_and_close_one_of_many_registrars_takes_as_many_steps_as_one_of_
         system.open_registrar("session", config).close()
 
     def steps() -> tuple[int, int]:
-        return min(steps_on_loop(session) for _ in range(5)), steps_of(is_deciding)[0]
+        return min(steps_on_loop(session) for _ in range(5)), steps_of(has_a_turn)[0]
 
     for number in range(20):
         system.open_registrar(f"few-{number}", config)
@@ -124,13 +124,13 @@ def test_a_load_through_a_long_chain_takes_the_loop_as_many_steps_for_each_link_
     assert steps(0) <= steps(50) * 1.3  # what waits for 50 ms is written meanwhile, too
 
 
-def test_of_many_registrars_that_share_locks_each_says_that_its_thread_is_deciding(system: rr.System) -> None:
+def test_of_many_registrars_that_share_locks_each_says_that_its_thread_has_a_turn(system: rr.System) -> None:
     registrars = [system.open_registrar(f"r{number}", rr.RegistrarConfig(durability="none")) for number in range(100)]
     for registrar in registrars:
-        assert not is_deciding()
+        assert not has_a_turn()
         with actor_of(registrar).lock:
-            assert is_deciding()
+            assert has_a_turn()
     for registrar in registrars[:-1]:
         registrar.close()
     with actor_of(registrars[-1]).lock:
-        assert is_deciding(), "the lock of an open registrar counts, also if a closed one shared it"
+        assert has_a_turn(), "the lock of an open registrar counts, also if a closed one shared it"

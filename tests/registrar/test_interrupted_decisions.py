@@ -19,7 +19,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.decide import Item
-from rr_actors.registrar.engine.registrar_state import DirectPaths
+from rr_actors.registrar.engine.registrar_state import RegistrarState
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.messages import Fetch, Load, Loaded, Noticed, Unload, Unloaded
@@ -98,6 +98,13 @@ SCENES: dict[str, tuple[list[Item], Item]] = {
 }
 
 
+class State(RegistrarState):
+    """A registrar's state alone, without the loop's turns."""
+
+    def handle(self, deliveries: Any) -> None:
+        raise AssertionError("nothing is delivered here")
+
+
 class Stage:
     """A registrar's state, and what it has written."""
 
@@ -105,7 +112,7 @@ class Stage:
         self.store = FullDisk()
         loop: Any = Loop()
         workers: Any = None
-        self.state = DirectPaths("me", RegistrarConfig(name="me"), self.store, loop, workers)
+        self.state = State("me", RegistrarConfig(name="me"), self.store, loop, workers)
         for item in before:
             self.state.commit([item])
 
@@ -124,7 +131,9 @@ class Stage:
         return [name for name in INDEXES if compared(getattr(fresh, name)) != compared(getattr(kept, name))]
 
 
-WITH = {getattr(DirectPaths, name).__code__ for name in ("commit", "join", "leave", "hold", "owe", "forget_released")}
+WITH = {
+    getattr(RegistrarState, name).__code__ for name in ("commit", "join", "leave", "hold", "owe", "forget_released")
+}
 
 
 class Interrupts:
@@ -233,36 +242,36 @@ IN_FLIGHT = holding.pending(c.AskProvider("mine", "p", "cam", b"front", "", (1 <
 GOT = c.Got("mine", "r", b"feed")
 
 
-def begins(state: DirectPaths) -> None:
+def begins(state: RegistrarState) -> None:
     state.catalog.in_flight["mine"] = IN_FLIGHT
 
 
-def holds(state: DirectPaths) -> None:
+def holds(state: RegistrarState) -> None:
     assert state.hold(GOT)
 
 
-def saves(state: DirectPaths) -> None:
+def saves(state: RegistrarState) -> None:
     state.commits.save()
 
 
-def owes(state: DirectPaths) -> None:
+def owes(state: RegistrarState) -> None:
     assert state.owe("mine")
 
 
-def lets_go(state: DirectPaths) -> None:
+def lets_go(state: RegistrarState) -> None:
     assert state.forget_released("mine")
 
 
-def joins(state: DirectPaths) -> None:
+def joins(state: RegistrarState) -> None:
     assert state.join(load("r")) is not None
 
 
-def leaves(state: DirectPaths) -> None:
+def leaves(state: RegistrarState) -> None:
     assert state.leave(Unload("r", "app")) is not None
 
 
 # What had happened before by decisions, and by threads; and what is interrupted.
-QUICK: dict[str, tuple[list[Any], list[Any], Callable[[DirectPaths], None]]] = {
+QUICK: dict[str, tuple[list[Any], list[Any], Callable[[RegistrarState], None]]] = {
     "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [], joins),
     "an unload that leaves others": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [joins], leaves),
     "a load by line": ([UP], [begins], holds),

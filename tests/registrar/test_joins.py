@@ -19,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rr_actors as rr
+from rr_actors.actors import turns
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import loading, unloading
@@ -104,7 +105,7 @@ def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[An
         else:
             fast.set("queries", query.id, query)
             resource = fast.resources[query.resource_id]
-            fast.joined[resource.server] = fast.joined.get(resource.server, 0) + 1  # as DirectPaths counts
+            fast.joined[resource.server] = fast.joined.get(resource.server, 0) + 1  # as RegistrarState counts
             answer = Loaded(query.id, resource.id, resource.response or b"", state=resource.state)
             assert decision.effects == [SendReply(step.origin, answer)]
             assert (decision.changes, decision.later) == ([Put(query)], {})
@@ -355,7 +356,7 @@ def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider
     arrived = threading.Event()
 
     def occupy() -> None:
-        actor_of(provider).monitor.receive(Unload(query.id, "app"), "app")
+        actor_of(provider).receive(Unload(query.id, "app"), "app")
         arrived.set()
         gate()
 
@@ -442,7 +443,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     heard: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
     try:
-        eventually(registrar_state.may_be_interrupted)
+        eventually(turns.may_be_interrupted)
         query = app.load("provider/thing", "x")
         assert len(app.queries()) == 2
         os.kill(os.getpid(), signal.SIGUSR1)
@@ -455,7 +456,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
         assert short_cuts == ["ServedQuery"]
     finally:
         signal.signal(signal.SIGUSR1, before)
-    eventually(lambda: not registrar_state.may_be_interrupted())
+    eventually(lambda: not turns.may_be_interrupted())
     app.load("provider/thing", "x")
     assert short_cuts == ["ServedQuery", "ServedQuery"]
 

@@ -97,7 +97,7 @@ def test_it_is_in_memory_and_on_disk_when_it_is_answered_and_the_inbox_has_seen_
     provider: rr.Registrar, lines: Lines, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(actor_of(provider).monitor, "put", None)
+        patch.setattr(actor_of(provider), "deliver", None)
         (line,) = lines.ask(load("new"))
     (resource,) = provider.resources()
     server = actor_of(provider).catalog.servers[resource.server]

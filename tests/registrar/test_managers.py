@@ -898,7 +898,7 @@ def test_a_response_is_read_with_its_own_types_though_a_thread_has_it_before_the
     assert (first.request, first.response) == (OpenCamera("a"), Feed("b", 1))
     provider.unregister_server("again")
     actor = actor_of(app)
-    receive = actor.monitor.receive
+    receive = actor.receive
 
     def receive_behind_types(message: Any, sender: str, *, more: bool = False) -> None:
         if type(message) is Loaded:
@@ -908,7 +908,7 @@ def test_a_response_is_read_with_its_own_types_though_a_thread_has_it_before_the
         receive(message, sender, more=more)
 
     types.on = True
-    monkeypatch.setattr(actor.monitor, "receive", receive_behind_types)
+    monkeypatch.setattr(actor, "receive", receive_behind_types)
     provider.register_server("again", lambda _: Made("d", "e", 2), request_type=Order, response_type=Made)
     query = app.load(f"{where}/again", Order("c"))
     assert (query.request, query.response) == (Order("c"), Made("d", "e", 2))

@@ -13,8 +13,8 @@ import msgspec
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors.turns import has_a_turn
 from rr_actors.base.values.canonical import Codec, encode
-from rr_actors.registrar.engine.registrar_state import is_deciding
 from rr_actors.registrar.model.messages import Load
 from support import LIMIT_S, Calls, Gate, eventually, serve
 from support_inside import actor_of
@@ -31,7 +31,7 @@ class Notes:
         self.error: BaseException | None = None
 
     def made(self, name: str) -> None:
-        self.read((name, threading.current_thread().name, is_deciding()))
+        self.read((name, threading.current_thread().name, has_a_turn()))
         if threading.current_thread().name.startswith("rr-worker") and name == "slow" and self.gate is not None:
             self.gate(name)
         if self.error is not None and name == "wrong":
@@ -76,15 +76,15 @@ def load(app: rr.Registrar, server: str, request: Any, block: bool, timeout_s: f
 
 
 def watch(monkeypatch: pytest.MonkeyPatch, registrar: rr.Registrar, decided: Calls) -> None:
-    """Note what is put to a registrar's monitor, once it has been decided."""
-    monitor = actor_of(registrar).monitor
-    put = monitor.put
+    """Note what a registrar's mailbox takes, once it has been decided."""
+    actor = actor_of(registrar)
+    put = actor.deliver
 
     def noted(what: Any, sender: str | None = None, *, more: bool = False) -> None:
         put(what, sender, more=more)
         decided(what)
 
-    monkeypatch.setattr(monitor, "put", noted)
+    monkeypatch.setattr(actor, "deliver", noted)
 
 
 @WAYS

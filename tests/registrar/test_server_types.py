@@ -36,7 +36,7 @@ class _Disk:
             node=SimpleNamespace(dispatcher=SimpleNamespace(loop=loop)),
             commit_rows=self._commit_rows,
         )
-        clients: Any = {"provider": SimpleNamespace(describe=lambda _server, *, at_once: None)}
+        clients: Any = {"provider": SimpleNamespace(deliver=lambda _wish: None)}
         self.types = ServerTypes(self.registrar, clients)
 
     def _commit_rows(self, changes: list[Put]) -> None:

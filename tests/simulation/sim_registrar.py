@@ -254,14 +254,14 @@ class SimRegistrar(SimShell):
         return query
 
     def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
-        """As RegistrarMonitor.put, of what a direct line brings."""
+        """As RegistrarBase.put, of what a direct line brings."""
         if self.inbox or self.state not in ("starting", "up"):
             return False
         self.take_up([(message, sender)], fault, 0)
         return True
 
     def tell(self, done: c.Command, fault: str) -> bool:
-        """As RegistrarMonitor.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
+        """As RegistrarBase.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
         if self.inbox:
             return False
         decision = decide(self.catalog, [(done, None)])

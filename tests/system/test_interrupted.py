@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.engine import registrar_state
+from rr_actors.actors import turns
 from rr_actors.storage import opening as catalogs
 from support import REPOSITORY, Workshop, eventually, serve
 from support_asks import in_threads
@@ -218,19 +218,19 @@ def test_a_program_without_standard_files_does_not_mistake_its_own_for_them(stat
 
 def test_in_a_forked_child_the_thread_that_forked_is_the_one_that_handlers_interrupt() -> None:
     before = signal.signal(signal.SIGUSR1, lambda *_: None)
-    eventually(registrar_state.may_be_interrupted)
+    eventually(turns.may_be_interrupted)
     statuses: list[int] = []
 
     def fork() -> None:
         pid = os.fork()
         if pid == 0:
-            os._exit(0 if registrar_state.may_be_interrupted() else 1)
+            os._exit(0 if turns.may_be_interrupted() else 1)
         statuses.append(os.waitpid(pid, 0)[1])
-        assert not registrar_state.may_be_interrupted()
+        assert not turns.may_be_interrupted()
 
     try:
         in_threads(fork)
         assert statuses == [0]
-        assert registrar_state.may_be_interrupted()
+        assert turns.may_be_interrupted()
     finally:
         signal.signal(signal.SIGUSR1, before)

@@ -186,7 +186,7 @@ def arrive(actor: RegistrarActor, loads: int) -> int:
     async def run() -> int:
         with framing_only(actor) as link:
             for number, load in enumerate(itertools.islice(warm_loads(), loads)):
-                actor.monitor.receive(load, load.origin, more=number < loads - 1)
+                actor.receive(load, load.origin, more=number < loads - 1)
             while actor.waiting:
                 await actor.monitor.next_change(1.0)
             return link.flushed

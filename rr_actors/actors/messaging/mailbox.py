@@ -100,6 +100,9 @@ class Mailbox:
         owner: the actor's name, for errors.
         limit: the number of messages it can hold; the limit does not hold for stop messages and Downs.
         opens_packed: whether it accepts Packed messages: the actor unpickles them off the loop.
+
+    Attributes:
+        waiting: the messages that wait for their turn, first in, first out.
     """
 
     def __init__(self, owner: str, limit: int, *, opens_packed: bool = False) -> None:
@@ -107,7 +110,7 @@ class Mailbox:
         self._owner = owner
         self._limit = limit
         self._lock = threading.Lock()
-        self._messages: deque[PykkaEnvelope[Any]] = deque()
+        self.waiting: deque[PykkaEnvelope[Any]] = deque()
         self._control: deque[PykkaEnvelope[Any]] = deque()
         self._at_rest = False  # until the actor has started
         self._due = False  # whether the actor was scheduled and has not begun that turn
@@ -129,7 +132,7 @@ class Mailbox:
         notice = type(envelope) is DownNotice
         urgent = notice or is_stop(message)
         overtakes = notice or (urgent and getattr(message, "reason", "normal") == "shutdown")
-        lane = self._control if overtakes else self._messages
+        lane = self._control if overtakes else self.waiting
         schedule: Callable[[bool], None] | None = None
         queued = False
         try:
@@ -151,7 +154,7 @@ class Mailbox:
     def _check(self, *, urgent: bool) -> None:
         if not self._open:
             raise Ended(f"{self._owner} not found", self._owner)
-        if not urgent and len(self._messages) >= self._limit:
+        if not urgent and len(self.waiting) >= self._limit:
             raise MailboxFull(
                 f"mailbox of {self._owner}: holds {self._limit} messages, its limit; send less, ask instead of "
                 f"telling, or raise the class's mailbox_limit",
@@ -197,9 +200,13 @@ class Mailbox:
     def next(self) -> PykkaEnvelope[Any] | None:
         """Take the next message; None if the mailbox is empty."""
         try:
-            return self._control.popleft() if self._control else self._messages.popleft()
+            return self._control.popleft() if self._control else self.waiting.popleft()
         except IndexError:
             return None
+
+    def urgent(self) -> list[PykkaEnvelope[Any]]:
+        """Take the stops and Downs that overtake the waiting messages."""
+        return [self._control.popleft() for _ in range(len(self._control))]
 
     def get(self) -> PykkaEnvelope[Any]:
         """Take the next message without waiting (Pykka calls this); raise LookupError if the mailbox is empty."""
@@ -210,12 +217,12 @@ class Mailbox:
 
     def empty(self) -> bool:
         """Return whether the mailbox is empty."""
-        return not self._messages and not self._control
+        return not self.waiting and not self._control
 
     def rest(self) -> bool:
         """Note that the actor rests, so that the next put() schedules it; return False if a message came meanwhile."""
         with self._lock:
-            self._at_rest = not self._messages and not self._control
+            self._at_rest = not self.waiting and not self._control
             return self._at_rest
 
     def close(self) -> list[PykkaEnvelope[Any]]:
@@ -223,13 +230,13 @@ class Mailbox:
         with self._lock:
             self._open = False
             self._schedule = None  # it refers to the actor, whose memory may be freed now
-            left = [*self._control, *self._messages]
+            left = [*self._control, *self.waiting]
             self._control.clear()
-            self._messages.clear()
+            self.waiting.clear()
             return left
 
     def __len__(self) -> int:
-        return len(self._messages) + len(self._control)
+        return len(self.waiting) + len(self._control)
 
 
 def put(ref: ActorRef[Any], envelope: Envelope, name: str) -> None:

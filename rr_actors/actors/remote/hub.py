@@ -79,6 +79,7 @@ class ActorHub:
         self._transport = transport
         self._directory = directory
         self._hosted: dict[str, pykka.ActorRef[Any]] = {}
+        self._parts: dict[str, pykka.ActorRef[Any]] = {}
         self._lines: dict[str, Line] = {}
         self._visitors: set[Link] = set()
         self._lock = threading.Lock()
@@ -98,13 +99,22 @@ class ActorHub:
         self._hosted[path] = ref
         self._directory.publish(actor_key(path), self.address, once=once)
 
+    def host(self, path: str, ref: pykka.ActorRef[Any]) -> None:
+        """Have an actor found that is a part of another one: others find it by the entry of that."""
+        self._parts[path] = ref
+
+    def parts(self) -> list[str]:
+        """Return the paths of the actors of this process that are parts of others. From any thread."""
+        return list(self._parts)
+
     def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport) -> None:
         """Remove the actor at `path`, which has ended or is abandoned. Its supervisor changes the directory.
 
         An abandoned actor is stuck in a handler; for all others it is dead from now on.
         """
-        if self._hosted.get(path) is ref:
-            del self._hosted[path]
+        for known in (self._hosted, self._parts):
+            if known.get(path) is ref:
+                del known[path]
         if running.get(ref.actor_urn) is ref:
             del running[ref.actor_urn]
             ref.actor_stopped.set()
@@ -117,7 +127,8 @@ class ActorHub:
         if (ref := running.get(urn)) is not None:
             return ref
         if urn.startswith(PATH_URN):
-            return self._hosted.get(urn[len(PATH_URN) :])
+            path = urn[len(PATH_URN) :]
+            return self._hosted.get(path) or self._parts.get(path)
         return ActorRegistry.get_by_urn(urn)
 
     # -- the actors of others ------------------------------------------------------------------------------------------
@@ -266,12 +277,12 @@ class ActorHub:
         True if that cannot say it any more: its system has ended, or the actor was started again meanwhile.
         """
         while where.path is not None and not self._closed:
-            entry = self._directory.lookup(actor_key(where.path))
+            entry = self._directory.actor(where.path)
             if entry is None or entry.address not in ("", address):
                 break
             if not entry.address:
                 return bool(entry.why) if entry.status is Presence.STARTING else entry.why.startswith("killed")
-            top = self._directory.lookup(actor_key(_top(where.path)))
+            top = self._directory.actor(_top(where.path))
             if top is None or _is_gone(top.address):
                 break
             time.sleep(0.01)
@@ -303,14 +314,14 @@ class ActorHub:
         return lifeline.signal_if(pid, signal.SIGKILL, lambda: self.pid(where) == pid)
 
     def _has_own_process(self, path: str) -> bool:
-        mine = self._directory.lookup(actor_key(path))
-        above = self._directory.lookup(actor_key(path.rpartition("/")[0]))
+        mine = self._directory.actor(path)
+        above = self._directory.actor(path.rpartition("/")[0])
         return mine is None or mine.status is not Presence.UP or above is None or above.address != mine.address
 
     def missing(self, where: Whereabouts) -> ActorDeadError | ActorUnavailable:
         """Return the error for an actor that was not found: dead or being respawned, by its entry in the directory."""
         name = where.target.name
-        entry = None if where.path is None else self._directory.lookup(actor_key(where.path))
+        entry = None if where.path is None else self._directory.actor(where.path)
         if entry is None:
             return ActorDeadError(f"{name} not found: it has ended, or never was")
         match entry.status:
@@ -352,7 +363,7 @@ class ActorHub:
         """Return the address of the actor's process; "" if the actor is not up."""
         address = where.address
         if where.path is not None:
-            entry = self._directory.lookup(actor_key(where.path))
+            entry = self._directory.actor(where.path)
             address = entry.address if entry is not None and entry.status is Presence.UP else ""
         return "" if address == where.ended_at else address
 

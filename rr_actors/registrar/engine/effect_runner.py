@@ -7,21 +7,18 @@ from asyncio import TimerHandle
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rr_actors.base.errors import RrError
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import text_of_value
-from rr_actors.base.values.failure import error_of, failure_of
-from rr_actors.registrar.engine.monitor import RegistrarBase
+from rr_actors.base.values.failure import error_of
+from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.server import Servers
 from rr_actors.registrar.links.consumer_links import Consumers
-from rr_actors.registrar.links.provider_link import ProviderLinks
+from rr_actors.registrar.links.provider_link import ProviderLink, ProviderLinks
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.effects import Effect
-from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import OWED, Resource, is_revocation
 from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
-from rr_actors.wire.transport import Link
 
 logger = Log("rr_actors.registrar")
 
@@ -42,7 +39,7 @@ class EffectRunner:
         self._loop = registrar.node.dispatcher.loop
         self._workers = registrar.node.dispatcher.workers
         self._timers: dict[str, TimerHandle] = {}
-        self._dirty: dict[int, Link] = {}
+        self._dirty: dict[str, ProviderLink] = {}  # the clients with unsent requests
         self._silent_until: dict[str, float] = {}  # by consumer: when the log says next that it is behind
         self._methods: dict[type, Callable[[Any], None]] = {
             e.SendReply: self._reply,
@@ -89,8 +86,8 @@ class EffectRunner:
             self._consumers.flush()
         if self._dirty:
             dirty, self._dirty = self._dirty, {}
-            for link in dirty.values():
-                link.flush()
+            for client in dirty.values():
+                client.flush()
 
     @with_lock
     def by_thread(self, effects: Sequence[Effect]) -> Callable[[], None] | None:
@@ -119,38 +116,14 @@ class EffectRunner:
 
     def _request(self, effect: e.SendRequest) -> None:
         client = self._clients[effect.registrar]
-        link = client.link
-        if link is None:
-            client.want()
-            return
-        if self._registrar.catalog.up.get(effect.registrar) != client.opened:
-            return  # decided for an earlier link: reconciling this one sends all open messages again
-        try:
-            if type(effect.message) is Load:
-                client.describe(effect.message.server)
-            link.send(effect.message)
-        except RrError as error:
-            self._not_sent(effect, error)
-            return
-        if self._registrar.node.watched.level[0] > 1:
-            self._registrar.recorder.message("sent", self._registrar.name, effect.registrar, effect.message)
-        self._dirty[id(link)] = link
-
-    def _not_sent(self, effect: e.SendRequest, error: RrError) -> None:
-        if type(effect.message) is Load:
-            self._registrar.post(c.GiveUp(effect.message.query_id, failure_of(error)))
-            return
-        name = self._registrar.name
-        logger.error("%s: %s; closing the link, what is open is sent again over the next", name, error)
-        link = self._clients[effect.registrar].link
-        if link is not None:
-            link.close()
+        client.deliver(effect)
+        self._dirty[effect.registrar] = client
 
     def _connect(self, effect: e.Connect) -> None:
-        self._clients[effect.registrar].want()
+        self._clients[effect.registrar].deliver(effect)
 
     def _receive(self, effect: e.Receive) -> None:
-        self._registrar.monitor.receive(effect.message, effect.sender)
+        self._registrar.receive(effect.message, effect.sender)
 
     # -- callbacks -----------------------------------------------------------------------------------------------
 

@@ -21,14 +21,14 @@ from rr_actors.base.errors import (
     UnknownQuery,
     UnknownRegistrar,
 )
-from rr_actors.base.names import CLIENTS, new_id
+from rr_actors.base.names import CLIENTS, REGISTRAR, new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.base.values.failure import Failure
 from rr_actors.hosting.process_node import ProcessNode, SystemInfo
 from rr_actors.registrar.engine.bulk_release import Releases
-from rr_actors.registrar.engine.monitor import Opening
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.engine.registrar_base import Opening
 from rr_actors.registrar.links.provider_link import THREADS
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.links.remote_calls import KIND, Door, HandleLine, HandleMessage
@@ -127,8 +127,11 @@ class Node(ProcessNode):
 
     # -- registrars ----------------------------------------------------------------------------------------------
 
-    async def open_registrar(self, name: str, config: RegistrarConfig) -> RegistrarActor:
+    async def open_registrar(self, name: str, config: RegistrarConfig, manager: str = "") -> RegistrarActor:
         """Lock and read a catalog, and continue its unfinished work. `serve_registrar` accepts the links of others.
+
+        Args:
+            manager: the path of the manager that it is for; without one it is the application's.
 
         Raises:
             NameTaken: the registrar is open in this process already, or up in another.
@@ -147,7 +150,10 @@ class Node(ProcessNode):
         try:
             with left_alone():  # the rows stay, perhaps a million of them
                 store = await self._open_store(config)
-                registrar = RegistrarActor(Opening(self, name, config, store, self.registrars, self.recorder))
+                path = f"{manager}/{REGISTRAR}" if manager else name
+                known = self.registrars, self.recorder
+                registrar = RegistrarActor.made(path, Opening(self, name, config, store, *known, manager or self.path))
+                registrar.begin_life(self.dispatcher, self.hub)
                 registrar.catalog.deaths = deaths
                 self.registrars[name] = registrar
                 registrar.begin()
@@ -175,7 +181,7 @@ class Node(ProcessNode):
         """Wait at most 2 s for the recover callbacks to end, and at most 1 s for the lists of providers that are up."""
         deadline = time.monotonic() + _RECOVER_S
         while registrar.catalog.recovering and not registrar.closed and time.monotonic() < deadline:
-            await registrar.monitor.next_change(_LOOK_AGAIN_S)
+            await registrar.next_change(_LOOK_AGAIN_S)
         deadline = time.monotonic() + _RECONCILE_S
         while time.monotonic() < deadline and not registrar.closed:
             with registrar.lock:
@@ -183,7 +189,7 @@ class Node(ProcessNode):
                 waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
             if not any(self.status_of(peer) is Presence.UP for peer in waiting):
                 return
-            await registrar.monitor.next_change(_LOOK_AGAIN_S)
+            await registrar.next_change(_LOOK_AGAIN_S)
         logger.info("%s: not all providers have answered within %g s", registrar.name, _RECONCILE_S)
 
     def serve_registrar(self, registrar: RegistrarActor) -> None:
@@ -197,7 +203,7 @@ class Node(ProcessNode):
             catalog = registrar.whole()
             origins = {**catalog.by_origin, **catalog.notices_to}
         for origin in filter(self._is_gone, origins):
-            registrar.monitor.receive(Gone(origin), origin)
+            registrar.receive(Gone(origin), origin)
 
     def _is_gone(self, registrar: str) -> bool:
         status = self.status_of(registrar)
@@ -314,7 +320,7 @@ class Node(ProcessNode):
                 waiting = [origin for origin in catalog.consumers if catalog.notices_to.get(origin)]
             if not waiting:
                 return
-            await registrar.monitor.next_change(_LOOK_AGAIN_S)
+            await registrar.next_change(_LOOK_AGAIN_S)
 
     def _owed_to_dormant(self, registrar: RegistrarActor, queries: Sequence[str]) -> set[str]:
         """Return the queries at dormant providers, and log them: their release does not end before these are opened."""
@@ -366,8 +372,8 @@ class Node(ProcessNode):
             self.directory.mark(registrar_key(name), _GONE)
         told: set[str] = set()
         for registrar in list(self.registrars.values()):
-            registrar.monitor.receive(Gone(name), name)
-            registrar.monitor.decide_waiting()
+            registrar.receive(Gone(name), name)
+            registrar.take_turns()
             if name not in registrar.catalog.by_origin:
                 told.add(registrar.name)
         for provider in self.directory.registrars():

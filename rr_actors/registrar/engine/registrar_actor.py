@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from rr_actors.actors.messaging.exit_reports import ExitReport, abnormal
+from rr_actors.actors.turns import CLOSED
 from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, RrError, UsageError
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.base.values.failure import Failure, error_of, failure_of
 from rr_actors.registrar.engine.effect_runner import EffectRunner
-from rr_actors.registrar.engine.monitor import Opening, RegistrarBase, RegistrarMonitor
 from rr_actors.registrar.engine.progress import ProgressReports
+from rr_actors.registrar.engine.registrar_base import Opening, RegistrarBase
 from rr_actors.registrar.engine.registrar_state import LoadWaiter, UnloadWaiter, answered_by_line
 from rr_actors.registrar.engine.server import Servers
 from rr_actors.registrar.links.consumer_links import Consumers
@@ -24,6 +26,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import Loaded, LoadRefused
 from rr_actors.registrar.model.rows import Held, Hold
+from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.runtime.thread_rules import on_loop
 from rr_actors.streams.publishers import Publishers
@@ -41,15 +44,15 @@ class RegistrarActor(RegistrarBase):
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
         self.callers: set[UnloadWaiter] = set()  # the callbacks of commands whose end somebody waits for
-        self.on_failure: Callable[[BaseException], None] | None = None
+        self.on_defect: Callable[[BaseException], None] | None = None
         self.progress = ProgressReports(self)
         self.publishers = Publishers(self.node.config.segments_limit_bytes, self.node.dispatcher.loop)
         self.consumers = Consumers(self)
         self.servers = Servers(self, self.consumers)
         self.clients = ProviderLinks(self)
         self.types = ServerTypes(self, self.clients)
-        runner = EffectRunner(self, self.consumers, self.servers, self.clients)
-        self.monitor = RegistrarMonitor(self, runner, self.servers)
+        self.runner = EffectRunner(self, self.consumers, self.servers, self.clients)
+        self.reader = self.servers
 
     # -- start and stop ------------------------------------------------------------------------------------------
 
@@ -66,7 +69,7 @@ class RegistrarActor(RegistrarBase):
     def begin(self) -> None:
         """Go on with the work that the catalog says was in progress, and look for the providers of its queries."""
         self.lock_in_use(in_use=True)
-        self.monitor.run(c.BeginAgain())
+        self.run(c.BeginAgain())
         if self.serving:  # the catalog is read again
             self.post(c.BeginServing(new_id()))
         with self.lock:
@@ -80,7 +83,7 @@ class RegistrarActor(RegistrarBase):
         self.serving = True
         self.servers.open_probes()
         self.post(c.BeginServing(new_id()))
-        self.monitor.hear_held_back()
+        self.hear_held_back()
 
     @on_loop
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
@@ -106,13 +109,14 @@ class RegistrarActor(RegistrarBase):
         return super().down()
 
     @on_loop
-    def close(self, *, erase: bool = False) -> None:
+    def close(self, *, erase: bool = False, report: ExitReport = CLOSED) -> None:
         """Write unsaved changes, and close the links and the catalog; no query is released.
 
         Each step is tried, also after one that failed.
 
         Args:
             erase: remove the catalog, unless a provider has to be told that queries are released.
+            report: how it ends, for those that monitor it.
 
         Raises:
             Exception, ExceptionGroup: the errors of the steps that failed.
@@ -121,7 +125,8 @@ class RegistrarActor(RegistrarBase):
             return
         self.closed = True
         steps = Steps()
-        for part in (self.monitor, self.servers, self.consumers, *self.clients.values()):
+        steps.take("dropping what waits", self.drop_all)
+        for part in (self.servers, self.consumers, *self.clients.values()):
             steps.take(f"closing its {type(part).__name__}", part.close)
         steps.take("stopping its callbacks", self.stop_callbacks)
         steps.take("closing its streams", self.publishers.close_all)
@@ -134,6 +139,7 @@ class RegistrarActor(RegistrarBase):
             steps.take("telling who unloads, or has given a command", waiter, down)
         steps.take("closing its catalog", self._close_catalog, erase)
         self.lock_in_use(in_use=False)
+        steps.take("reporting its end", self.end_life, report)
         steps.end(f"registrar {self.name!r}: not closed altogether")
 
     def _close_catalog(self, erase: bool) -> None:
@@ -151,9 +157,9 @@ class RegistrarActor(RegistrarBase):
         """Close the registrar after a defect. Its supervisor starts it again from its catalog."""
         logger.critical("registrar %s: failed", self.name, exc_info=error)
         self._why_down = "closed after a defect, which the log has; open it again: its catalog is as it was"
-        self.close()
-        if self.on_failure is not None:
-            self.on_failure(error)
+        self.close(report=abnormal(raised_by(error)))
+        if self.on_defect is not None:
+            self.on_defect(error)
         else:  # no supervisor starts it; it may be opened again
             self.node.close_registrar(self.name, Presence.DORMANT)
 
@@ -332,11 +338,11 @@ class RegistrarActor(RegistrarBase):
         """Load nothing for others any more; `own`: nor for this registrar. Callers get `why` in their error."""
         text = f"registrar {self.name!r}: loads nothing any more, as {why}"
         failure = Failure("RegistrarDown", text, {"registrar": self.name, "status": "stopped"})
-        self.monitor.run(c.BeginClosing(failure, own))
+        self.run(c.BeginClosing(failure, own))
 
     def end_closing(self) -> None:
         """Have the catalog keep only what is still to be released; raise CatalogError if that cannot be written."""
-        self.monitor.run(c.EndClosing())
+        self.run(c.EndClosing())
 
     def busy(self) -> bool:
         """Return whether a load or unload is in flight on either side."""

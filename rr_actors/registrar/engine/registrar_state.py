@@ -1,7 +1,6 @@
-"""The catalog of one registrar, in memory and on disk, the lock that guards it, and the fast paths under that lock.
+"""The catalog of one registrar, in memory and on disk, and the decisions of senders that take the registrar's turn.
 
-Under the lock no user code runs, nothing is pickled and no message is sent. A thread that has the lock never waits, and
-never takes the lock of another registrar.
+The lock of the actor (actors/turns.py) guards the catalog.
 
     with state.enter():
         catalog = state.whole()
@@ -14,18 +13,14 @@ whole().
 
 from __future__ import annotations
 
-import functools
 import itertools
-import os
-import signal
 import threading
-import time
 from asyncio import AbstractEventLoop
-from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from typing import Protocol
 
+from rr_actors.actors.turns import TurnActor, may_be_interrupted
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError, RegistrarDown, RrError
 from rr_actors.registrar.core import holding
@@ -40,63 +35,11 @@ from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision
 from rr_actors.registrar.model.messages import Load, Loaded, Unload, Unloaded
 from rr_actors.registrar.model.rows import LOADING, OK, PENDING, Drop, Held, Phase, Put, Resource
 from rr_actors.registrar.model.store import Store
-from rr_actors.runtime.thread_rules import on_loop, with_lock
+from rr_actors.runtime.thread_rules import with_lock
 from rr_actors.runtime.workers import Workers
 
 LoadWaiter = Callable[[Held | None, RrError | None], None]
 UnloadWaiter = Callable[[RrError | None], None]
-
-
-_LOCKS = 16
-"""The most locks of the registrars of one process. More registrars share them, so that is_deciding() looks at few."""
-
-
-class _Locks:
-    """The locks of this process's open registrars. Used on the loop, except for `owned`.
-
-    Attributes:
-        owned: for each, a function that says whether the calling thread has it. The tuple is replaced as a whole.
-    """
-
-    def __init__(self) -> None:
-        self.owned: tuple[Callable[[], bool], ...] = ()
-        self._users: dict[threading.RLock, int] = {}
-        self._turn = itertools.count()
-
-    def choose(self) -> threading.RLock:
-        """Return a lock for one registrar more: a new one, or one that some share."""
-        if len(self._users) < _LOCKS:
-            return threading.RLock()
-        return list(self._users)[next(self._turn) % _LOCKS]
-
-    def count(self, lock: threading.RLock, change: int) -> None:
-        """Note that so many registrars more use a lock."""
-        users = self._users.get(lock, 0) + change
-        if users:
-            self._users[lock] = users
-        else:
-            del self._users[lock]
-        if users in (0, change):  # the last has gone, or the first has come
-            self.owned = tuple(_owned_of(lock) for lock in self._users)
-
-
-def _owned_of(lock: threading.RLock) -> Callable[[], bool]:
-    return lock._is_owned  # type: ignore[attr-defined]  # as in threading
-
-
-_locks = _Locks()
-os.register_at_fork(after_in_child=_locks.__init__)  # another thread may have had one of them, and is not in the child
-
-
-def is_deciding() -> bool:
-    """Return whether the calling thread has the lock of any registrar of this process.
-
-    A finalizer (__del__) must not wait if so: the garbage collector runs it anywhere, also in the middle of a decision.
-    """
-    for is_owned in _locks.owned:  # noqa: SIM110 - any() takes longer
-        if is_owned():
-            return True
-    return False
 
 
 def answered_by_line(_error: RrError | None) -> None:
@@ -125,40 +68,41 @@ class StopEvent(threading.Event):
             self.cancel()
 
 
-class RegistrarState:
+class Asked(Protocol):
+    """The query that a thread is about to load."""
+
+    id: str
+    registrar: str
+    server: str
+    parent: str
+
+
+class RegistrarState(TurnActor):
     """The catalog of one registrar, in memory and on disk.
 
     Attributes:
-        lock: held by the thread that decides, or that reads more than one entry. enter() returns it. Registrars of one
-            process share locks if there are many.
-        is_inside: whether the calling thread has the lock; is_deciding() asks it.
-        closed: whether the registrar is closed; then nothing is decided any more.
-        waiting: the messages and commands that are not decided yet (monitor.py). One of a thread waits behind them.
+        lock: the turn, held by the thread that decides, or that reads more than one entry. enter() returns it.
         commits: the disk, and which changes are still to be written.
         sequence: the running numbers of queries, in the order in which they are asked for. Releases go newest first.
         loads, unloads: by query, the callback that hears how its load, or its release, ended.
         stops: by resource, phase and attempt of a callback that runs, the event that tells it to stop.
     """
 
+    taken_by_senders = True
+
     def __init__(
         self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
     ) -> None:
         self.name = name
         self.config = config
-        self.lock = _locks.choose()
-        self._count_users = functools.partial(_locks.count, self.lock)
-        self._is_user = False
         self.commits = CommitLog(name, config, store, loop, workers, self.lock)
-        self.is_inside = _owned_of(self.lock)
         self.epoch = store.epoch
         self.catalog = self.stored_catalog()
-        self.waiting: deque[Item] = deque()
         self.sequence = itertools.count(self.catalog.since + 1)
         self.loads: dict[str, LoadWaiter] = {}
         self.unloads: dict[str, UnloadWaiter] = {}
         self._stops: dict[str, dict[tuple[Phase, int], StopEvent]] = {}  # of runs of callbacks, by resource
         self._loads_over: dict[str, threading.Event] = {}  # set when a load is over, by resource
-        self.closed = False
         self._why_down = "closed"
 
     def stored_catalog(self) -> Catalog:
@@ -170,13 +114,6 @@ class RegistrarState:
         catalog = Catalog(self.name, self.commits.content(), self.epoch)
         catalog.max_priority = self.config.max_priority
         return catalog
-
-    @on_loop
-    def lock_in_use(self, *, in_use: bool) -> None:
-        """Have is_deciding() ask this lock from now on, or no longer."""
-        if in_use != self._is_user:
-            self._is_user = in_use
-            self._count_users(1 if in_use else -1)
 
     def enter(self) -> AbstractContextManager[object]:
         """Return the lock, for a `with` statement.
@@ -299,21 +236,7 @@ class RegistrarState:
         """Return the error that callers of a closed registrar get."""
         return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
 
-
-# -- decisions about one row -------------------------------------------------------------------------------------------
-
-
-class Asked(Protocol):
-    """The query that a thread is about to load."""
-
-    id: str
-    registrar: str
-    server: str
-    parent: str
-
-
-class DirectPaths(RegistrarState):
-    """The catalog of one registrar, with the fast paths of threads that load and release by their own direct lines."""
+    # -- decisions about one row: the sender takes the turn ------------------------------------------------------------
 
     def join(self, load: Load) -> Loaded | None:
         """Decide a Load by the fast path, and write its row. Return None if it has to be decided like any message.
@@ -450,50 +373,3 @@ class DirectPaths(RegistrarState):
                 if not self.commits.saving:
                     self.commits.save_soon()
             return gone
-
-
-# -- interruptions -----------------------------------------------------------------------------------------------------
-#
-# A Python signal handler may run in the main thread between any two of its instructions. It may stop the system, or
-# make another call that waits for the loop. So the thread must not hold a lock then that the loop needs. By default the
-# only handler is that of Ctrl-C, which raises.
-
-CATCHABLE_SIGNALS = tuple(signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP})
-_LOOK_AGAIN_S = 0.05  # asking for all handlers takes some 40 us
-
-
-class _Interruptions:
-    def __init__(self) -> None:
-        self.main = threading.main_thread().ident
-        self.look_at = 0.0
-        self.found = False
-
-
-_interruptions = _Interruptions()
-
-
-def runs_handlers() -> bool:
-    """Return whether signal handlers run in the calling thread, at least that of Ctrl-C, which raises."""
-    return threading.get_ident() == _interruptions.main
-
-
-def may_be_interrupted() -> bool:
-    """Return whether a handler other than that of Ctrl-C may interrupt the calling thread; up to 50 ms old."""
-    if threading.get_ident() != _interruptions.main:
-        return False
-    now = time.monotonic()
-    if now >= _interruptions.look_at:
-        _interruptions.found = any(_waits(signal.getsignal(number)) for number in CATCHABLE_SIGNALS)
-        _interruptions.look_at = now + _LOOK_AGAIN_S
-    return _interruptions.found
-
-
-def _waits(handler: object) -> bool:
-    return callable(handler) and handler is not signal.default_int_handler
-
-
-def _look_who_is_main() -> None:
-    _interruptions.main = threading.main_thread().ident  # in a forked child it is the thread that forked
-
-
-os.register_at_fork(after_in_child=_look_who_is_main)

@@ -50,8 +50,8 @@ from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.registrar.core.callback_runs import deaths_of, is_given_up, running
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.fields import annotated_types, by_fields, field_names, hints_of
-from rr_actors.registrar.engine.monitor import RegistrarBase
 from rr_actors.registrar.engine.progress import checked
+from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.status import Status, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
@@ -547,7 +547,7 @@ class ServerActor:
         if self.too_long(resource, response) is not None or (reports.loads and not reports.forget_sent(resource.id)):
             return False
         self._let_in(resource)
-        is_decided = self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
+        is_decided = self.registrar.decide_here(c.LoadDone(resource.id, resource.attempt, response))
         if is_decided:
             self.load_times.take(began_s, failed=False)
         return is_decided
@@ -618,7 +618,7 @@ class ServerActor:
 
         def at_once(_result: None) -> bool:
             self.registrar.publishers.close(resource.id)
-            return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
+            return self.registrar.decide_here(c.UnloadDone(resource.id, resource.tries))
 
         done = functools.partial(self._unload_ended, resource)
         start = functools.partial(self._submit, UNLOAD, resource, resource.tries, done, at_once=at_once)
@@ -1106,11 +1106,11 @@ class Servers:
             if registrar.closed or link_of(sender) is not link:  # the consumer sends it again over the next link
                 return
             if self.get(load.server) is not server:  # unregistered meanwhile, and perhaps registered anew
-                registrar.monitor.receive(load, sender)
+                registrar.receive(load, sender)
                 return
             if error is not None:
                 read = c.RefuseLoad(sender, load.query_id, failure_of(error))
-            registrar.monitor.put(read, sender if type(read) is Load else None)
+            registrar.deliver(read, sender if type(read) is Load else None)
             registrar.progress.greet(sender, load.query_id)
 
         try:

@@ -10,10 +10,10 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
+from rr_actors.actors.turns import may_be_interrupted
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.base.reporting.log import Log
-from rr_actors.registrar.engine.monitor import RegistrarBase
-from rr_actors.registrar.engine.registrar_state import may_be_interrupted
+from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
@@ -137,7 +137,7 @@ class Consumers:
         others: Sequence[Message] = ()
         match message:
             case Loaded():
-                self._provider.monitor.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
+                self._provider.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
                 others = (self._provider.refusal(message, error),)
             case Fetched(queries=[_, _, *_] as rows):
                 half = len(rows) // 2
@@ -179,7 +179,7 @@ class Consumers:
                 return
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
-            self._provider.monitor.receive(message, origin, more=link.more)
+            self._provider.receive(message, origin, more=link.more)
             if type(message) is Load:
                 self._provider.progress.greet(origin, message.query_id)
 
@@ -225,7 +225,7 @@ class Consumers:
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message, self._provider.catalog.refused)
             line.open_outlet()
-        self._provider.monitor.receive(message, origin, more=more)
+        self._provider.receive(message, origin, more=more)
 
     def received_here(self, line: Any, message: Any) -> None:
         """Decide a message of a thread of this process, behind a command that the thread may have posted before."""
@@ -241,7 +241,7 @@ class Consumers:
             return None
         if type(message) is Load:
             return self._provider.join(message)
-        if type(message) is Unload and not self._provider.gathers() and not self._provider.node.dispatcher.is_behind():
+        if type(message) is Unload and not self._provider.gathers and not self._provider.node.dispatcher.is_behind():
             return self._provider.leave(message)
         return None
 

@@ -1,4 +1,8 @@
-"""ProviderLink: a registrar's link to one provider. It finds the provider, connects, reconciles, and reconnects.
+"""ProviderLink: a registrar's client, the actor that has its link to one provider.
+
+It finds the provider, connects, reconciles, and reconnects. Its mailbox takes what its registrar has for the provider:
+requests, and the wishes to connect, to know a server's types or all queries held there. It sends to its registrar what
+comes from the provider.
 
 While anything is asked, held or owed at the provider, it keeps trying: a provider that is being respawned is back
 within milliseconds. It has no queue: open messages can be made from the rows, and reconciling sends them again.
@@ -13,16 +17,20 @@ from __future__ import annotations
 import asyncio
 import functools
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import msgspec
+
+from rr_actors.actors.turns import CLOSED, Delivery, TurnActor
 from rr_actors.base.errors import CatalogError, RegistrarDown, RrError, Unavailable, UnknownRegistrar
-from rr_actors.base.names import ServerId, new_id
+from rr_actors.base.names import PROVIDERS, ServerId, new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.failure import failure_of
-from rr_actors.registrar.engine.monitor import RegistrarBase
+from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import digests
+from rr_actors.registrar.model.effects import Connect, SendRequest
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
@@ -30,6 +38,7 @@ from rr_actors.registrar.model.messages import (
     Fetched,
     FetchedQuery,
     Gone,
+    Load,
     Loaded,
     LoadRefused,
     Noticed,
@@ -61,9 +70,22 @@ _A_PROVIDERS = _ANSWERS | {Fetched, Noticed}  # and the side messages (ProviderL
 Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
 
 
+class ListQueries(msgspec.Struct, frozen=True, eq=False):
+    """Ask for the queries that the registrar holds at the provider; `done` gets them, or the error."""
+
+    done: Fetching
+
+
+class LearnTypes(msgspec.Struct, frozen=True):
+    """Ask for a server's types, unless this link has brought them; `at_once`: do not wait for other messages."""
+
+    server: str
+    at_once: bool
+
+
 @on_loop
-class ProviderLink:
-    """The link of one registrar to one provider.
+class ProviderLink(TurnActor):
+    """The client of one registrar for one provider.
 
     Attributes:
         link: the present one; `opened` is the number of the Fetch that opened the last one.
@@ -97,6 +119,56 @@ class ProviderLink:
             Described: self._take_types,
             Progressed: functools.partial(self._registrar.listeners.hear, provider),
         }
+        self._unflushed: Link | None = None  # a link with unsent requests
+
+    # -- the handler ---------------------------------------------------------------------------------------------
+
+    def handle(self, deliveries: Sequence[Delivery]) -> None:
+        """Do what the registrar wants of its provider."""
+        for delivery in deliveries:
+            match delivery.message:
+                case SendRequest() as wanted:
+                    self._request(wanted)
+                case Connect():
+                    self._want()
+                case LearnTypes(server, at_once):
+                    self._describe(server, at_once=at_once)
+                case ListQueries(done):
+                    self._fetch(done)
+                case other:
+                    raise TypeError(f"{self.actor_ref}: unknown message {type(other).__name__}")
+
+    def flush(self) -> None:
+        """Send the requests that wait, together."""
+        if self._unflushed is not None:
+            link, self._unflushed = self._unflushed, None
+            link.flush()
+
+    def _request(self, wanted: SendRequest) -> None:
+        link, registrar = self.link, self._registrar
+        if link is None:
+            self._want()
+            return
+        if registrar.catalog.up.get(self.provider) != self.opened:
+            return  # decided for an earlier link: reconciling this one sends all open messages again
+        try:
+            if type(wanted.message) is Load:
+                self._describe(wanted.message.server)
+            link.send(wanted.message)
+        except RrError as error:
+            self._not_sent(link, wanted, error)
+            return
+        if self._node.watched.level[0] > 1:
+            registrar.recorder.message("sent", registrar.name, self.provider, wanted.message)
+        self._unflushed = link
+
+    def _not_sent(self, link: Link, wanted: SendRequest, error: RrError) -> None:
+        registrar = self._registrar
+        if type(wanted.message) is Load:
+            registrar.post(c.GiveUp(wanted.message.query_id, failure_of(error)))
+            return
+        logger.error("%s: %s; closing the link, what is open is sent again over the next", registrar.name, error)
+        link.close()
 
     # -- for threads ---------------------------------------------------------------------------------------------
 
@@ -120,7 +192,10 @@ class ProviderLink:
     # -- for the registrar ---------------------------------------------------------------------------------------
 
     def want(self) -> None:
-        """Open a link if there is none; if that is impossible, post PeerGone with the reason."""
+        """Have a link opened if there is none; if that is impossible, the registrar gets PeerGone with the reason."""
+        self.deliver(Connect(self.provider))
+
+    def _want(self) -> None:
         self._asked = True
         if self.link is None and self._task is None and not self._registrar.closed:
             self._task = self._node.dispatcher.loop.create_task(self._connect())
@@ -128,7 +203,7 @@ class ProviderLink:
     def link_again(self) -> None:
         """Close the link and open another, over which the provider lists again what is held there."""
         self._drop_link()
-        self.want()
+        self._want()
 
     def _drop_link(self) -> None:
         link, self.link = self.link, None
@@ -136,25 +211,23 @@ class ProviderLink:
         if link is not None:
             link.close()
 
-    def describe(self, server: str, *, at_once: bool = False) -> None:
-        """Ask for a server's types, unless this link has brought them; `at_once`: do not wait for other messages."""
+    def _describe(self, server: str, *, at_once: bool = False) -> None:
         if self.link is None:
             self.undescribed.add(server)
-            self.want()
+            self._want()
         elif server not in self._described:
             self.undescribed.add(server)  # until the answer is there: this link may break before
             self.link.send(Describe(server))
             if at_once:
                 self.link.flush()
 
-    def fetch(self, done: Fetching) -> None:
-        """Ask for the queries that this registrar holds at the provider; `done` gets them, or the error."""
+    def _fetch(self, done: Fetching) -> None:
         if self._registrar.closed:
             done(None, self._registrar.down())
             return
         self._fetching.append(done)
         if self.link is None:
-            self.want()
+            self._want()
         elif self._reconciled and len(self._fetching) == 1:  # else the next Fetch is sent when the last is answered
             self._send_fetch(self.link, resume=False)
 
@@ -173,6 +246,8 @@ class ProviderLink:
             self._task = None
         self._drop_link()
         self._end_fetches(self._registrar.down())
+        self.closed = True
+        self.end_life(CLOSED)
 
     # -- connecting ----------------------------------------------------------------------------------------------
 
@@ -296,7 +371,7 @@ class ProviderLink:
         if self._node.watched.level[0] > 1:
             self._registrar.recorder.message("received", self._registrar.name, self.provider, message)
         if kind in _ANSWERS or (kind is Noticed and self._reconciled):
-            self._registrar.monitor.receive(message, self.provider, more=link.more)
+            self._registrar.receive(message, self.provider, more=link.more)
         elif kind is Fetched:
             self._fetched(link, message)
         elif kind in self._side:
@@ -359,7 +434,7 @@ class ProviderLink:
         self._registrar.post(c.LinkLost(self.provider))
         if self._registrar.catalog.needs(self.provider) or self._fetching:
             asked = self._asked
-            self.want()
+            self._want()
             self._asked = asked  # unchanged: if no caller asks, it is no error that the provider is stopped
 
 
@@ -371,7 +446,10 @@ class ProviderLinks(dict[str, ProviderLink]):
         self._registrar = registrar
 
     def __missing__(self, provider: str) -> ProviderLink:
-        client = self[provider] = ProviderLink(self._registrar, provider)
+        registrar = self._registrar
+        path = f"{registrar.actor_ref.path}/{PROVIDERS}/{provider}"
+        client = self[provider] = ProviderLink.made(path, registrar, provider)
+        client.begin_life(registrar.node.dispatcher, registrar.node.hub)
         return client
 
 
@@ -391,7 +469,7 @@ class ServerTypes:
             told()
             return
         self._wanting.setdefault(str(server), []).append(told)
-        self._clients[server.registrar].describe(server.server, at_once=True)
+        self._clients[server.registrar].deliver(LearnTypes(server.server, at_once=True))
 
     def described(self, server: str, blob: bytes) -> None:
         """Keep the types that a provider has sent, and call the callers that wait for them."""

@@ -1,0 +1,191 @@
+"""Registrars and their clients are actors: a mailbox and a turn, a reference with a path, a monitor, dead letters."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pykka
+import pytest
+
+import rr_actors as rr
+from rr_actors.actors.messaging.mailbox import Mailbox
+from rr_actors.actors.turns import TurnActor
+from support import REPOSITORY
+from support_inside import actor_of, on_loop
+
+LIMIT_S = 20.0
+PAGE = REPOSITORY / "docs" / "life-of-a-load.md"
+
+
+class Cameras(rr.Manager):
+    """Serves cameras in a process of its own."""
+
+    @rr.server("camera")
+    def camera(self, request: str) -> str:
+        return f"{request} is open"
+
+
+class Asker(rr.Actor):
+    """Asks another process's registrar for what it does not take."""
+
+    def on_receive(self, message: Any) -> Any:
+        try:
+            return message.ask("open")
+        except rr.UsageError as error:
+            return str(error)
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Iterator[rr.System]:
+    children = [rr.ChildSpec(Cameras, id="cameras"), rr.ChildSpec(Asker, id="asker")]
+    with rr.System(children, state_dir=tmp_path) as running:
+        yield running
+
+
+@pytest.fixture
+def app(system: rr.System) -> rr.Registrar:
+    return system.open_registrar("app")
+
+
+@pytest.fixture
+def delivered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """What mailboxes of this process's registrars and clients took from now on: the actor's path and the message."""
+    found: list[tuple[str, str]] = []
+    deliver = TurnActor.deliver
+
+    def noted(actor: TurnActor, message: Any, sender: str | None = None, *, more: bool = False) -> None:
+        found.append((str(actor.actor_ref.path), type(message).__name__))
+        deliver(actor, message, sender, more=more)
+
+    monkeypatch.setattr(TurnActor, "deliver", noted)
+    return found
+
+
+def test_a_registrar_and_its_client_of_a_provider_are_actors_with_a_mailbox(app: rr.Registrar) -> None:
+    app.load("cameras/camera", "front")
+    registrar = actor_of(app)
+    for actor, path in ((registrar, "app"), (registrar.client("cameras"), "app/clients/cameras")):
+        assert isinstance(actor, pykka.Actor)
+        assert isinstance(actor.actor_inbox, Mailbox)
+        assert len(actor.actor_inbox) == 0
+        assert actor.actor_ref.path == path
+        assert actor.actor_ref.is_alive()
+
+
+@pytest.mark.parametrize("path", ["cameras/registrar", "root/cameras/registrar", "app", "app/clients/cameras"])
+def test_a_system_finds_them_by_their_paths(system: rr.System, app: rr.Registrar, path: str) -> None:
+    app.load("cameras/camera", "front")
+    ref = system.ref(path)
+    assert ref.is_alive()
+    assert str(ref) == path or str(ref) == f"root/{path}"
+    assert issubclass(ref.actor_class, pykka.Actor)
+
+
+def test_a_name_that_no_actor_has_is_still_not_found(system: rr.System, app: rr.Registrar) -> None:
+    for path in ("other", "app/other", "cameras/other"):
+        with pytest.raises(rr.NotFound):
+            system.ref(path)
+
+
+def test_a_monitor_hears_that_a_registrar_was_closed_and_then_that_it_is_not_there(
+    system: rr.System, app: rr.Registrar
+) -> None:
+    ref = system.ref("app")
+    with rr.monitor(ref) as monitor:
+        app.close()
+        down = monitor.wait(LIMIT_S)
+    assert down is not None
+    assert down.reason == "shutdown"
+    assert not ref.is_alive()
+    again = rr.monitor(ref).wait(LIMIT_S)
+    assert again is not None
+    assert again.reason == "noproc"
+
+
+def test_a_monitor_hears_that_the_process_of_a_managers_registrar_was_killed(system: rr.System) -> None:
+    with rr.monitor(system.ref("cameras/registrar")) as monitor:
+        system.ref("cameras").kill()
+        down = monitor.wait(LIMIT_S)
+    assert down is not None
+    assert down.reason in ("killed", "abnormal")
+
+
+@pytest.mark.parametrize("path", ["app", "cameras/registrar"])
+def test_it_refuses_what_is_no_message_of_a_registrar(system: rr.System, app: rr.Registrar, path: str) -> None:
+    with pytest.raises(rr.UsageError, match="takes messages of registrars alone"):
+        system.ref(path).ask("open")
+    assert "takes messages of registrars alone" in system.ref("asker").ask(system.ref(path))
+    assert system.ref(path).is_alive()
+
+
+def test_a_told_message_that_it_does_not_take_is_a_dead_letter(system: rr.System, app: rr.Registrar) -> None:
+    before = system.dead_letters().count
+    system.ref("app").tell("open")
+    on_loop(app, lambda: None)
+    letters = system.dead_letters()
+    assert letters.count == before + 1
+    assert letters.letters[-1].to == "app"
+
+
+def test_it_is_not_stopped_by_its_reference_as_it_ends_with_its_owner(system: rr.System, app: rr.Registrar) -> None:
+    with pytest.raises(rr.UsageError, match="is a part of another actor"):
+        system.ref("app").stop(timeout=LIMIT_S)
+    assert app.load("cameras/camera", "front").response == "front is open"
+
+
+def test_a_load_over_the_loop_puts_the_messages_into_mailboxes_that_the_page_lists(
+    system: rr.System, app: rr.Registrar, delivered: list[tuple[str, str]]
+) -> None:
+    near = system.open_registrar("near")
+    near.register_server("thing", lambda request: request)
+    app.load("near/thing", "the first makes the link")
+    del delivered[:]
+    app.load("near/thing", "x", block=False).get(timeout=LIMIT_S)
+    section = PAGE.read_text().partition("## The messages of a load")[2].partition("\n## ")[0]
+    assert delivered == re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", section, re.MULTILINE)
+
+
+def test_a_thread_that_joins_takes_the_turn_and_puts_nothing_into_a_mailbox(
+    system: rr.System, app: rr.Registrar, delivered: list[tuple[str, str]]
+) -> None:
+    near = system.open_registrar("near")
+    near.register_server("thing", lambda request: request)
+    app.load("near/thing", "x")
+    app.load("near/thing", "x")
+    del delivered[:]
+    query: list[rr.Query[Any]] = []
+    caller = threading.Thread(target=lambda: query.append(app.load("near/thing", "x")))
+    caller.start()
+    caller.join(LIMIT_S)
+    assert query[0].response == "x"
+    assert delivered == []
+
+
+@pytest.mark.parametrize("ways", ["over the loop", "by the turn of the sender", "by both"])
+def test_the_messages_of_one_sender_keep_their_order_over_both_ways(
+    system: rr.System, app: rr.Registrar, ways: str
+) -> None:
+    near = system.open_registrar("near")
+    order: list[str] = []
+    near.register_server(
+        "thing", lambda request: order.append(request) or request, unload=lambda request, _: order.append(request)
+    )
+    block: dict[str, Callable[[int], bool]] = {
+        "over the loop": lambda _: False,
+        "by the turn of the sender": lambda _: True,
+        "by both": lambda turn: turn % 2 == 0,
+    }
+    expected: list[str] = []
+    for turn in range(20):
+        name = f"thing {turn}"
+        waits = block[ways](turn)
+        query = (
+            app.load("near/thing", name) if waits else app.load("near/thing", name, block=False).get(timeout=LIMIT_S)
+        )
+        query.unload() if not waits else app.unload(query)
+        expected += [name, name]
+    assert order == expected
