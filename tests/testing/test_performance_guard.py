@@ -173,7 +173,7 @@ def committed(registrars: tuple[rr.Registrar, rr.Registrar], monkeypatch: pytest
 
     async def begin() -> None:
         for noted in range(5):  # what the fixture has begun comes to an end
-            await actor.monitor.next_change(0.01 * noted)
+            await actor.next_change(0.01 * noted)
         monkeypatch.setattr(actor.commits.store, "commit", counted)
 
     actor.node.dispatcher.run(begin(), timeout_s=30.0)
@@ -188,7 +188,7 @@ def arrive(actor: RegistrarActor, loads: int) -> int:
             for number, load in enumerate(itertools.islice(warm_loads(), loads)):
                 actor.receive(load, load.origin, more=number < loads - 1)
             while actor.waiting:
-                await actor.monitor.next_change(1.0)
+                await actor.next_change(1.0)
             return link.flushed
 
     return actor.node.dispatcher.run(run(), timeout_s=30.0)
