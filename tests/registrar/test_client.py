@@ -70,8 +70,9 @@ def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answ
     eventually(lambda: held_back.messages)
     second = app.load("provider/thing", "second")
     held_back.on = False
-    for what in (*[(client.deliver, ListQueries(hear))] * 2, (held_back.messages[0],)):
-        call(*what)
+    for _ in range(2):
+        call(client.deliver, ListQueries(hear))
+    call(held_back.messages[0])
 
     eventually(lambda: len(heard) == 3)
     assert heard == [[first.id], *[sorted((first.id, second.id))] * 2]

@@ -98,7 +98,7 @@ SCENES: dict[str, tuple[list[Item], Item]] = {
 }
 
 
-class State(RegistrarState):
+class KeptState(RegistrarState):
     """A registrar's state alone, without the loop's turns."""
 
     def handle(self, deliveries: Any) -> None:
@@ -112,7 +112,7 @@ class Stage:
         self.store = FullDisk()
         loop: Any = Loop()
         workers: Any = None
-        self.state = State("me", RegistrarConfig(name="me"), self.store, loop, workers)
+        self.state = KeptState("me", RegistrarConfig(name="me"), self.store, loop, workers)
         for item in before:
             self.state.commit([item])
 
