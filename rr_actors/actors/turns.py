@@ -144,6 +144,7 @@ class TurnActor(BaseActor, abc.ABC):
         self.is_inside = _owned_of(self.lock)
         self._count_users = functools.partial(_locks.count, self.lock)
         self._is_user = False
+        self._hub: ActorHub | None = None  # from the beginning of its life on
         self.waiting = self._mailbox.waiting
         self._busy = False  # the loop handles messages, or follows: a new message waits until it has finished
         self._scheduled = False  # a turn of the loop is scheduled
@@ -189,7 +190,8 @@ class TurnActor(BaseActor, abc.ABC):
 
         Deliveries that wait are dropped: their senders send them again, to the next incarnation.
         """
-        self._hub.remove(self._target.name, self.actor_ref, report)
+        if (hub := self._hub) is not None:  # else it has not begun
+            hub.remove(self._target.name, self.actor_ref, report)
         self.actor_stopped.set()
         left = self._mailbox.close()
         refuse_all([envelope for envelope in left if type(envelope) is not Delivery], self._target.name)
@@ -205,7 +207,7 @@ class TurnActor(BaseActor, abc.ABC):
         """Do what follows from the turns so far, in their order. On the loop, without the lock."""
 
     def on_receive(self, message: Any) -> Any:
-        """Refuse a message that is told or asked like any user's.
+        """Refuse a message that a user sends by tell or ask.
 
         Raises:
             UsageError: always.

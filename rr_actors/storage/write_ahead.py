@@ -153,7 +153,7 @@ def settled_before(folder: Folder, path: Path, spare: Spare, settled: int) -> in
     process may have the file open.
 
     Args:
-        spare: what a crash has left of it, taken up.
+        spare: what a crash has left of it, used again.
         settled: the last commit that the lock says the file has.
 
     Raises:

@@ -80,7 +80,7 @@ class ChildProcess:
     def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes, classes: list[bytes]) -> None:
         self.node = Node(info, path, on_event=self._tell, open_catalog=open_catalog, remove_unneeded=remove_catalogs)
         self.node.on_death_in_callback = lambda runs, proven: self._say(control.DiedInCallback(runs, proven))
-        self.node.on_acquitted = lambda: self._say(control.Acquitted())
+        self.node.on_acquitted = lambda: self._say(control.CallbacksAcquitted())
         self.node.on_resumed = self._resumed
         self._has_resumed = False
         self._health = ProcessHealth(self._directories)

@@ -251,7 +251,7 @@ class ProcessRun:
                 if not (self._up or self._died_before):
                     self._died_before = True
                     self.on_death_in_callback(message.runs, message.is_proven)
-            case control.Acquitted():
+            case control.CallbacksAcquitted():
                 self.on_acquitted()
             case control.News():
                 self._note(message.event)

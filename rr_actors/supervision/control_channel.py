@@ -95,7 +95,7 @@ class DiedInCallback(msgspec.Struct, tag=True, array_like=True, frozen=True):
     is_proven: bool = False
 
 
-class Acquitted(msgspec.Struct, tag=True, array_like=True, frozen=True):
+class CallbacksAcquitted(msgspec.Struct, tag=True, array_like=True, frozen=True):
     """All callbacks that ran when the child's last process died have run again, and the child lives."""
 
 
@@ -120,7 +120,7 @@ class News(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 Message = (Start | Stop | Ping | AskStacks) | (
-    ChildReady | Ignored | Failed | DiedInCallback | Acquitted | Resumed | Pong | FoundStacks | News | Exiting
+    ChildReady | Ignored | Failed | DiedInCallback | CallbacksAcquitted | Resumed | Pong | FoundStacks | News | Exiting
 )
 
 

@@ -44,7 +44,13 @@ def test_pools_are_read_from_a_file_or_taken_as_they_are(tmp_path: Path) -> None
         ("capacity = 100", "capacity = -1", "pool[0].capacity", "a number of at least 0", -1),
         ("capacity = 100", "capacity = inf", "pool[0].capacity", "a number of at least 0", math.inf),
         ("amount = 50", "amount = -5", "pool[0].reserve[0].amount", "a number of at least 0", -5),
-        ("amount = 50", "amont = 50", "pool[0].reserve[0].amont", "one of server, amount, request", "amont"),
+        (
+            "amount = 50",
+            "amont = 50",
+            "pool[0].reserve[0].amont",
+            "one of server, amount, request, least_on_s",
+            "amont",
+        ),
         ("amount = 50", 'amount = "5"', "pool[0].reserve[0].amount", "`float`", "5"),
         (
             "capacity = 2.5",

@@ -516,8 +516,6 @@ def test_shares_that_are_no_parts_are_a_share_each(house: House) -> None:
     house.app.load("budgets/share", Share("watts", 60))
     with pytest.raises(OverCapacity):
         house.devices.load("budgets/share", Share("watts", 60))
-    with pytest.raises(rr.RrError, match="instance: expected a name that no other request has"):
-        house.app.load("budgets/share", {"pool": "watts", "amount": 1})
 
 
 def test_a_grace_without_an_end_is_one(start: Start) -> None:

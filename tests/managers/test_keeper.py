@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import resource
 import threading
@@ -481,7 +482,7 @@ def test_a_defect_of_the_loop_is_logged_and_the_keeper_starts_again(
     system = start(rr.ChildSpec(Defective, id="keeper", args=args, placement="thread"))
     keeper = system.ref("keeper").proxy()
     Defective.shows.set()
-    with pytest.raises(ValueError, match="a defect"):
+    with contextlib.suppress(ValueError, rr.ActorDeadError):  # unless the loop has looked by itself before
         keeper.apply(str(tmp_path / "keep.toml")).get()
     assert eventually(lambda: [one.event for one in system.supervisor().history() if one.event == "restarted"])
     assert "ValueError: a defect" in caplog.text

@@ -601,8 +601,9 @@ def test_an_update_that_waits_to_be_written_is_not_the_first_that_is_written_of_
 
 def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     query = taken_up(app, watched, saved=True)
-    monkeypatch.setattr(type(actor_of(app)), "release", None)
-    query.unload()
+    with monkeypatch.context() as patch:
+        patch.setattr(type(actor_of(app)), "release", None)
+        query.unload()
     assert watched.found == [Hold.OWED]
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, cast
 
 import msgspec
-import pykka
 from msgspec import inspect
 
 from rr_actors.actors.messaging.futures import Reply
@@ -116,7 +115,7 @@ class Action(ABC):
 
         Raises:
             RrError: as Registrar.load().
-            LoadFailed: the action is told to stop while it waits: the load is withdrawn.
+            LoadFailed: the graph stops the action while it waits, which withdraws the load.
             UsageError: the action is isolated.
         """
         me, registrar = self._current, self._registrar
@@ -136,8 +135,8 @@ class Action(ABC):
         )
         loading = cast("Reply[Query]", begun)
         while not was_stopping and not loading.done():
-            with contextlib.suppress(pykka.Timeout):
-                return loading.get(timeout=_LOOK_S)
+            with contextlib.suppress(TimeoutError):
+                return loading.result(_LOOK_S)
             if self.stopping.is_set() and loading.cancel():
                 text = f"{name_of(type(self))}: it was told to stop while it waited for {server}: the load is withdrawn"
                 raise LoadFailed(text, server=server)

@@ -206,7 +206,7 @@ class Actions(Manager):
         Raises:
             NotFound: no graph of this id runs here. `.id`, `.known`
             Unavailable: the manager of an action has not confirmed within 5 s that the action is to stop, so it may run
-                on. It is told when that manager answers again.
+                on. That manager hears it when it answers again.
         """
         self._say(graph, Halt())
 
@@ -447,7 +447,7 @@ class Actions(Manager):
     def tell_run(self, actor: str, key: str, word: Word, step: int) -> Callable[[float], str]:
         """Tell a run what holds for it, here or in another manager. Return a function that waits until the run has it.
 
-        The manager of the run may not answer now. A run that begins there later asks first, and one that runs is told
+        The manager of the run may not answer now. A run that begins there later asks first, and one that runs hears it
         when the manager answers: each word has its step, so that none comes too late.
         """
         if actor and actor != self.registrar.name:

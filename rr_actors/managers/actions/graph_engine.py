@@ -166,7 +166,7 @@ class GraphEngine:
     def tell(self, event: Event, query: Query | None = None) -> list[str]:
         """Take an event: decide, commit, and do what follows from it.
 
-        Return what the managers of runs have not confirmed in time: what is told to them is told later.
+        Return what the managers of runs have not confirmed in time: they hear it later.
 
         Args:
             query: of the run that has ended. What it has loaded is released after the commit, and before others begin,

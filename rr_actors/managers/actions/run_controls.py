@@ -1,4 +1,4 @@
-"""Run controls: whether a run of an action may begin, and what it is told, in the manager that runs it.
+"""Run controls: whether a run of an action may begin, and what it hears, in the manager that runs it.
 
 The engine commits a stop or a pause, and then tells it to the run. The load of a run travels on another way, so it may
 arrive before that or after it. Therefore a run makes its control first, asks the engine what holds now, and begins

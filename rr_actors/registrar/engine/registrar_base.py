@@ -314,7 +314,7 @@ class RegistrarBase(RegistrarState, abc.ABC):
         self._changed.set()
 
     def on_receive(self, message: Any) -> Any:
-        """Refuse what is told or asked like a message of a user's.
+        """Refuse what a user sends by tell or ask.
 
         Raises:
             UsageError: always.
