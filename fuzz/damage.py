@@ -69,7 +69,7 @@ def _play(store: Store, registrar: str, commits: range, *, folding: bool) -> Non
     for number in commits:
         store.commit(_changes(registrar, number))
         if folding and number % 4 == 0:
-            (store.upkeep if number % 8 else store.tidy)()
+            store.tidy()
 
 
 def _closed(path: Path, registrar: str, witness: Witness, durability: Durability) -> None:
