@@ -648,7 +648,8 @@ class System:
             ActorUnavailable: a supervisor that may have the child is being respawned.
             pykka.Timeout: the process of such a supervisor has not answered within 60 s.
         """
-        path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
+        id = check_text(id, "ref: expected a child's id or path")
+        path, _, child_id = id.rpartition("/")
         part = self._running().part(id)
         if part is not None and path:
             return part

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from rr_actors.base.config import SystemConfig
+from rr_actors.base.errors import SupervisionError
 from rr_actors.base.reporting.log import Log
 from rr_actors.supervision.core.specs import Supervisor
 from rr_actors.system.system import System
@@ -56,6 +57,8 @@ def run_tree(
                 system.wait()
     except _Told:
         return True
+    except SupervisionError:
+        return False  # the log has it
     ended = system.ended
     return ended is not None and ended.reason in ("normal", "shutdown") and ended.exception is None
 

@@ -86,12 +86,7 @@ class ClientQuery(Query[Response]):
         super().__init__(*place)
         self._lost = None
 
-    @property
-    def is_lost(self) -> bool:
-        """Whether the system has ended while the query was held."""
-        return self._lost is not None
-
-    def lose(self, error: NotRunning) -> None:
+    def _lose(self, error: NotRunning) -> None:
         """Note that the system has ended: what waits for a status or a frame raises the error."""
         self._lost = error
 
@@ -113,6 +108,15 @@ class ClientQuery(Query[Response]):
 
 
 _EARLY = 1000
+
+
+# For this package's own modules. As private names they stay out of an editor's list of names.
+lose = ClientQuery._lose  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def is_lost(query: ClientQuery) -> bool:
+    """Return whether the system has ended while the query was held."""
+    return query._lost is not None  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 class ClientViews:
@@ -195,7 +199,7 @@ class ClientViews:
             place = {"resource_id": query.resource_id, "query_id": query.id, "source": query.server_id}
             status = Status(State.FATAL, error.message, repeated=False, **place)
             status.reason = ENDED
-            query.lose(error)
+            lose(query, error)
             self._tell(query, own, status, None, released=True)
         self.forget("", "")
 
@@ -216,7 +220,7 @@ class ClientViews:
     def _hears(self, query_id: str) -> bool:
         if (held := self._held.get(query_id)) is None or not self.is_open():
             return False
-        return held[0].is_lost or self._is_connected()
+        return is_lost(held[0]) or self._is_connected()
 
     def _while_held(self, query_id: str, callback: StatusCallback) -> Callable[[Status], Coroutine[Any, Any, None]]:
         async def begin(status: Status) -> None:
