@@ -135,6 +135,7 @@ class TurnActor(BaseActor, abc.ABC):
     is_inside: Callable[[], bool]
     waiting: deque[PykkaEnvelope[Any]]
     _count_users: Callable[[int], None]
+    _hub: ActorHub | None
     gathers = False
     closed = False
 
@@ -144,7 +145,7 @@ class TurnActor(BaseActor, abc.ABC):
         self.is_inside = _owned_of(self.lock)
         self._count_users = functools.partial(_locks.count, self.lock)
         self._is_user = False
-        self._hub: ActorHub | None = None  # from the beginning of its life on
+        self._hub = None  # until its life begins
         self.waiting = self._mailbox.waiting
         self._busy = False  # the loop handles messages, or follows: a new message waits until it has finished
         self._scheduled = False  # a turn of the loop is scheduled

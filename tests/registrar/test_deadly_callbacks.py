@@ -224,7 +224,7 @@ def test_a_health_callback_that_ends_its_process_each_time_loses_the_resource_by
     lost = app.load("shop/probed", "health", on_status=hears)
     kept = [app.load("shop/probed", f"kept {number}") for number in range(3)]
     workshop.note("armed")
-    (status,) = hears.wait()
+    (status,) = hears.wait(timeout=40)  # it waits for 5 s in all, and four processes start
     assert status.state is rr.State.FATAL
     assert "shop/probed: the process died in each of 3 runs of the health callback" in status.message
     assert lost.resource_id in status.message
