@@ -22,7 +22,7 @@ StreamHappening = Literal["stream_opened", "stream_rebound", "stream_closed"]
 Place = tuple[object, ...]
 """Where in a response something is: the names and numbers that lead to it."""
 
-_ID = re.compile("[0-9a-f]{32}").fullmatch
+_ID = re.compile(r"[0-9a-f]{32}(\.\d+)?(\+\d+)?").fullmatch  # with the epoch of a provider that was respawned
 
 
 class Stream(msgspec.Struct, frozen=True):
