@@ -516,6 +516,9 @@ def test_shares_that_are_no_parts_are_a_share_each(house: House) -> None:
     house.app.load("budgets/share", Share("watts", 60))
     with pytest.raises(OverCapacity):
         house.devices.load("budgets/share", Share("watts", 60))
+    house.app.load("budgets/share", {"pool": "watts", "amount": 20})
+    house.devices.load("budgets/share", {"pool": "watts", "amount": 20})
+    assert house.pool().used == 100
 
 
 def test_a_grace_without_an_end_is_one(start: Start) -> None:

@@ -7,7 +7,7 @@ import msgspec
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import UsageError, shown
 from rr_actors.base.names import new_id
-from rr_actors.registrar.engine.server import current, current_or_none
+from rr_actors.registrar.engine.server import current_or_none
 
 
 def _whose() -> str:
@@ -30,7 +30,7 @@ class Share(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         wait_s: how many seconds it may wait for others to release theirs. Room that is being made by a reserve, or by
             others that are revoked, is waited for in any case. `timeout_s` of the load should be longer.
         instance: a name that distinguishes requests that are otherwise the same, which would be one share. By default
-            the resource whose callback makes the request; outside of callbacks each Share is one of its own.
+            the resource whose callback makes the request; outside of callbacks each request is one of its own.
         whose: for people, the name of what the share is for. By default that of the same resource.
     """
 
@@ -74,17 +74,10 @@ class PoolInfo(msgspec.Struct, frozen=True):
 
 
 def check_request(request: Share | Supply) -> None:
-    """Refuse a request whose numbers are wrong, or that would be the same one as somebody else's.
-
-    Raises:
-        UsageError: a number is wrong, or the request is a dict without an `instance`.
-    """
+    """Raise UsageError for a request whose numbers are wrong."""
     _check_number(request.amount, "amount")
     if isinstance(request, Share):
         _check_number(request.wait_s, "wait_s")
-    if request.instance == current().resource_id:  # made here, where the request was read
-        expected = "a name that no other request has; Share(...) and Supply(...) make one by themselves"
-        raise UsageError(f"instance: expected {expected}, got none", field="instance", expected=expected, got="")
 
 
 def _check_number(value: float, field: str) -> None:
