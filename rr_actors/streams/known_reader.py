@@ -176,9 +176,11 @@ class KnownReader:
         self._read()
         self._offered += 1
         if self.left or frame.number < self._last:  # of another thread, which was later
+            self._send()  # it may want the one that waits, as has just been read
             return False
         body = self._body_of(frame)
         if isinstance(body, str):
+            self._send()
             self._note(body)
             return False
         self._drop()
