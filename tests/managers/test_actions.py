@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -572,3 +574,37 @@ def test_a_class_without_run_is_refused_by_name() -> None:
 
     with pytest.raises(rr.UsageError, match=r"expected a class with a method run\(\), got Idle without one"):
         Actions(actions=[Idle])
+
+
+class Dies(Actions):
+    """Kills its process once, when a sub-graph is loaded and held, and the first step of that is to be written."""
+
+    def __init__(self, graphs: str, mark: str) -> None:
+        super().__init__(ALL, graphs)
+        self.mark = Path(mark)
+
+    def on_start(self) -> None:
+        write = self.registrar.update_response
+
+        def dies(id: Any, response: dict[str, Any], message: str = "") -> None:
+            if response.get("graph_name") == "inner" and not self.mark.exists():
+                assert eventually(lambda: any(query.resource_id == id for query in self.registrar.queries()))
+                self.mark.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            write(id, response, message)
+
+        self.registrar.update_response = dies  # type: ignore[method-assign]
+        super().on_start()
+
+
+def test_a_crash_between_the_load_of_a_sub_graph_and_its_first_step_holds_up_nothing(
+    start: Start, tmp_path: Path
+) -> None:
+    graphs, mark = tmp_path / "graphs", tmp_path / "mark"
+    graphs.mkdir()
+    inner = {"graph_name": "inner", "actions": [action("Relay", inputs={"text": "x"})]}
+    (graphs / "inner.json").write_text(json.dumps(inner))
+    system = start(rr.Supervisor([rr.ChildSpec(Dies, id="actions", args=(str(graphs), str(mark)))]))
+    ended = run_graph(system.open_registrar("app"), {"actions": [action("inner")]}, timeout_s=20)
+    assert ended.outputs == {"text": "x"}
+    assert mark.exists()

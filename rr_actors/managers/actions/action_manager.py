@@ -175,9 +175,18 @@ class Actions(Manager):
                 threading.Thread(target=query.unload, kwargs={"timeout_s": None}, daemon=True).start()
         found = [info for info in self.registrar.resources() if info.server == "graph" and info.phase == LOADED]
         graphs = [info for info in found if info.id not in self._engines]
-        go_on = [self._restored(info.id, info.request, info.response) for info in graphs]
-        for each in go_on:  # when all engines are there: a graph tells its sub-graphs again what it has told them
-            each()
+        lost: list[tuple[str, Status]] = []
+        begun = [info for info in graphs if run_in(info.response).steps]
+        engines = {info.id: self._restored(info.id, info.request, info.response, lost) for info in begun}
+        ends = self._ends()
+        for id, engine in engines.items():  # all of them are there: a graph tells its sub-graphs what it had told them
+            if engine is not None:
+                engine.restore(self.registrar.children(id), _key_of, ends)
+        for info in graphs:  # one that has not begun asks the graph around it: that would wait for it if it told it
+            if info.id not in engines and (engine := self._restored(info.id, info.request, info.response, lost)):
+                self._begin_graph(engine, info.request, _flat_inputs(engine.graph, info.request.inputs))
+        for id, status in lost:
+            self.registrar.send_status(id, status)
 
     def on_stop(self) -> None:
         """Tell all actions to end. Those whose graph is not released run again when the manager starts again."""
@@ -370,11 +379,19 @@ class Actions(Manager):
         inputs = checked_inputs(graph, _flat_inputs(graph, request.inputs))
         run = first_run(graph)
         engine = self._add(current().resource_id, request.instance, graph, run)
-        instance = request.instance
-        around = lambda: self._said(instance)[0] if instance.partition("/")[0] in self._engines else "run"  # noqa: E731
-        begins = Begin(inputs), current().loaded, around
-        threading.Thread(target=engine.begin, args=begins, name=f"graph {graph.name}", daemon=True).start()
+        self._begin_graph(engine, request, inputs, current().loaded)
         return feedback(graph, run)
+
+    def _begin_graph(
+        self, engine: GraphEngine, request: RunGraph, inputs: dict[str, Any], loaded: threading.Event | None = None
+    ) -> None:
+        """Have a graph begin in a thread of its own, as the graph around it says."""
+
+        def around() -> Word:
+            return self._said(request.instance)[0] if request.instance.partition("/")[0] in self._engines else "run"
+
+        begins = Begin(inputs), loaded, around
+        threading.Thread(target=engine.begin, args=begins, name=f"graph {engine.graph.name}", daemon=True).start()
 
     @load_graph.status
     def graph_status(self, request: RunGraph, status: Status) -> None:
@@ -398,21 +415,20 @@ class Actions(Manager):
             self._instances[instance] = id
         return engine
 
-    def _restored(self, id: str, request: RunGraph, response: dict[str, Any]) -> Callable[[], None]:
-        """Make the engine of a graph again, and return what goes on with it."""
+    def _restored(
+        self, id: str, request: RunGraph, response: dict[str, Any], lost: list[tuple[str, Status]]
+    ) -> GraphEngine | None:
+        """Make the engine of a graph again; None: it does not fit, and is put to what is lost."""
         try:
             run = run_in(response)
             graph = self._library.complete(read_graph(document_in(response)))
-            inputs = {} if run.steps else checked_inputs(graph, _flat_inputs(graph, request.inputs))
+            if not run.steps:
+                checked_inputs(graph, _flat_inputs(graph, request.inputs))
         except RrError as error:
             text = f"the graph does not fit the actions of this version: {error}"
-            return functools.partial(self.registrar.send_status, id, Status(State.FATAL, text))
-        engine = self._add(id, request.instance, graph, run)
-        if run.steps:
-            return lambda: engine.restore(self.registrar.children(id), _key_of, self._ends())
-        return threading.Thread(
-            target=engine.begin, args=[Begin(inputs)], name=f"graph {graph.name}", daemon=True
-        ).start
+            lost.append((id, Status(State.FATAL, text)))
+            return None
+        return self._add(id, request.instance, graph, run)
 
     def _ends(self) -> dict[str, tuple[str, dict[str, Any]]]:
         """Return the ends of actions that are on disk here."""

@@ -95,6 +95,11 @@ class GraphEngine:
             self._begun.set()
 
     @property
+    def graph(self) -> ActionGraph:
+        """The graph that is run now."""
+        return self._graph
+
+    @property
     def run(self) -> GraphRun:
         """The run as it is on disk."""
         return self._run
