@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import os
 import random
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -14,7 +16,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Actions, GraphError, RunGraph, run_graph
-from support import eventually, kill, wait_respawned
+from support import Calls, eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
 LIMIT_S = 60.0
@@ -71,7 +73,35 @@ class Gives(rr.Action):
         return {"path": Path("/a"), "raw": b"abc", "many": {1, 2}, "when": datetime.date(2026, 11, 28)}
 
 
-ACTIONS: list[type[rr.Action]] = [Moves, Step, Alone, Loads, Gives]
+class Takes(rr.Action):
+    """Notes what it is given, and dies the first time."""
+
+    def run(self, given: dict[str, Any]) -> None:
+        note(given, f"{given['raw']!r} {given['path']!r}")
+        if self.attempt == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Much(rr.Action):
+    def run(self, given: dict[str, Any]) -> dict[str, Any]:
+        return {f"much_{given['number']}": b"x" * 7_000_000}
+
+
+class Odd(rr.Action):
+    def run(self, given: dict[str, Any]) -> dict[str, Any]:
+        return {"odd": threading.Lock()}
+
+
+class Stays(rr.Action):
+    """Does not hear that it is to stop."""
+
+    def run(self, given: dict[str, Any]) -> None:
+        note(given, "began")
+        while not (Path(given["place"]) / "go").exists():
+            time.sleep(0.01)
+
+
+ACTIONS: list[type[rr.Action]] = [Moves, Step, Alone, Loads, Gives, Takes, Much, Odd, Stays]
 
 
 class World:
@@ -190,6 +220,43 @@ def test_outputs_keep_their_types(world: World) -> None:
     ended = run_graph(world.app, world.graph("Gives"), timeout_s=LIMIT_S)
     expected = {"path": Path("/a"), "raw": b"abc", "many": {1, 2}, "when": datetime.date(2026, 11, 28)}
     assert ended.outputs == expected
+
+
+def test_inputs_keep_their_types_also_in_the_attempt_after_a_crash(world: World) -> None:
+    inputs = {name: {"pvf_type": "any"} for name in ("raw", "path")}
+    place = {"place": {"pvf_type": "string", "pvf_value": str(world.place)}}
+    graph = {"actions": [{"name": "Takes", "input_parameters": {**inputs, **place}}]}
+    given = {"raw": b"abc", "path": Path("/a")}
+    assert run_graph(world.app, graph, inputs=given, timeout_s=LIMIT_S).result == "on_true"
+    assert world.lines() == ["b'abc' PosixPath('/a')"] * 2
+
+
+def test_an_end_that_cannot_be_kept_is_an_error_of_the_graph(world: World) -> None:
+    numbers = range(3)
+    actions: list[dict[str, Any]] = [
+        {"name": "Much", "instance_id": n, "input_parameters": {"number": {"pvf_type": "number", "pvf_value": n}}}
+        for n in numbers
+    ]
+    ends = [{"name": "Much", "instance_id": n} for n in numbers]
+    together = {"actions": actions, "graph_entry": ends, "graph_exit": ends}
+    ended = run_graph(world.app, together, timeout_s=LIMIT_S)
+    assert (ended.result, "its end cannot be kept" in ended.error) == ("on_error", True)
+    assert "frame_limit_bytes" in ended.error
+    ended = run_graph(world.app, {"actions": [{"name": "Odd"}]}, timeout_s=LIMIT_S)
+    assert (ended.result, "lock" in ended.error) == ("on_error", True)
+
+
+def test_an_action_that_does_not_stop_is_named_to_the_holders(world: World) -> None:
+    statuses = Calls()
+    request = RunGraph(world.graph("Stays"))
+    with world.app.load("actions/graph", request, on_status=statuses, timeout_s=LIMIT_S) as query:
+        eventually(lambda: world.lines() == ["began"], LIMIT_S)
+        world.say("stop_graph", query)
+        text = "Stays_0 has not ended within 1 s of stopping"
+        eventually(lambda: [one.message for one in statuses if one.state is rr.State.WARNING] == [text], LIMIT_S)
+        assert query.response["graph_state"] == "STOPPING"
+        (world.place / "go").touch()
+        state_is(query, "STOPPED")
 
 
 def test_a_graph_that_is_overdue_says_which_action_runs(world: World) -> None:

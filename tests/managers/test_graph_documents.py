@@ -131,6 +131,16 @@ WRONG: list[tuple[Callable[[Table], None], str, str]] = [
     ),
     (put(*TELL, "parents", 0, "conditions", value=["on_true -> walk"]), "actions[1].parents[0].conditions[0]", "walk"),
     (put(*TELL, "parents", 0, "conditions", value=["on_true"]), "actions[1].parents[0].conditions[0]", "got 'on_true'"),
+    (
+        put(*TELL, "parents", 0, "conditions", value=["on_true -> stop", "on_true -> run"]),
+        "actions[1].parents[0].conditions[1]",
+        "one response to on_true: stop, got",
+    ),
+    (
+        put(*TELL, "input_parameters", "words", "pvf_allowed_values", value=["yes", 0]),
+        "actions[1].input_parameters.words.pvf_allowed_values",
+        "values that are each a string, got 0",
+    ),
     (put(*TELL, "parents", value=[]), "actions[0].children[0]", "TaLook_0 among the parents of TaTell_2, got none"),
     (put(*LOOK, "children", value=[]), "actions[1].parents[0]", "TaTell_2 among the children of TaLook_0, got none"),
     (
@@ -190,6 +200,92 @@ def test_each_fault_is_named_with_its_place(
     assert (error.file, error.path) == (str(file), path)
     assert said in str(error)
     assert isinstance(error, (UsageError, LoadFailed))
+
+
+MISSPELT: list[tuple[tuple[Any, ...], str, str]] = [
+    ((), "graph_exits", "graph_exit"),
+    (LOOK, "acter", "actor"),
+    (LOOK, "childs", "children"),
+    (LOOK, "input_paramters", "input_parameters"),
+    (LOOK, "instanceid", "instance_id"),
+    (LOOK, "typ", "type"),
+    ((*LOOK, "children", 0), "instance", "instance_id"),
+    ((*LOOK, "output_parameters", "seen"), "pvf_valu", "pvf_value"),
+    ((*TELL, "parents", 0), "conditons", "conditions"),
+    ((*TELL, "parents", 0), "requird", "required"),
+    (("graph_entry", 0), "nam", "name"),
+]
+
+
+@pytest.mark.parametrize(("path", "key", "known"), MISSPELT, ids=[row[1] for row in MISSPELT])
+def test_a_misspelt_key_is_refused_and_a_foreign_one_is_kept(path: tuple[Any, ...], key: str, known: str) -> None:
+    document = copy.deepcopy(NEWER)
+    put(*path, "x_of_a_tool", value=1)(document)
+    assert read_graph(document).document == document
+    put(*path, key, value=False)(document)
+    with pytest.raises(GraphError, match=f"an unknown key; did you mean '{known}'") as raised:
+        read_graph(document)
+    assert raised.value.got == key
+    assert raised.value.path.endswith(key)
+
+
+@pytest.mark.parametrize("type_name", ["strng", "String", "nubmer", "numbrs", "boll"])
+def test_a_misspelt_type_is_refused_and_a_foreign_one_is_kept(type_name: str) -> None:
+    document = copy.deepcopy(NEWER)
+    put(*LOOK, "output_parameters", "count", "pvf_type", value="pose")(document)
+    check_graph(read_graph(document))
+    put(*LOOK, "output_parameters", "count", "pvf_type", value=type_name)(document)
+    with pytest.raises(
+        GraphError, match=r"output_parameters\.count\.pvf_type: .*; did you mean '(string|numbers?|bool)'"
+    ):
+        read_graph(document)
+
+
+def test_a_key_twice_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "twice.json"
+    file.write_text('{"actions": [{"name": "A", "name": "B"}]}')
+    with pytest.raises(GraphError, match=r"name: expected a key that its object has once, got it twice"):
+        read_graph_file(file)
+
+
+REQUIRED_PARENTS: list[tuple[Table, str, str]] = [
+    ({"A": "", "Z": "", "C": "A Z"}, "A", "actions[2].parents[1]"),  # nothing leads to Z
+    ({"A": "", "B": "A C", "C": "B", "D": "A"}, "", "actions[1].parents[1]"),  # B and C wait for each other
+    ({"A": "", "B": "A", "C": "B"}, "", ""),
+]
+
+
+@pytest.mark.parametrize(("parents", "entry", "path"), REQUIRED_PARENTS)
+def test_a_required_parent_that_can_never_end_is_refused(parents: Table, entry: str, path: str) -> None:
+    names = {name: text.split() for name, text in parents.items()}
+    children = {name: [other for other, above in names.items() if name in above] for name in names}
+    actions = [
+        {
+            "name": name,
+            "parents": [{"name": one} for one in above],
+            "children": [{"name": one} for one in children[name]],
+        }
+        for name, above in names.items()
+    ]
+    document = {"actions": actions, "graph_entry": [{"name": one} for one in entry], "graph_exit": [{"name": "C"}]}
+    graph = read_graph({**document, **({} if entry else {"graph_entry": [{"name": "A"}]})})
+    if not path:
+        check_graph(graph)
+        return
+    said = r"a required parent that can end as ._0 waits for it, got ._0, which never does"
+    with pytest.raises(GraphError, match=said) as raised:
+        check_graph(graph)
+    assert raised.value.path == path
+
+
+def test_a_required_exit_that_can_never_end_is_refused() -> None:
+    actions = [{"name": "A"}, {"name": "B"}]
+    entry, exit = [{"name": "A"}], [{"name": "A"}, {"name": "B"}]
+    with pytest.raises(GraphError, match=r"graph_exit\[1\]: expected a required parent"):
+        check_graph(read_graph({"actions": actions, "graph_entry": entry, "graph_exit": exit}))
+    check_graph(
+        read_graph({"actions": actions, "graph_entry": entry, "graph_exit": [exit[0], {**exit[1], "required": False}]})
+    )
 
 
 def test_a_name_twice_is_refused() -> None:

@@ -364,6 +364,28 @@ def test_a_join_whose_last_parent_is_taken_away_runs_and_an_exit_ends_the_graph(
     assert player.tell(Change(graph_of([("b", "c")], exits=["a"], entry=["a", "b"]))) == ["stop b", "stop c"]
 
 
+def test_a_new_child_of_an_action_that_has_ended_runs_as_its_relation_says() -> None:
+    before = graph_of([("a", "b"), ("b", "d")])
+    for conditions, begins in (("", ["run c"]), ("on_true -> ignore, on_false -> run", [])):
+        player = Player(before)
+        player.ends("a")
+        after: list[Edge] = [("a", "b"), ("b", "d"), ("a", "c", conditions), ("c", "d", "", bool(begins))]
+        assert player.tell(Change(graph_of(after, exits=["d"]))) == begins
+        assert player.ends("b") == ([] if begins else ["run d"])
+    player = Player(before)
+    player.ends("a", "on_false")
+    assert player.tell(Change(graph_of([*after[:2], ("a", "c", "on_true -> ignore, on_false -> run"), after[3]]))) == [
+        "run c"
+    ]
+
+
+def test_a_halted_graph_says_what_it_waits_for() -> None:
+    player = Player(graph_of([("a", "c"), ("b", "c", "on_true -> stop")], entry=["a", "b"]))
+    player.ends("a")
+    player.ends("b")
+    assert (player.run.state, player.run.why) == ("HALTED", "nothing runs: c_0 waits for b_0")
+
+
 def test_another_graph_altogether_begins_with_its_entries() -> None:
     player = Player(graph_of([("a", "b")]))
     assert player.tell(Change(graph_of([("c", "d"), ("e", "d")]))) == ["stop a"]

@@ -71,12 +71,28 @@ class Fail(rr.Action):
         return None
 
 
+def start_daemon(given: In) -> None:
+    """Start a process with a session of its own, as launchers of robots do."""
+    daemon = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"], start_new_session=True)
+    (Path(given.folder) / f"daemon-{daemon.pid}").touch()
+
+
+class Daemon(rr.Action):
+    """Ends by itself, and leaves a process behind."""
+
+    Input = In
+    isolate = True
+
+    def run(self, given: In) -> Any:
+        start_daemon(given)
+
+
 class Hang(rr.Action):
     Input = In
     isolate = True
 
     def run(self, given: In) -> Any:
-        subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"], start_new_session=True)
+        start_daemon(given)
         begun(given)
         hang()
 
@@ -99,7 +115,7 @@ class Wait(rr.Action):
         (Path(given.folder) / "stopped").touch()
 
 
-ACTIONS: list[type[rr.Action]] = [Where, Fail, Hang, Overdue, Wait]
+ACTIONS: list[type[rr.Action]] = [Where, Fail, Daemon, Hang, Overdue, Wait]
 
 
 class World:
@@ -126,6 +142,10 @@ class World:
 
         eventually(lambda: len(pids()) >= count, LIMIT_S, "a run")
         return pids()
+
+    def daemons(self) -> list[int]:
+        """Return the ids of the processes that the runs have started in sessions of their own."""
+        return [int(path.name.partition("-")[2]) for path in self.folder.glob("daemon-*")]
 
 
 @pytest.fixture
@@ -166,6 +186,24 @@ def test_whatever_ends_the_process_is_an_error_with_a_reason(world: World, how: 
     with pytest.raises(rr.LoadFailed, match=why):
         world.app.load("actions/action", RunAction("Fail", {"folder": "", "how": how}), timeout_s=LIMIT_S)
     assert world.run("Fail", how).result == "on_error"
+
+
+@pytest.mark.parametrize("how", ["it ends", "overdue", "released", "its manager dies"])
+def test_a_process_in_a_session_of_its_own_ends_with_the_run_that_has_started_it(world: World, how: str) -> None:
+    if how == "it ends":
+        assert world.run("Daemon").result == "on_true"
+    elif how == "overdue":
+        assert world.run("Overdue").result == "on_error"
+    else:
+        graph = world.app.load("actions/graph", RunGraph(world.graph("Hang")), timeout_s=LIMIT_S)
+        world.started()
+        if how == "its manager dies":
+            wait_respawned(world.system, "actions", kill(world.system, "actions"))
+            world.started(2)
+        graph.unload(timeout_s=LIMIT_S)
+    assert world.daemons()
+    for pid in world.daemons():
+        ends(pid)
 
 
 def test_a_run_that_hangs_is_killed_when_its_graph_is_released(world: World) -> None:

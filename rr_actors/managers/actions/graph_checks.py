@@ -6,7 +6,15 @@ from collections.abc import Collection, Mapping
 
 import msgspec
 
-from rr_actors.managers.actions.graph_model import ActionGraph, ActionNode, Parameter, wrong_graph
+from rr_actors.managers.actions.graph_model import (
+    EXIT,
+    RESULTS,
+    ActionGraph,
+    ActionNode,
+    Parameter,
+    ParentRelation,
+    wrong_graph,
+)
 from rr_actors.managers.actions.parameters import known_types
 
 
@@ -61,6 +69,7 @@ def _check_ways(graph: ActionGraph) -> None:
     """Check that there is a beginning, and a way out of each cycle of a graph that has an exit."""
     if not graph.entry:
         raise wrong_graph(graph.file, "graph_entry", "an action without parents, or a graph_entry", None)
+    _check_required(graph)
     if graph.dialect == 1:
         return  # it ends when nothing runs
     if not graph.exit:
@@ -74,6 +83,53 @@ def _check_ways(graph: ActionGraph) -> None:
         if name in below and below.isdisjoint(graph.exit):
             expected = f"a way out of the cycle to {', '.join(graph.exit)}"
             raise wrong_graph(graph.file, f"{graph.nodes[name].place}.children", expected, name)
+
+
+def _check_required(graph: ActionGraph) -> None:
+    """Check that each required parent of what the graph leads to can come to an end that is waited for."""
+    told = _results(graph)
+    for name in (*graph.nodes, EXIT):
+        relations = graph.parents_of(name)
+        if name in graph.entry or not any(told[parent] for parent in relations):
+            continue
+        for i, (parent, relation) in enumerate(relations.items()):
+            if relation.required and not _heard(relation, told[parent]):
+                place = f"graph_exit[{i}]" if name == EXIT else f"{graph.nodes[name].place}.parents[{i}]"
+                expected = f"a required parent that can end as {name} waits for it"
+                raise wrong_graph(graph.file, place, expected, parent, f"{parent}, which never does")
+
+
+def _results(graph: ActionGraph) -> dict[str, set[str]]:
+    """Return the results that each action can tell its children: its own, and those of parents that bypass it."""
+    told: dict[str, set[str]] = {name: set() for name in graph.nodes}
+    left = list(graph.nodes)
+    while left:
+        name = left.pop()
+        parents = graph.nodes[name].parents
+        can: set[str] = {*RESULTS} if _can_run(graph, name, told) else set()
+        for parent, relation in parents.items():
+            can |= {result for result in told[parent] if relation.conditions[result] == "bypass"}
+        if can != told[name]:
+            told[name] = can
+            left += graph.nodes[name].children
+    return told
+
+
+def _can_run(graph: ActionGraph, name: str, told: dict[str, set[str]]) -> bool:
+    parents = graph.nodes[name].parents
+    required = {parent: one for parent, one in parents.items() if one.required}
+    waits_for = required or parents
+    return name in graph.entry or (
+        all(_heard(one, told[parent]) for parent, one in required.items())
+        and any(
+            one.conditions[result] in ("run", "restart") for parent, one in waits_for.items() for result in told[parent]
+        )
+    )
+
+
+def _heard(relation: ParentRelation, results: set[str]) -> bool:
+    """Return whether one of these results counts as the end of a required parent."""
+    return any(relation.conditions[result] in ("run", "restart", "ignore") for result in results)
 
 
 def _check_remaps(graph: ActionGraph, node: ActionNode) -> None:

@@ -25,7 +25,7 @@ from rr_actors.managers.actions.graph_model import (
     ParentRelation,
     wrong_graph,
 )
-from rr_actors.managers.actions.parameters import SEPARATOR, is_of_type
+from rr_actors.managers.actions.parameters import SEPARATOR, is_of_type, likely_type
 
 _KEYS = {
     "graph": ("graph_name", "graph_description", "graph_entry", "graph_exit", "graph_state", "actions", "umrf_actions"),
@@ -275,8 +275,13 @@ class _Reader:
     def parameter(self, table: Table, path: str) -> Parameter:
         self.check_keys(table, "parameter", path)
         type_name = self.get(table, "pvf_type", str, path, required=True)
+        if hint := likely_type(type_name):
+            raise wrong_graph(self.file, f"{path}.pvf_type", "a type", type_name, f"an unknown one{hint}")
         listed: object = table.get("pvf_allowed_values", ())
         allowed = tuple(cast("list[object]", listed)) if isinstance(listed, (list, tuple)) else (listed,)
+        for one in allowed:
+            if not is_of_type(one, type_name):
+                raise wrong_graph(self.file, f"{path}.pvf_allowed_values", f"values that are each a {type_name}", one)
         value: object = table.get("pvf_value", table.get("value"))
         if value is not None and not is_of_type(value, type_name):
             raise wrong_graph(self.file, f"{path}.pvf_value", f"a {type_name}", value)

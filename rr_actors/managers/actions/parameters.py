@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any, cast
 
+from rr_actors.base.errors import did_you_mean
 from rr_actors.managers.actions.graph_model import Parameter
 
 SEPARATOR = "::"
 _KINDS: dict[str, type | tuple[type, ...]] = {"string": str, "number": (int, float), "bool": bool}
+_OTHER_WORDS = ("boolean", "booleans")  # types of which nothing is known, although they look like one of the known
 
 
 def is_of_type(value: object, type_name: str) -> bool:
@@ -22,6 +24,12 @@ def is_of_type(value: object, type_name: str) -> bool:
 def known_types(type_name: str) -> bool:
     """Return whether this is a type whose values can be told apart."""
     return type_name in _KINDS or (type_name.endswith("s") and type_name[:-1] in _KINDS)
+
+
+def likely_type(type_name: str) -> str:
+    """Return "; did you mean 'string'?" for a misspelt type, else ""."""
+    known = [*_KINDS, *(f"{kind}s" for kind in _KINDS)]
+    return "" if type_name in _OTHER_WORDS or known_types(type_name) else did_you_mean(type_name, known)
 
 
 def flat(values: Mapping[str, Any], leaves: Collection[str] = (), prefix: str = "") -> dict[str, Any]:
