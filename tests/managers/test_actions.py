@@ -259,11 +259,12 @@ def test_a_cyclic_state_machine_of_the_older_dialect_runs_until_no_child_accepts
         older("Go", ["TaChoose"], ["TaChoose"], "synchronous", True),
         older("Rest", ["TaChoose"], ["TaChoose"], "synchronous", True),
     ]
-    with robot.app.load("actions/graph", RunGraph({"graph_name": "machine", "umrf_actions": actions})) as query:
-        said: list[str] = []
-        while query.response["graph_state"] != "FINISHED":
-            said.append(query.wait_status(timeout_s=60).message)
-    begun = ["TaChoose", "Go", "TaChoose", "Rest", "TaChoose", "Go", "TaChoose"]
+    said: list[str] = []
+    request = RunGraph({"graph_name": "machine", "umrf_actions": actions})
+    with robot.app.load("actions/graph", request, on_status=lambda status: said.append(status.message)) as query:
+        begun = ["TaChoose", "Go", "TaChoose", "Rest", "TaChoose", "Go", "TaChoose"]
+        eventually(lambda: len(said) > len(begun), timeout=60)
+        assert query.response["graph_state"] == "FINISHED"
     assert said == ["begin", *(f"{name}_0: on_true" for name in begun)]
 
 
@@ -318,7 +319,7 @@ def test_a_graph_can_be_stopped_paused_and_resumed_by_messages(robot: Robot, tmp
 def test_what_is_said_to_a_graph_as_soon_as_it_is_loaded_is_not_lost(robot: Robot, tmp_path: Path) -> None:
     with robot.app.load("actions/graph", RunGraph(lingering(tmp_path))) as query:
         robot.messages.pause_graph(query.resource_id).get()
-        assert query.response["graph_state"] == "PAUSED"
+        assert eventually(lambda: query.response["graph_state"] == "PAUSED")
         (tmp_path / "go").touch()
         robot.messages.resume_graph(query.resource_id).get()
         assert eventually(lambda: query.response["graph_state"] == "FINISHED")

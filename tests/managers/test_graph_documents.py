@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from rr_actors.base.errors import GraphError, LoadFailed, UsageError
 from rr_actors.managers.actions.graph_checks import Signature, check_graph, completed, signature_of
 from rr_actors.managers.actions.graph_documents import read_graph, read_graph_file
-from rr_actors.managers.actions.graph_model import DEFAULT_CONDITIONS, Parameter
-from rr_actors.managers.actions.parameters import flat, is_of_type, nested
+from rr_actors.managers.actions.graph_model import DEFAULT_CONDITIONS, Parameter, flat, is_of_type, nested
 
 Table = dict[str, Any]
 TEXT, NUMBER = {"pvf_type": "string"}, {"pvf_type": "number"}

@@ -15,8 +15,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import LoadFailed, UsageError, shown
 from rr_actors.managers.actions.graph_checks import Signature
-from rr_actors.managers.actions.graph_model import Parameter
-from rr_actors.managers.actions.parameters import SEPARATOR, flat, nested
+from rr_actors.managers.actions.graph_model import SEPARATOR, Parameter, flat, nested
 from rr_actors.registrar.engine.server import Current, current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State

@@ -18,6 +18,7 @@ from typing import Any, Literal
 from rr_actors.base import pickling
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import (
+    CatalogError,
     LoadFailed,
     LoadTimeout,
     NotFound,
@@ -34,7 +35,8 @@ from rr_actors.managers.actions.action import Action, bind, given_to, name_of, r
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_engine import GraphEngine
 from rr_actors.managers.actions.graph_library import GraphLibrary
-from rr_actors.managers.actions.graph_model import ActionGraph, wrong_graph
+from rr_actors.managers.actions.graph_log import GraphLog, logged
+from rr_actors.managers.actions.graph_model import ActionGraph, flat, wrong_graph
 from rr_actors.managers.actions.graph_runs import (
     ENDED,
     LIVE,
@@ -54,7 +56,6 @@ from rr_actors.managers.actions.graph_runs import (
     first_run,
     run_in,
 )
-from rr_actors.managers.actions.parameters import flat
 from rr_actors.managers.actions.run_controls import RunControl, Word
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
@@ -173,7 +174,11 @@ class Actions(Manager):
         for query in self.registrar.queries():
             if query.server == "control":  # the crash came between an answer and its release
                 threading.Thread(target=query.unload, kwargs={"timeout_s": None}, daemon=True).start()
-        found = [info for info in self.registrar.resources() if info.server == "graph" and info.phase == LOADED]
+        logs = logged(self.registrar.directory)
+        resources = self.registrar.resources()
+        for id in logs - {info.id for info in resources}:  # a crash came before it was removed
+            GraphLog(self.registrar.directory, id).remove()
+        found = [info for info in resources if info.server == "graph" and info.phase == LOADED]
         graphs = [info for info in found if info.id not in self._engines]
         lost: list[tuple[str, Status]] = []
         begun = [info for info in graphs if run_in(info.response).steps]
@@ -407,9 +412,12 @@ class Actions(Manager):
             self._instances.pop(request.instance, None)
         if engine is not None:
             engine.close(self._stop_s)
+        GraphLog(self.registrar.directory, current().resource_id).remove()
 
     def _add(self, id: str, instance: str, graph: ActionGraph, run: GraphRun) -> GraphEngine:
-        engine = GraphEngine(self, id, graph, run, self._stop_s)
+        log = GraphLog(self.registrar.directory, id) if self.registrar.config.durability == "process" else None
+        engine = GraphEngine(self, id, graph, run, self._stop_s, log)
+        engine.replay()
         with self._lock:
             self._engines[id] = engine
             self._instances[instance] = id
@@ -424,11 +432,13 @@ class Actions(Manager):
             graph = self._library.complete(read_graph(document_in(response)))
             if not run.steps:
                 checked_inputs(graph, _flat_inputs(graph, request.inputs))
+            return self._add(id, request.instance, graph, run)
+        except CatalogError as error:
+            lost.append((id, Status(State.FATAL, f"the graph cannot go on: {error}")))
         except RrError as error:
             text = f"the graph does not fit the actions of this version: {error}"
             lost.append((id, Status(State.FATAL, text)))
-            return None
-        return self._add(id, request.instance, graph, run)
+        return None
 
     def _ends(self) -> dict[str, tuple[str, dict[str, Any]]]:
         """Return the ends of actions that are on disk here."""

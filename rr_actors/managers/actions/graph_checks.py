@@ -13,9 +13,9 @@ from rr_actors.managers.actions.graph_model import (
     ActionNode,
     Parameter,
     ParentRelation,
+    known_types,
     wrong_graph,
 )
-from rr_actors.managers.actions.parameters import known_types
 
 
 class Signature(msgspec.Struct, frozen=True):

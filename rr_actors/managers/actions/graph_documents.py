@@ -19,13 +19,15 @@ from rr_actors.managers.actions.graph_model import (
     DEFAULT_CONDITIONS,
     RESPONSES,
     RESULTS,
+    SEPARATOR,
     ActionGraph,
     ActionNode,
     Parameter,
     ParentRelation,
+    is_of_type,
+    likely_type,
     wrong_graph,
 )
-from rr_actors.managers.actions.parameters import SEPARATOR, is_of_type, likely_type
 
 _KEYS = {
     "graph": ("graph_name", "graph_description", "graph_entry", "graph_exit", "graph_state", "actions", "umrf_actions"),

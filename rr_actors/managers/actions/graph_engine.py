@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 from rr_actors.base.errors import CatalogError, RrError, Unavailable, UnknownQuery, text_of
 from rr_actors.base.reporting.log import Log
+from rr_actors.managers.actions.graph_log import GraphLog
 from rr_actors.managers.actions.graph_model import ActionGraph
 from rr_actors.managers.actions.graph_runs import (
     ENDED,
@@ -40,6 +41,11 @@ from rr_actors.registrar.registrar import Registrar
 logger = Log("rr_actors.managers.actions")
 
 _NO_ROOM_S = 0.1  # how soon it tries again to write what the disk has refused
+_SMALL = 20
+_RESPONSE_S = 0.005
+"""The response of a graph with more actions than _SMALL is written at most once in so many seconds for each action."""
+_AGAIN_S = 1.0
+_MOST_TEXTS = 10  # the newest, of the transitions that one status is about
 CONFIRMED_S = 5.0
 """How long a message waits until the managers of the runs have confirmed what they were told."""
 _WORDS: dict[str, Word] = {"RUNNING": "run", "PAUSED": "pause", "STOPPING": "stop"}
@@ -81,9 +87,21 @@ class GraphEngine:
         graph_id: the id of the resource.
     """
 
-    def __init__(self, runner: Runner, graph_id: str, graph: ActionGraph, run: GraphRun, stop_s: float = 5.0) -> None:
+    def __init__(
+        self,
+        runner: Runner,
+        graph_id: str,
+        graph: ActionGraph,
+        run: GraphRun,
+        stop_s: float = 5.0,
+        log: GraphLog | None = None,
+    ) -> None:
         self.graph_id = graph_id
         self._stop_s = stop_s
+        self._log = log
+        self._texts: list[str] = []  # of the transitions that are in the log alone
+        self._write_at = 0.0  # when the next transition is written with the response
+        self._writing: threading.Timer | None = None  # writes the response if no other transition does
         self._runner, self._graph, self._run = runner, graph, run
         self._kept: dict[str, Query] = {}
         self._stops: dict[str, threading.Timer] = {}  # of the runs that were told to stop, by their keys
@@ -93,6 +111,16 @@ class GraphEngine:
         self._begun = threading.Event()  # the first event is on disk: messages wait for that
         if run.steps:
             self._begun.set()
+
+    def replay(self) -> None:
+        """Take the ends that are in the log alone, after a crash.
+
+        Raises:
+            CatalogError: the log is damaged.
+        """
+        for event in self._log.since(self._run.steps) if self._log is not None else []:
+            self._run, _ = decide(self._graph, self._run, event)
+            self._texts.append(f"{event.node}: {event.result}")
 
     @property
     def graph(self) -> ActionGraph:
@@ -160,6 +188,9 @@ class GraphEngine:
             self._release(query)
         if lost:
             self._in_thread("restored", self._take_end, Restored(tuple(lost)))
+        with self._changing:
+            if self._texts and self._writing is None:
+                self._write_later(0.0)
 
     def said(self, key: str) -> tuple[Word, int]:
         """Return what holds for the run with this key, and since which step of the graph."""
@@ -244,8 +275,10 @@ class GraphEngine:
         with self._changing:
             self._closed = True
             threads, run = list(self._threads), self._run
-            for timer in self._stops.values():
+            for timer in [*self._stops.values(), *filter(None, [self._writing])]:
                 timer.cancel()
+            if self._log is not None:
+                self._log.close()
         for name, node in _live(run):
             self._runner.tell_run(node.actor, self._key(name, node), "stop", run.steps + 1)
         deadline = time.monotonic() + stop_s
@@ -258,7 +291,45 @@ class GraphEngine:
 
     def _commit(self, graph: ActionGraph, run: GraphRun, event: Event) -> None:
         text = f"{event.node}: {event.result}" if isinstance(event, Ended) else type(event).__name__.lower()
-        self._runner.registrar.update_response(self.graph_id, feedback(graph, run), text)
+        if not (isinstance(event, Ended) and run.state == self._run.state and self._note(run.steps, event)):
+            self._write(graph, run, text)
+            return
+        self._texts.append(text)
+        if self._writing is None:
+            self._write_later(self._write_at - time.monotonic())
+
+    def _note(self, step: int, event: Ended) -> bool:
+        """Write the end of an action to the log, if the response was written a short while ago."""
+        return self._log is not None and time.monotonic() < self._write_at and self._log.append(step, event)
+
+    def _write(self, graph: ActionGraph, run: GraphRun, text: str = "") -> None:
+        """Write the response: the whole graph, with all that the log has."""
+        texts = [*self._texts, *([text] if text else [])]
+        said = f"... {'; '.join(texts[-_MOST_TEXTS:])}" if len(texts) > _MOST_TEXTS else "; ".join(texts)
+        self._runner.registrar.update_response(self.graph_id, feedback(graph, run), said)
+        self._texts.clear()
+        if self._log is not None:
+            self._log.clear()
+            self._write_at = time.monotonic() + _RESPONSE_S * len(run.nodes) if len(run.nodes) > _SMALL else 0.0
+
+    def _write_later(self, after_s: float) -> None:
+        self._writing = threading.Timer(max(0.0, after_s), self._write_now)
+        self._writing.daemon = True
+        self._writing.start()
+
+    def _write_now(self) -> None:
+        with self._changing:
+            self._writing = None
+            if self._closed or not self._texts:
+                return
+            try:
+                self._write(self._graph, self._run)
+            except CatalogError as error:
+                logger.info("%s: %s", self._graph.name, error)
+                self._write_later(_AGAIN_S)
+            except RrError as error:  # it has become too long: the next transition hears it
+                logger.info("%s: %s", self._graph.name, error)
+                self._write_at = 0.0
 
     def _end_of_all(self) -> None:
         """Release what is kept, and say so if the graph has ended with an error."""

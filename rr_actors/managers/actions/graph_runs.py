@@ -17,8 +17,7 @@ from typing import Any, Literal
 import msgspec
 
 from rr_actors.managers.actions.graph_checks import missing_inputs
-from rr_actors.managers.actions.graph_model import EXIT, ActionGraph, ActionNode, ParentRelation, wrong_graph
-from rr_actors.managers.actions.parameters import accepts
+from rr_actors.managers.actions.graph_model import EXIT, ActionGraph, ActionNode, ParentRelation, accepts, wrong_graph
 
 MOST_ATTEMPTS = 3
 KEY = "rr_run"  # what the dialects have no key for
