@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from rr_actors.base.checks import check_number, examined
 from rr_actors.base.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
 from rr_actors.base.names import check_name
+from rr_actors.base.redefined import warn_of_redefined
 from rr_actors.registrar.engine.server import (
     RECOVER_S,
     ROLES,
@@ -240,6 +241,7 @@ class Declared(Generic[Request, Returned, Response]):
         """
         if self._owner is None:
             raise UsageError(f"server {self.name!r}: expected an attribute of a Manager class, got a function")
+        warn_of_redefined(self._owner)
         return Declaring(class_name(self._owner), self._load.__name__, self.name)
 
 

@@ -32,6 +32,7 @@ from rr_actors.base.errors import (
     shown,
     text_of,
 )
+from rr_actors.base.redefined import note_started
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import trace_of
 from rr_actors.registrar.engine.server import check_not_own, serving
@@ -40,7 +41,7 @@ from rr_actors.supervision.child_runs import Target
 from rr_actors.supervision.core import child_calls
 from rr_actors.supervision.core.child_calls import Counts
 from rr_actors.supervision.core.rendering import describe_settings
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, count_processes
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, classes_of, count_processes
 from rr_actors.supervision.core.state import CallReply, ChildState, Decision, ExitSupervisor
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
@@ -339,6 +340,7 @@ class SupervisorRef:
         else:
             child = as_child_spec(cast("ChildSpec | Supervisor", spec))
             check_children_can_import(child, f"{self.path}/{child.id}", f"supervisor {self.path}: start_child()")
+            note_started(classes_of(child))
         return self._ask(child_calls.Change("start_child", spec))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
@@ -384,6 +386,7 @@ class SupervisorRef:
         if not is_a(spec, Supervisor):
             raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
         self._ask(child_calls.Change("update", spec))
+        note_started(classes_of(as_child_spec(spec)))
         path, new = self.path, spec
         while "/" in path:  # the parent must have the new specification for the next start
             path, _, id = path.rpartition("/")

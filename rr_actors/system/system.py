@@ -36,6 +36,7 @@ from rr_actors.base.errors import (
     shown,
 )
 from rr_actors.base.names import CLIENTS, check_name
+from rr_actors.base.redefined import note_started, warn_of_redefined
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
@@ -67,7 +68,7 @@ from rr_actors.runtime.workers import Workers
 from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.streams.stream import StreamInfo
 from rr_actors.supervision.core.rendering import Tree
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, classes_of
 from rr_actors.supervision.event_history import TreeLog
 from rr_actors.supervision.given_up import give_up
 from rr_actors.supervision.hosted import Hosted, check_hostable, prepare
@@ -250,12 +251,16 @@ class System:
     def running(cls, state_dir: str | os.PathLike[str] = "rr_state") -> System | None:
         """Return the running system of this process with that state directory, or None.
 
-        A notebook cell that starts a system can use this when it runs a second time.
+        A notebook cell that starts a system can use this when it runs a second time. If it has defined the class of a
+        child anew, with other code, a RuntimeWarning says that the system runs the code from before.
 
         Raises:
             ConfigError: state_dir is no path, or no possible state directory.
         """
-        return _systems.get(str(absolute_path(state_path(state_dir))))
+        system = _systems.get(str(absolute_path(state_path(state_dir))))
+        for cls in classes_of(as_child_spec(system.root)) if system is not None else ():
+            warn_of_redefined(cls, by_name=True)
+        return system
 
     def __del__(self) -> None:
         """Warn that the system was dropped while it runs, and stop it in the background."""
@@ -290,6 +295,7 @@ class System:
             node.keeper.also.append(self._state.keep)
         try:
             spec = as_child_spec(self.root)
+            note_started(classes_of(spec))
             in_tree = set(registrars_of(spec, self._top))
             Entries(node.directory).announce(spec, self._top)
             renamed = renamed_managers(spec, self._top)

@@ -142,6 +142,16 @@ def test_a_cell_that_runs_again_uses_the_system_that_runs(kernel: Kernel) -> Non
     assert kernel.run("print(len(app.queries()), len(system.snapshot()['registrars']))") == "2 2\n"
 
 
+def test_a_cell_that_is_edited_says_that_the_system_runs_the_code_from_before(kernel: Kernel) -> None:
+    kernel.run("import warnings; warnings.showwarning = lambda message, *rest: print(message)")
+    assert cameras_pid(kernel.run(START))
+    said = kernel.run(START.replace("images of", "pictures of"))
+    assert said.startswith("Cameras was defined anew, and the system still runs the code from before")
+    assert "images of front" in said
+    kernel.run("app.close(); system.stop()")
+    assert kernel.run(START.replace("images of", "pictures of")).startswith("pictures of front")
+
+
 def test_an_interrupted_cell_leaves_the_system_running_and_nothing_half_done(kernel: Kernel) -> None:
     pid = cameras_pid(kernel.run(START))
     kernel.run("import threading, time; begun = threading.Event()")

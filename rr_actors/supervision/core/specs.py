@@ -305,6 +305,12 @@ def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]
             yield from starting_with(below, f"{path}/{below.id}")
 
 
+def classes_of(child: ChildSpec) -> list[type]:
+    """Return the classes of a child and of all that start with it."""
+    found = [below.actor_class_or_manager for _, below in starting_with(child, "")]
+    return [cls for cls in found if isinstance(cls, type)]
+
+
 def count_processes(supervisor: Supervisor) -> int:
     """Return how many processes the supervisor starts from its own process, with those of supervisors placed there."""
     if supervisor.strategy == "simple_one_for_one":
