@@ -69,7 +69,7 @@ def _play(store: Store, registrar: str, commits: range, *, folding: bool) -> Non
     for number in commits:
         store.commit(_changes(registrar, number))
         if folding and number % 4 == 0:
-            store.tidy()
+            (store.upkeep if number % 8 else store.tidy)()
 
 
 def _closed(path: Path, registrar: str, witness: Witness, durability: Durability) -> None:
@@ -255,7 +255,7 @@ def _ends(data: bytes) -> Iterator[int]:
 # -- what comes of it ----------------------------------------------------------------------------------------------
 
 
-class _Warnings(logging.Handler):
+class Warnings(logging.Handler):
     """The warnings of the stores."""
 
     def __init__(self) -> None:
@@ -306,7 +306,7 @@ def run(times: int, seed: int, place: Path) -> Result:
     all_scenes = list(scenes(place))
     counts: Counter[tuple[str, str]] = Counter()
     failures: list[str] = []
-    handler = _Warnings()
+    handler = Warnings()
     logger = logging.getLogger("rr_actors.storage")
     logger.addHandler(handler)
     propagates, logger.propagate = logger.propagate, False

@@ -188,7 +188,7 @@ def _prepare(directory: Path) -> Feed:
 def _read(folder: Folder, path: Path, meta: Meta, base: set[Row], expected: list[set[Row]] | None) -> None:
     content = content_of(base)
     try:
-        apply(content, journaled_store.read(folder, path).since(meta))
+        apply(content, journaled_store.read(folder, path).since(meta).changes)
     except Damage:
         return
     rows = set(rows_of(content))

@@ -31,6 +31,7 @@ class Reached(msgspec.Struct, frozen=True, gc=False):
 
     `in_tables`: the catalog has no journal, and the number is that of the last commit in the tables. `is_made`: whether
     it has its SQLite file; one that has committed nothing has none, nor one whose commits are all in its journal.
+    `folded`: the last segment, or commit, in the tables. `settled`: the last one in the SQLite file without its -wal.
     """
 
     id: str
@@ -38,6 +39,8 @@ class Reached(msgspec.Struct, frozen=True, gc=False):
     number: int
     in_tables: bool = False
     is_made: bool = True
+    folded: int = 0
+    settled: int = 0
 
 
 class CatalogLock:
@@ -153,7 +156,8 @@ class CatalogLock:
             text = "" if pid is None else str(pid)
         else:
             kind = "tables" if reached.in_tables else "journal" if reached.is_made else "new"
-            noted = f"{reached.id} {reached.epoch} {kind} {reached.number:020}"
+            numbers = f"{reached.number:020} {reached.folded:020} {reached.settled:020}"
+            noted = f"{reached.id} {reached.epoch} {kind} {numbers}"
             text = f"{'' if pid is None else pid}\n{noted} {zlib.crc32(noted.encode()):08x}\n"
         with contextlib.nullcontext() if needed else contextlib.suppress(OSError):  # commits are elsewhere, and safe
             fd, data = self._file.fileno(), text.encode()
@@ -174,8 +178,10 @@ def _read(text: bytes) -> tuple[int | None, Reached | None]:
     noted, _, checksum = second.rstrip("\n").rpartition(" ")
     if f"{zlib.crc32(noted.encode()):08x}" != checksum or not noted:
         return pid, None
-    id_, epoch, kind, number = noted.split(" ")
-    return pid, Reached(id_, int(epoch), int(number), in_tables=kind == "tables", is_made=kind != "new")
+    id_, epoch, kind, number, *others = noted.split(" ")
+    folded, settled = map(int, others or (0, 0))  # an earlier version noted neither
+    made = kind != "new"
+    return pid, Reached(id_, int(epoch), int(number), kind == "tables", made, folded, settled)
 
 
 _locks: weakref.WeakSet[CatalogLock] = weakref.WeakSet()  # weak: an interrupted caller may never get its lock

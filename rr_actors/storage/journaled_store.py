@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from rr_actors.base.errors import CatalogError
+from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import Folder
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
@@ -42,24 +42,32 @@ _log = Log(__name__)
 class JournaledStore:
     """A Store (store.py) that survives SIGKILL; made by `open_store` (opening.py). Commits from any thread.
 
-    `tidy` brings the SQLite file up to date with the commits before it.
+    `upkeep` brings the SQLite file, with its -wal, up to date with the commits before it. A segment stays until the
+    file has its changes without the -wal: so no single damaged file loses what was folded.
+
+    Args:
+        tables: the catalog's SQLite file.
+        kept: the names of segments that are folded, but that the file may not have without its -wal.
+        end: the end of the last one.
 
     Attributes:
         path: the catalog's SQLite file.
     """
 
-    def __init__(self, tables: SqliteStore) -> None:
+    def __init__(self, tables: SqliteStore, kept: Iterable[str] = (), end: End | None = None) -> None:
         self.path = tables.path
         self.epoch = tables.epoch
         self._tables = tables
         self._look_at = 0.0  # when a commit looks next whether the directory is in its place
-        self._lock = threading.Lock()  # protects the next four
+        self._lock = threading.Lock()  # protects the next five
         self._segment: Segment | None = None  # takes commits; made by the first commit
-        self._end = End()  # of the segment before
+        self._last = tables.meta.folded  # the number of the segment before
+        self._end = end or End()  # and its end
         self._pending: list[Change] = []  # changes that are not in the tables
         self._closed = False
         self._tidying = threading.Lock()  # protects the tables, and:
         self._full: list[Segment] = []  # ended segments with pending changes
+        self._kept = list(kept)
 
     def load(self) -> Content:
         with self._tidying:
@@ -108,25 +116,39 @@ class JournaledStore:
         """Return whether a change is in the journal alone."""
         return bool(self._pending)
 
-    def tidy(self) -> None:
-        """Fold the journal's changes into the SQLite file, and keep its -wal small. Do nothing once this is closed,
-        or while the directory has gone away.
+    def upkeep(self) -> None:
+        """Fold the journal's changes into the SQLite file. Do nothing once this is closed, or while the directory has
+        gone away.
 
         If the folding fails, the changes stay in the journal.
         """
         with self._tidying:
-            if self._closed or not self._tables.place.is_there():
-                return
-            self._tables.keep_lock()
-            self._fold()
-            if self._tables.wants_tidying() or self._tables.is_too_large():
-                self._tables.tidy()
+            if self._is_usable():
+                self._fold()
+                if self._tables.wants_tidying() or self._tables.is_too_large():
+                    self._settle()
+
+    def tidy(self) -> None:
+        """Fold, and have the file itself take what its -wal has; then the journal keeps nothing."""
+        with self._tidying:
+            if self._is_usable():
+                self._fold()
+                self._settle()
+
+    def _is_usable(self) -> bool:
+        if self._closed or not self._tables.place.is_there():
+            return False
+        self._tables.keep_lock()
+        return True
 
     def close(self, *, erase: bool = False) -> None:
         """Close the store as the contract says. The next opening folds the changes that cannot be folded now."""
         with self._tidying:
             try:
-                if self._tables.is_made or not erase:
+                if not erase:
+                    self._fold()
+                    self._settle()
+                elif self._tables.is_made:
                     self._fold()
             except CatalogError as error:
                 if not erase:
@@ -144,17 +166,16 @@ class JournaledStore:
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
-        full = self._full  # a folding that ends now replaces the list: so the meta row comes next
-        meta = self._tables.meta
-        number = (full[-1].number if full else meta.folded) + 1
+        number = self._last + 1
         begins = number == 1 and not self._tables.is_made
-        segment = Segment(self._tables.folder, self.path, meta, number, self._end, begins=begins)
+        segment = Segment(self._tables.folder, self.path, self._tables.meta, number, self._end, begins=begins)
         self._tables.note(number)
         if begins:
             self._tables.note_outside()
         return segment
 
     def _fold(self) -> None:
+        self._fold_again()
         was_made = self._tables.is_made
         changes: list[Change] = []
         try:
@@ -163,7 +184,7 @@ class JournaledStore:
                     self._begin_again()
                 segment = self._segment
                 if segment is not None and segment.end.records:
-                    self._end = segment.end
+                    self._last, self._end = segment.number, segment.end
                     self._full.append(segment)
                     self._segment = None
                     segment.close()
@@ -174,12 +195,40 @@ class JournaledStore:
             with self._lock:
                 self._pending = changes + self._pending
             raise
-        if not was_made and self._tables.is_made:
-            with self._lock:  # from now on a catalog without its file is a damaged one
-                self._tables.note(self._full[-1].number if self._segment is None else self._segment.number)
         full, self._full = self._full, []
-        for segment in full:
-            segment.remove()
+        self._kept += [segment.name for segment in full]
+        if full:
+            self._note()  # also that the file is made: from now on a catalog without its file is a damaged one
+
+    def _note(self) -> None:
+        with self._lock:
+            self._tables.note(self._last if self._segment is None else self._segment.number)
+
+    def _settle(self) -> None:
+        """Have the SQLite file take its -wal, and remove the segments that it has then."""
+        tables = self._tables
+        if not tables.is_made or (not self._kept and not tables.wants_tidying() and not tables.is_too_large()):
+            return
+        try:
+            tables.tidy()
+        except CatalogDamaged as error:
+            _log.warning("%s. It is made again from the journal", error)
+            tables.reopen()
+            self._fold_again()
+            tables.tidy()
+        if tables.settled == tables.meta.folded:
+            self._note()  # first: a segment that is missing then is not missed
+            kept, self._kept = self._kept, []
+            for name in kept:
+                tables.folder.discard(name)
+
+    def _fold_again(self) -> None:
+        """Fold the kept segments that the tables have no more, since reopen(); nearly always there are none."""
+        tables, last = self._tables, self._full[0].number - 1 if self._full else self._last
+        if tables.meta.folded < last:
+            before = msgspec.structs.replace(tables.meta, epoch=0)  # segments of earlier openings are kept, too
+            found = read(tables.folder, self.path).since(before, until=last)
+            tables.fold(net_of(found.changes), last)
 
     def _begin_again(self) -> None:
         """Forget all commits of a catalog without a file, which have come to nothing. With the lock."""
@@ -343,16 +392,21 @@ class Segment:
 
 
 class JournalFiles(msgspec.Struct, frozen=True):
-    """The files of a catalog's journal. `contents`: each segment's bytes by its number, None if it is only begun."""
+    """The files of a catalog's journal.
+
+    `contents`: each segment's bytes by its number, None if it is only begun. `bad`: what is wrong with a file that has
+    a segment's name, but not a segment's beginning.
+    """
 
     catalog: Path
-    segments: list[str]
+    segments: dict[int, str]
     contents: dict[int, bytes | None]
+    bad: dict[int, str]
 
     @property
     def last(self) -> int:
         """The highest number of a segment; 0 without segments."""
-        return max(self.contents, default=0)
+        return max((*self.contents, *self.bad), default=0)
 
     def first(self, registrars: Collection[str]) -> Meta | None:
         """Return the meta row of a catalog without an SQLite file, all of which is in its journal; None for another.
@@ -376,46 +430,87 @@ class JournalFiles(msgspec.Struct, frozen=True):
         later = (data for number, data in self.contents.items() if number > folded and data is not None)
         return max((_HEADER.unpack_from(data)[2] for data in later), default=0)
 
-    def since(self, meta: Meta, begun: int = 0) -> list[Change]:
+    def since(self, meta: Meta, begun: int = 0, *, settled: int = 0, until: int | None = None) -> Replay:
         """Return the changes after those in the tables, up to the first that is missing; log a warning about the rest.
 
         Args:
             meta: the meta row in the tables.
             begun: the last segment that is known to have been begun, even if its file is missing.
+            settled: the last segment that is known to be in the SQLite file; that is gone if it is missing there.
+            until: the last segment to read; None: all.
 
         Raises:
             Damage: a segment belongs to another catalog, or a record is not a catalog's.
         """
-        changes: list[Change] = []
-        end: End | None = None
-        for number in range(meta.folded + 1, max(self.last, begun) + 1):
-            data = self.contents.get(number)
-            if data is None and number == self.last > begun:
-                break  # begun, and nothing written to it
+        found = Replay()
+        before = meta.folded
+        for number in sorted(self.bad):
+            if number > meta.folded:
+                raise Damage(self.bad[number])
+            _log.warning("%s: %s; the SQLite file has all of it: nothing is lost", self.catalog, self.bad[number])
+        for number in sorted(self.contents):
+            data = self.contents[number]
+            if number <= meta.folded or data is None or (until is not None and number > until):
+                continue
             name = f"{segment_prefix(self.catalog)}{number}"
-            if data is not None:
-                # A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the -wal.
-                id_, epoch = _HEADER.unpack_from(data)[1:3]
-                if id_ != meta.id.encode().ljust(16, b"\0") or epoch < meta.epoch:
-                    raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
-            if data is None or (end is not None and End(*_HEADER.unpack_from(data)[4:6]) != end):
-                _log.warning(
-                    "%s: %s: missing, or not what was written next; it and what came later is ignored: what was"
-                    " committed since then is lost. A power cut may do that (with durability 'power' it does not), and"
-                    " so does a file that is removed, or put in another's place",
-                    self.catalog,
-                    name,
-                )
-                break
-            end, place = _read_records(data, changes)
-            if place.at < len(data):
-                _tell_of_rest(self.catalog, name, data, place)
-        return changes
+            # A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the -wal.
+            id_, epoch, _, *place = _HEADER.unpack_from(data)[1:6]
+            if id_ != meta.id.encode().ljust(16, b"\0") or epoch < meta.epoch:
+                raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
+            follows = End(*place) in ((End(),) if found.end is None else (found.end,))
+            if not found.has_gap and not follows and (found.end is not None or number != meta.folded + 1):
+                found.has_gap = True
+                if before >= settled:
+                    _tell_of_gap(self.catalog, before + 1)
+            changes: list[Change] = []
+            end, rest = _read_records(data, changes)
+            if found.has_gap:
+                found.ignored += changes
+                continue
+            found.changes += changes
+            found.end, before = end, number
+            if rest.at < len(data) and _tell_of_rest(self.catalog, name, data, rest):
+                found.is_whole = False
+                found.ignored += _behind(data, rest)
+        if until is None and not found.has_gap and begun > before:
+            found.has_gap = True
+            if before >= settled:
+                _tell_of_gap(self.catalog, before + 1)
+        found.is_whole = found.is_whole and not found.has_gap
+        if found.end is None and (data := self.contents.get(self.last)) is not None:
+            found.end = _read_records(data, [])[0]
+        return found
 
 
-def _tell_of_rest(catalog: Path, name: str, data: bytes, end: RecordEnd) -> None:
-    left = len(data) - end.at
-    if is_torn(data, end):
+class Replay(msgspec.Struct):
+    """What a journal has beside the tables.
+
+    `changes`: to be applied. `ignored`: those that were found behind a gap or behind damage. `end`: of the last
+    segment. `has_gap`: a segment is missing. `is_whole`: nothing is missing or damaged.
+    """
+
+    changes: list[Change] = []
+    ignored: list[Change] = []
+    end: End | None = None
+    has_gap: bool = False
+    is_whole: bool = True
+
+
+def _tell_of_gap(catalog: Path, number: int) -> None:
+    _log.warning(
+        "%s: %s%s: missing, or not what was written next; it and what came later is ignored: what was committed since"
+        " then is lost. A power cut may do that (with durability 'power' it does not), and so does a file that is"
+        " removed, or put in another's place",
+        catalog,
+        segment_prefix(catalog),
+        number,
+    )
+
+
+def _tell_of_rest(catalog: Path, name: str, data: bytes, end: RecordEnd) -> bool:
+    """Log a warning about the bytes after the last good record; return whether commits are lost."""
+    left, torn = len(data) - end.at, is_torn(data, end)
+    if torn:
         text = (
             f"its last record is not whole ({left} bytes from byte {end.at} on), and ignored: its process died while it"
             " wrote it, and nobody heard that it was written; or the file was cut off there later"
@@ -426,22 +521,41 @@ def _tell_of_rest(catalog: Path, name: str, data: bytes, end: RecordEnd) -> None
             " is lost. Compare it with a copy, and see whether the disk is good"
         )
     _log.warning("%s: %s: %s", catalog, name, text)
+    return not torn
+
+
+def _behind(data: bytes, end: RecordEnd) -> list[Change]:
+    """Return what can still be read of a damaged record and of those after it, to say what is lost."""
+    found: list[Change] = []
+    length, first, _ = _RECORD.unpack_from(data, end.at)
+    for size in {length, first ^ end.checksum}:  # one of the two is right
+        start = end.at + _RECORD.size
+        after = start + size
+        if after + _RECORD.size > len(data) and after != len(data):
+            continue
+        with contextlib.suppress(Damage):
+            found += _decoded(data[start:after])
+        if after < len(data):
+            length, first, _ = _RECORD.unpack_from(data, after)
+            for body, _ in records(data, RecordEnd(after, first ^ length)):
+                found += _decoded(body)
+    return found
 
 
 def read(folder: Folder, catalog: Path) -> JournalFiles:
-    """Read the files of this catalog's journal; a segment that is removed during this is folded, and left out.
-
-    Raise Damage for a file that has a segment's name and is none.
-    """
-    found = JournalFiles(catalog, [], {})
+    """Read the files of this catalog's journal; a segment that is removed during this is folded, and left out."""
+    found = JournalFiles(catalog, {}, {}, {})
     for name in segments_among(folder.names(), catalog):
         try:
             data = folder.read(name)
         except FileNotFoundError:
             continue
         number = int(name.removeprefix(segment_prefix(catalog)))
-        found.segments.append(name)
-        found.contents[number] = _checked(name, number, data)
+        found.segments[number] = name
+        try:
+            found.contents[number] = _checked(name, number, data)
+        except Damage as error:
+            found.bad[number] = str(error)
     return found
 
 

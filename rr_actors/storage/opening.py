@@ -11,7 +11,7 @@ import os
 import sqlite3
 import stat
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -21,13 +21,14 @@ from rr_actors.base.config import CATALOG_FILE, RegistrarConfig
 from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked, shortened
 from rr_actors.base.folder import Folder, NotAFile, make_directories
 from rr_actors.base.reporting.log import Log
-from rr_actors.registrar.model.rows import Change, Content, Row, apply, content_of, rows_of
+from rr_actors.registrar.model.rows import Change, Content, Held, Resource, Row, apply, content_of, rows_of
 from rr_actors.registrar.model.store import MemoryStore, Store, is_needed
-from rr_actors.storage import journaled_store, sql_tables, sqlite_store
+from rr_actors.storage import journaled_store, sql_tables, sqlite_store, write_ahead
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.damage import Damage, damaged, errors_named
 from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.witness import LastOpening, Witness, is_missing, missing_text
+from rr_actors.storage.write_ahead import Spare
 
 Durability = Literal["process", "power"]
 
@@ -41,6 +42,7 @@ _LOOK_AGAIN_S = 0.05
 
 _READINGS = 20  # attempts to read a catalog that is opened or closed during each reading
 
+_LISTED = 20  # of what is lost
 _log = Log(__name__)
 
 
@@ -259,13 +261,15 @@ def _open_locked(
 ) -> Store:
     registrar = "" if witness is None else witness.registrar
     known, spent = (None, 0) if witness is None else witness.known_or_spent()
+    spare, settled = Spare(folder, path), 0
     try:
+        settled = _mend(folder, path, lock.reached, spare)
         meta, content, left = _read_locked(folder, path, lock.reached, witness)
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
         meta, content = sqlite_store.NONE, content_of(())
-        left = _Left(epoch=0 if lock.reached is None else lock.reached.epoch)
+        left, spare, settled = _Left(epoch=0 if lock.reached is None else lock.reached.epoch), Spare(folder, path), 0
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(folder, path).name)
     else:
         if known is not None:
@@ -283,10 +287,18 @@ def _open_locked(
             sqlite_store.create(folder, path, durability, meta)
         if durability != "power":  # with it the first commit is SQLite's, and must not wait for the opening of the file
             changes = None
-    store = sqlite_store.SqliteStore(folder, path, lock, durability, meta, changes, content, witness)
-    for segment in left.segments:
-        folder.discard(segment)  # if that fails: it is folded, so it is ignored, and the next opening removes it
-    return store if durability == "power" else JournaledStore(store)
+    tables = sqlite_store.SqliteStore(
+        folder, path, lock, durability, meta, changes, content, witness, settled=settled, spare=spare
+    )
+    if left.segments and (durability == "power" or not left.is_whole):
+        tables.tidy()
+    kept: list[str] = []
+    for number, segment in left.segments.items():
+        if number > tables.settled:
+            kept.append(segment)
+        else:
+            folder.discard(segment)  # if that fails: it is folded, so it is ignored, and the next opening removes it
+    return tables if durability == "power" else JournaledStore(tables, kept, left.end)
 
 
 class _Left(msgspec.Struct, frozen=True):
@@ -295,24 +307,31 @@ class _Left(msgspec.Struct, frozen=True):
     `last`: the last segment that was begun. `epoch`: the last opening that the journal or the lock knows.
     """
 
-    segments: Sequence[str] = ()
+    segments: Mapping[int, str] = {}
     last: int = 0
     epoch: int = 0
     changes: Sequence[Change] = ()
+    end: journaled_store.End | None = None
+    is_whole: bool = True
+
+
+def _mend(folder: Folder, path: Path, reached: Reached | None, spare: Spare) -> int:
+    """Mend the -wal of a catalog whose lock the caller has, and return the last commit that its file has without it."""
+    settled = 0 if reached is None else reached.settled
+    with errors_named(path):
+        _make_files_private(folder, sqlite_store.files_among(folder.names(), path))
+        spare.recover(settled)
+        return write_ahead.settled_before(folder, path, spare, settled)
 
 
 def _read_locked(
     folder: Folder, path: Path, reached: Reached | None, witness: Witness | None
 ) -> tuple[sql_tables.Meta, Content, _Left]:
-    """Return what _read() does, of a catalog whose lock the caller has. Make its files private first."""
+    """Return what _read() does, of a catalog whose lock the caller has, and which is mended."""
     with errors_named(path):
-        files = sqlite_store.files_among(folder.names(), path)
-        if reached is None and not files:
+        if reached is None and not sqlite_store.files_among(folder.names(), path):
             return sqlite_store.NONE, content_of(()), _Left()
-        _make_files_private(folder, files)
-        read = _read(folder, path, reached, witness)
-        sqlite_store.check_under_wal(folder, path, read[0])
-        return read
+        return _read(folder, path, reached, witness)
 
 
 def _read(
@@ -324,6 +343,8 @@ def _read(
         reached: the catalog's progress, if it was not closed.
         witness: has the name of the catalog's registrar, if that is known.
     """
+    if reached is None and witness is None:
+        Spare(folder, path).check()
     found = journaled_store.read(folder, path)  # first: the file then has the segments that are folded meanwhile
     first, is_new = None, reached is not None and not reached.is_made
     if not sqlite_store.has_file(folder, path):
@@ -332,7 +353,7 @@ def _read(
     if not folder.has(path.name):
         left = not is_new and any(found.contents.values())
         if left and sqlite_store.segments_among(folder.names(), path):  # otherwise it was erased meanwhile
-            damaged(path, f"no such file, but {found.segments[0]}, which belongs to it")
+            damaged(path, f"no such file, but {min(found.segments.items())[1]}, which belongs to it")
         if reached is not None and reached.is_made:
             damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
     if is_new and folder.has(path.name) and not sqlite_store.has_file(folder, path):
@@ -352,18 +373,38 @@ def _read(
     begun = 0
     if reached is not None and not reached.in_tables:
         begun = reached.number
-    elif reached is not None and reached.number > meta.folded:
-        _log.warning(
-            "%s: its last %d commit(s) are missing, and what they changed is lost: it, or its -wal, was removed, cut"
-            " off, damaged, or put back from an older copy",
-            path,
-            reached.number - meta.folded,
-        )
-    changes = found.since(meta, begun)
-    apply(content, changes)
+    settled = 0 if reached is None else reached.settled
+    replay = found.since(meta, begun, settled=settled)
+    apply(content, replay.changes)
+    if reached is not None and max(reached.folded, reached.number if reached.in_tables else 0) > meta.folded:
+        _tell_of_older(path, meta, reached, is_whole=replay.is_whole)
+    if lost := _lost(replay.ignored, content):
+        more = f" and {len(lost) - _LISTED} more" if len(lost) > _LISTED else ""
+        _log.warning("%s: lost with that: %s%s", path, ", ".join(lost[:_LISTED]), more)
     last = max(found.last, begun, 0 if reached is None else reached.number)
     epoch = max(found.epoch_after(meta.folded), 0 if reached is None else reached.epoch)
-    return meta, content, _Left(found.segments, last, epoch, changes)
+    return meta, content, _Left(found.segments, last, epoch, replay.changes, replay.end, replay.is_whole)
+
+
+def _tell_of_older(path: Path, meta: sql_tables.Meta, reached: Reached, *, is_whole: bool) -> None:
+    """Warn that the SQLite file, or its -wal, has less than was written to it."""
+    name = path.name if meta.folded < reached.settled else f"{path.name}-wal"
+    if reached.in_tables:
+        text = f"its last {reached.number - meta.folded} commit(s) are missing, and what they changed is lost"
+    elif meta.folded < reached.settled:
+        text = "what was committed since then is lost"
+    else:
+        text = f"what it had is taken from the journal{': nothing is lost' if is_whole else ', as far as it goes'}"
+    _log.warning("%s: %s was removed, cut off, damaged, or put back from an older copy: %s", path, name, text)
+
+
+def _lost(ignored: Sequence[Change], content: Content) -> list[str]:
+    """Return what was served and held by changes that could not be applied, for people."""
+    net = sql_tables.net_of(ignored)
+    served = [row for row in net.puts.get("resources", {}).values() if row.id not in content["resources"]]
+    held = [row for row in net.puts.get("held", {}).values() if row.id not in content["held"]]
+    texts = [f"{row.server} {row.id} (served)" for row in served if isinstance(row, Resource)]
+    return texts + [f"{row.registrar}/{row.server} {row.id} (held)" for row in held if isinstance(row, Held)]
 
 
 def _compare(path: Path, meta: sql_tables.Meta, known: LastOpening, registrar: str) -> None:

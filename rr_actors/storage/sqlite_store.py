@@ -29,13 +29,14 @@ from rr_actors.storage import sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.damage import Damage, damaged, errors_named
 from rr_actors.storage.witness import LastOpening, Witness, segment_prefix
+from rr_actors.storage.write_ahead import Spare, leftovers
 
 APPLICATION_ID = 0x52524143  # "RRAC"
 
 _CACHE_KIB = 16 * 1024  # at most; holds the pages of 100,000 queries
 _WAL_LIMIT_BYTES = 4 * 2**20  # the size of the -wal after the checkpoint that follows a huge commit
 _SPARE_BYTES = 2**20  # free pages that the file may have, in addition to as many as it has used ones
-_TIDY_PAGES = 128  # after about so many written pages another thread copies the -wal; at 1000 a commit does it
+_TIDY_PAGES = 192  # after about so many written pages another thread copies the -wal; no commit does it
 _EACH_A_PAGE = 4  # the estimate for a commit: its first 4 changes write a page each,
 _SOME_A_PAGE = 8  # and each 8 changes write one more
 _SHRINK = "VACUUM"
@@ -55,9 +56,11 @@ class SqliteStore:
             file yet, or it has this meta row already; SQLite makes or opens it when it is used first.
         content: the file's content after that.
         witness: the record of this catalog outside of its directory.
+        settled: the number of the last commit that the file has without its -wal.
+        spare: what a crash has left of it.
 
     Attributes:
-        folder, path: as given.
+        folder, path, settled: as given; then as it is.
         meta: the meta row in the file.
         is_made: whether there is a file.
 
@@ -75,8 +78,13 @@ class SqliteStore:
         changes: sql_tables.Net | None,
         content: Content,
         witness: Witness | None = None,
+        *,
+        settled: int = 0,
+        spare: Spare | None = None,
     ) -> None:
         self.folder = folder
+        self.settled = settled
+        self._spare = spare or Spare(folder, path)
         self.place = folder.place
         self.path = path
         self.meta = meta
@@ -89,6 +97,7 @@ class SqliteStore:
         self._synchronous = "FULL" if durability == "power" else "NORMAL"
         self._opened: sqlite3.Cursor | None = None
         self._closed = False
+        self._wal = f"{path.name}-wal"
         if changes is not None:
             try:
                 version = sql_tables.version_of(self._connection)
@@ -100,7 +109,6 @@ class SqliteStore:
         if self.is_made:
             self.note_outside()
         self._content: Content | None = content  # as read at the opening; None once returned or out of date
-        self._wal = f"{path.name}-wal"  # SQLite fills it again from its beginning: its size is not that of its content
         self._pages = 0  # an estimate of the pages written since the last copy
         self._tidying = threading.Lock()
 
@@ -118,6 +126,7 @@ class SqliteStore:
                 cursor.execute(f"PRAGMA synchronous = {self._synchronous}")
                 cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
                 cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
+                cursor.execute("PRAGMA wal_autocheckpoint = 0")  # tidy() copies the -wal
             except BaseException:
                 self._close_file()
                 raise
@@ -151,12 +160,33 @@ class SqliteStore:
         if self._witness is not None:
             self._witness.forget(self.epoch)
 
+    def reopen(self) -> None:
+        """Close the file, because its -wal is damaged; the next use opens it as after a crash.
+
+        SQLite then takes what is before the damage. `meta` says what the file has for certain.
+        """
+        with self._tidying, self._writing, errors_named(self.path):
+            self.meta = msgspec.structs.replace(self.meta, folded=self.settled)
+            self._content = None
+            self._close_file()
+            self.folder.discard(files_of(self.path)[2].name)
+            self._spare.recover(self.settled)
+
     def _close_file(self) -> None:
+        """Close the file. SQLite copies nothing of the -wal at this: tidy() does, which checks it."""
         cursor, self._opened = self._opened, None
-        if cursor is not None:
-            connection = cursor.connection
+        if cursor is None:
+            return
+        connection = cursor.connection
+        with contextlib.ExitStack() as others:
+            if self._wal_bytes():  # then another has the file open, and that one cannot write it
+                reader = sqlite3.connect(f"{self.path.as_uri()}?mode=ro", uri=True)
+                others.callback(reader.close)
+                with contextlib.suppress(sqlite3.Error):
+                    reader.execute("PRAGMA schema_version").fetchall()
             cursor.close()  # a failed statement in it would keep SQLite's files open
             connection.close()
+        self._spare.close()
 
     def load(self) -> Content:
         if self._content is not None:
@@ -190,7 +220,7 @@ class SqliteStore:
 
     def _commit(self, changes: sql_tables.Net, number: int, expected: str, if_not: str) -> None:
         self._content = None
-        self._pages += min(changes.count, _EACH_A_PAGE + changes.count // _SOME_A_PAGE)
+        self._pages += 1 + min(changes.count, _EACH_A_PAGE + changes.count // _SOME_A_PAGE)  # 1: of the meta row
         meta = msgspec.structs.replace(self.meta, folded=number)
         try:
             self._write(changes, meta)
@@ -202,7 +232,8 @@ class SqliteStore:
     def note(self, number: int, *, needed: bool = False) -> None:
         """Have CatalogLock.note() note that a segment of the journal is begun, or that a commit is in the tables."""
         in_tables = self._durability == "power"
-        reached = Reached(self.meta.id, self.epoch, number, in_tables=in_tables, is_made=self.is_made)
+        folded = self.meta.folded if self.is_made else 0
+        reached = Reached(self.meta.id, self.epoch, number, in_tables, self.is_made, folded, self.settled)
         self._lock.note(reached, needed=needed)
 
     def keep_lock(self) -> None:
@@ -214,6 +245,11 @@ class SqliteStore:
         """Write the changes of a journal as commit() does, atomically with the number of its last segment."""
         unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
         self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
+
+    def _settle(self, number: int) -> None:
+        """Note that the file has all up to this commit without its -wal."""
+        if self._spare.remove():  # otherwise the next opening must know that it is of use
+            self.settled = number
 
     def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta, migration: sql_tables.Statements = ()) -> None:
         with self._writing:
@@ -242,11 +278,21 @@ class SqliteStore:
         except OSError:  # it is not there
             return 0
 
+    def upkeep(self) -> None:
+        """Do what tidy() does: there is no journal."""
+        self.tidy()
+
     def tidy(self) -> None:
-        """Copy the -wal into the file, by a separate connection: the fsyncs delay no commit.
+        """Copy the -wal into the file and empty it, by a separate connection: the fsyncs delay no commit.
+
+        A copy of the -wal is kept until that is done, and SQLite checks the copy before. A tool that reads the file can
+        hold up the end of this; then the next call does it.
 
         A file with more free pages than used ones is written anew. So its size follows its content, at a fraction of
         the cost of filling and emptying those pages.
+
+        Raises:
+            CatalogDamaged: the -wal is not what was written to it; it is not copied.
         """
         own = contextlib.ExitStack()
         with self._tidying, errors_named(self.path), own:
@@ -256,17 +302,28 @@ class SqliteStore:
             self._pages = 0
             connection = sqlite3.connect(self.path, isolation_level=None, timeout=_BUSY_S)
             own.callback(connection.close)
-            vacuumed = self._has_too_many_pages()
-            if vacuumed:
-                with self._writing:
+            is_too_large = self._has_too_many_pages()
+            with self._writing:
+                if is_too_large:
                     self._connection.execute(_SHRINK)
-            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
-            if vacuumed or self._wal_bytes() > _WAL_LIMIT_BYTES:
+                number = self.meta.folded
+                if frames := self._spare.frames():
+                    self._spare.make(number, frames)
+            if frames:
+                connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
                 connection.execute("PRAGMA busy_timeout = 0")  # while a tool reads the file, the next tidy() does it
-                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+                ((is_busy, *_),) = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+                if is_busy:
+                    return
+            self._settle(number)
 
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
         """Close the store as the contract says. `settled`: whether the journal has no change of its own."""
+        if not erase and self._wal_bytes():
+            try:
+                self.tidy()
+            except CatalogError as error:
+                _log.warning("%s; the next opening does it", error)
         with self._tidying, errors_named(self.path):
             self._closed = True
             with self.folder:
@@ -279,7 +336,7 @@ class SqliteStore:
                     self._close_file()
                     if erase:
                         self._erase()
-                    elif settled and self.is_made and not self.folder.has(self._wal):
+                    elif settled and self.is_made and not self.folder.has(self._wal) and self._spare.is_gone():
                         self._lock.note(None)
                 finally:
                     self._lock.release(remove=erase)
@@ -290,7 +347,7 @@ class SqliteStore:
     def _erase(self) -> None:
         self._lock.note(None)  # a noted catalog without its file would count as damaged
         segments = segments_among(self.folder.names(), self.path)
-        for name in (*segments, *(file.name for file in files_of(self.path))):
+        for name in (*segments, *leftovers(self.path), *(file.name for file in files_of(self.path))):
             with contextlib.suppress(FileNotFoundError):
                 self.folder.unlink(name)
 
@@ -301,14 +358,13 @@ _NUMBER = re.compile(r"[1-9]\d{0,17}$")
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the catalog's file, and the files that SQLite has beside it while it is open."""
-    return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
+    """Return the catalog's file, and the files that there are beside it while it is open."""
+    return [path, *(path.with_name(path.name + ending) for ending in ("-wal", "-shm", ".spare-wal"))]
 
 
 def files_among(names: Sequence[str], path: Path) -> list[str]:
     """Return the names that belong to files_of() this catalog, or to its journal."""
-    own = path.name, f"{path.name}-wal", f"{path.name}-shm"
-    return [name for name in own if name in names] + segments_among(names, path)
+    return [file.name for file in files_of(path) if file.name in names] + segments_among(names, path)
 
 
 def has_file(folder: Folder, path: Path) -> bool:
@@ -387,7 +443,7 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
         CatalogDamaged, CatalogVersion: as open_store() describes; nothing is changed.
         Damage, sqlite3.Error, OSError: errors_named() turns these into a CatalogDamaged or a CatalogError.
     """
-    file, wal, shm = files_of(path)
+    file, wal, shm, _ = files_of(path)
     there = folder.look(file.name)
     left = folder.look(wal.name)
     folder.look(shm.name)
@@ -410,23 +466,6 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
         if problems != [("ok",)]:
             damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
         return sql_tables.read_meta(connection), sql_tables.read_all(connection)
-
-
-def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
-    """Raise Damage if a -wal belongs to another file than it is about to change, which SQLite does not check.
-
-    No process may have the file open.
-    """
-    if folder.look(files_of(path)[1].name) is None or not folder.has(path.name):
-        return
-    uri = f"{path.as_uri()}?immutable=1"
-    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
-        try:
-            found = sql_tables.read_meta(connection)
-        except (sqlite3.Error, Damage):  # a copy of the -wal was not finished: the -wal has the missing pages
-            return
-    if found.id != meta.id:
-        raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")
 
 
 def _check_header(path: Path, header: bytes) -> None:

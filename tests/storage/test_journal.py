@@ -57,7 +57,7 @@ def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Met
 
 def rows(catalog: Path, folded: int = 0, base: Sequence[Row] = (), owner: Meta = OWNER) -> list[Row]:
     content = content_of(base)
-    apply(content, journaled_store.read(folder_of(catalog), catalog).since(Meta(owner.id, owner.epoch, folded)))
+    apply(content, journaled_store.read(folder_of(catalog), catalog).since(Meta(owner.id, owner.epoch, folded)).changes)
     return in_order(rows_of(content))
 
 
@@ -248,12 +248,12 @@ def test_a_segment_that_is_known_to_be_begun_is_missed_though_it_is_the_last(
 ) -> None:
     paths = write(catalog, HISTORY)
     found = journaled_store.read(folder_of(catalog), catalog)
-    assert len(found.since(OWNER, 4)) == len([change for changes in flat(HISTORY) for change in changes])
+    assert len(found.since(OWNER, 4).changes) == len([change for changes in flat(HISTORY) for change in changes])
     assert caplog.text == ""
     for spoil in (Path.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(bytes(500))):
         paths[-1].touch()
         spoil(paths[-1])
-        assert journaled_store.read(folder_of(catalog), catalog).since(OWNER, 3) != []
+        assert journaled_store.read(folder_of(catalog), catalog).since(OWNER, 3).changes != []
         assert caplog.text == ""
         journaled_store.read(folder_of(catalog), catalog).since(OWNER, 4)
         assert "catalog.journal.4: missing" in caplog.text

@@ -62,8 +62,11 @@ class Faults:
             def cursor(self, factory: Any = Cursor) -> Any:
                 return super().cursor(factory)
 
-        def connect(*args: Any, **options: Any) -> sqlite3.Connection:
-            return CONNECT(*args, **options, factory=Connection)
+            def execute(self, sql: str, parameters: Any = (), /) -> sqlite3.Cursor:
+                return self.cursor().execute(sql, parameters)
+
+        def connect(place: Any, **options: Any) -> sqlite3.Connection:
+            return CONNECT(place, **options, factory=sqlite3.Connection if place == ":memory:" else Connection)
 
         monkeypatch.setattr(sqlite3, "connect", connect)
 
@@ -145,6 +148,9 @@ class Run:
             case "tidy":
                 assert self.store is not None
                 self.store.tidy()
+            case "fold":
+                assert self.store is not None
+                self.store.upkeep()
             case "close" | "erase":
                 store, self.store = self.store, None
                 assert store is not None
@@ -180,7 +186,7 @@ C: list[Change] = [Put(query("a", 7)), Drop("resources", "r")]
 D: list[Change] = [Put(query(f"d{n}", n)) for n in range(40)]
 E: list[Change] = [Drop("queries", f"d{n}") for n in range(40)]
 HISTORY: list[Any] = [
-    "open", A, B, "tidy", C, "tidy", D, E, "close", "open", A, D, "tidy", "tidy", B, "close",
+    "open", A, B, "tidy", C, "tidy", D, E, "close", "open", A, D, "tidy", "fold", B, "fold", C, "fold", A, "close",
     "open for power", C, D, "tidy", "close", "open", E, A, "erase", "open", B, "tidy", C, "close",
 ]  # fmt: skip
 

@@ -166,17 +166,25 @@ def test_segments_of_a_crash_are_folded_and_removed_at_the_next_opening(path: Pa
     for durability in ("process", "power"):
         again = left_by(copy, f"again-{durability}")
         store = open_store(again, durability=durability)
-        assert (segments(again), folded(again), content(store)) == ([], ["b"], [query("b")])
+        assert (folded(again), content(store)) == (["b"], [query("b")])
+        assert segments(again) == ([] if durability == "power" else segments(copy)), "the -wal alone is no second copy"
+        store.tidy()
         store.commit([Put(query("c"))])
         assert segments(again) == ([] if durability == "power" else ["catalog.journal.4"])
         store.close()
 
 
 def test_a_segment_that_could_not_be_removed_is_not_read_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = journaled(path)
+    store, unlink = journaled(path), os.unlink
+
+    def broken(name: str, **options: Any) -> None:
+        if "journal" in name:
+            raise OSError(5, "broken")
+        unlink(name, **options)
+
     store.commit([Put(query("a"))])
     with monkeypatch.context() as patch:
-        patch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "broken")))
+        patch.setattr(os, "unlink", broken)
         store.tidy()
     assert segments(path) == ["catalog.journal.1"]
     store.commit([Drop("queries", "a")])
@@ -309,7 +317,7 @@ def test_a_catalog_that_is_all_in_its_journal_is_read_locked_and_opened_by_the_n
     for durability in ("process", "power"):
         copy = left_by(path, f"copy-{durability}")
         again = open_store(copy, durability=durability)
-        assert (content(again), again.epoch, names(copy)[:2]) == ([query("b")], 2, ["catalog.lock", "catalog.sqlite3"])
+        assert (content(again), again.epoch, path.name in names(copy)) == ([query("b")], 2, True)
         again.close()
     store.close()
     assert (names(path), read_rows(path)) == (["catalog.lock", "catalog.sqlite3"], [query("b")])
@@ -436,7 +444,9 @@ def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_i
     for catalog in (path, copy):
         assert in_order(read_rows(catalog)) == rows
         store = journaled(catalog)
-        assert (content(store), segments(catalog)) == (rows, [])
+        assert content(store) == rows
+        store.tidy()
+        assert segments(catalog) == []
         store.close()
 
 
@@ -673,7 +683,7 @@ def test_a_ledger_folds_when_nothing_is_committed_any_more_or_at_last_anyway(
     noted, loop, _ = ledger
     commit(noted, query("a"))
     loop.advance(0.25)
-    assert (folded(path), segments(path), loop.timers) == (["a"], [], [])
+    assert (folded(path), segments(path), loop.timers) == (["a"], ["catalog.journal.1"], [])
     for n in range(30):
         commit(noted, query(f"b{n:02}"))
         loop.advance(0.09)
@@ -698,7 +708,7 @@ def test_a_ledger_does_not_fold_while_another_registrar_of_the_process_commits(
         loop.advance(0.09)
     assert segments(path) == ["catalog.journal.1"]
     loop.advance(0.25)
-    assert (folded(path), len(folded(store.path)), segments(path)) == (["a"], 20, [])
+    assert (folded(path), len(folded(store.path))) == (["a"], 20)
     commit(noted, query("c"))
     for n in range(30):
         commit(other, query(f"d{n:02}"))
@@ -725,7 +735,7 @@ def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room
     assert (content(store), segments(path)) == ([row], ["catalog.journal.3"])
     assert read_rows(left_by(path)) == [row]
     loop.advance(1.0)
-    assert (segments(path), loop.timers) == ([], [])
+    assert loop.timers == []
     with contextlib.closing(sqlite3.connect(path)) as connection:
         assert connection.execute("SELECT id FROM resources").fetchall() == [("large",)]
     noted.close(erase=False)
@@ -754,7 +764,7 @@ def spoil_its_file(path: Path) -> None:
 
 
 def spoil_a_segment(path: Path) -> None:
-    path.with_name("catalog.journal.2").write_bytes(b"text")
+    path.with_name("catalog.journal.3").write_bytes(b"text")
 
 
 def another_catalogs(path: Path) -> None:
@@ -826,7 +836,7 @@ def test_a_journal_left_beside_another_copy_of_its_catalog_is_not_mixed_with_it(
     copy.write_bytes(good)
     store = journaled(copy)
     assert content(store) == [query("a")]
-    assert "catalog.journal.2: missing" in caplog.text
+    assert f"{copy}: catalog.sqlite3 was removed, cut off, damaged, or put back from an older copy" in caplog.text
     store.close()
 
 

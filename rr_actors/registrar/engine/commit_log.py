@@ -209,7 +209,7 @@ class CommitLog:
             return
         if commits == _activity.commits or self._loop.time() >= at_last:
             with contextlib.suppress(Unavailable):  # the process is stopping, and soon closes this registrar
-                self._workers.submit(self.store.tidy, done=self._tidied, patient=True)
+                self._workers.submit(self.store.upkeep, done=self._tidied, patient=True)
         else:
             self._loop.call_later(_TIDY_SOON_S, self._look, at_last, _activity.commits)
 

@@ -10,7 +10,7 @@ Each implementation guarantees:
 - A catalog has one open store: a second `open` raises CatalogLocked until the first is closed or its process is dead.
 
 The caller's duties: if `commit` raises, it treats the changes as not made. It calls `close` once, and nothing after it.
-It uses a store from one thread at a time; only `tidy` may run in another.
+It uses a store from one thread at a time; only `upkeep` and `tidy` may run in another.
 """
 
 from __future__ import annotations
@@ -42,11 +42,21 @@ class Store(Protocol):
         ...
 
     def wants_tidying(self) -> bool:
-        """Return whether the caller should call tidy() a moment after its commits."""
+        """Return whether the caller should call upkeep() a moment after its commits."""
+        ...
+
+    def upkeep(self) -> None:
+        """Bring the file up to date for other readers, and keep commits fast and the files small.
+
+        This may take long: call it in another thread, while commits continue.
+
+        Raises:
+            CatalogError: the files could not be written; nothing is lost.
+        """
         ...
 
     def tidy(self) -> None:
-        """Bring the file up to date for other readers, and keep commits fast and the files small.
+        """Do what upkeep() does, and leave nothing of it to be done later.
 
         This may take long: call it in another thread, while commits continue.
 
@@ -84,6 +94,9 @@ class MemoryStore:
 
     def wants_tidying(self) -> bool:
         return False
+
+    def upkeep(self) -> None:
+        """Do nothing."""
 
     def tidy(self) -> None:
         """Do nothing."""
