@@ -115,15 +115,21 @@ def _written_with_the_next() -> None:
 
 
 def _not_read() -> None:
-    def wrap(since: Any) -> Any:
-        return lambda self, folded, owner, begun: since(self, folded, owner, begun)[:0]
-
-    override(JournalFiles, "since", wrap)
+    _read_up_to(0)
 
 
 def _read_without_its_newest() -> None:
+    _read_up_to(-3)
+
+
+def _read_up_to(end: int) -> None:
     def wrap(since: Any) -> Any:
-        return lambda self, folded, owner, begun: since(self, folded, owner, begun)[:-3]
+        def broken(self: JournalFiles, *args: Any, **options: Any) -> Any:
+            found = since(self, *args, **options)
+            found.changes = found.changes[:end]
+            return found
+
+        return broken
 
     override(JournalFiles, "since", wrap)
 

@@ -7,17 +7,15 @@ SIGKILL. A row that is put and dropped again before the folding never gets into 
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import re
 import struct
 import threading
 import time
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from operator import attrgetter
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
@@ -25,8 +23,9 @@ from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import Folder
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
+from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Put, apply
 from rr_actors.storage.damage import Damage
+from rr_actors.storage.journal_rows import check_lengths, check_numbers, decoded
 from rr_actors.storage.sql_tables import Meta, net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segments_among
 from rr_actors.storage.witness import segment_prefix
@@ -259,8 +258,6 @@ _CHECKSUM = struct.Struct("<I")
 _RECORD = struct.Struct("<III")  # the body's length, that XOR the checksum before, the checksum
 _UINT64 = b"\xcf"  # msgpack's first byte of an integer of eight bytes; a search for it alone is quicker
 _TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # an integer too large for SQLite, or other bytes by chance
-_ARRAY = 0x90  # msgpack's first byte of an array of up to fifteen items: a row
-_LARGEST = 2**63 - 1
 _LONGEST = 10**9 - 1000  # bytes: about the longest row that SQLite takes
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -371,9 +368,9 @@ class Segment:
         """Write changes as one record, or write nothing and raise an OSError or an error of JournaledStore.commit()."""
         body = _encode([(TABLE_OF[type(c.row)], c.row) if type(c) is Put else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
-            _check_lengths(changes)
+            check_lengths(changes, _LONGEST)
         if _UINT64 in body and _TOO_LARGE.search(body):
-            _check_numbers(changes)
+            check_numbers(changes)
         data, checksum = record(body, self._checksum)
         self._size = write_whole(self._fd, data, self._size)
         self._checksum = checksum
@@ -534,11 +531,11 @@ def _behind(data: bytes, end: RecordEnd) -> list[Change]:
         if after + _RECORD.size > len(data) and after != len(data):
             continue
         with contextlib.suppress(Damage):
-            found += _decoded(data[start:after])
+            found += decoded(data[start:after])
         if after < len(data):
             length, first, _ = _RECORD.unpack_from(data, after)
             for body, _ in records(data, RecordEnd(after, first ^ length)):
-                found += _decoded(body)
+                found += decoded(body)
     return found
 
 
@@ -563,27 +560,6 @@ def _checksum_of(registrar: str) -> int:
     return zlib.crc32(registrar.encode())
 
 
-def _check_lengths(changes: Sequence[Change]) -> None:
-    for change in changes:
-        if isinstance(change, Put) and (size := len(_encode(change.row))) > _LONGEST:
-            raise OverflowError(f"{change.row.id}: expected a row of up to {_LONGEST} bytes, got {size}")
-
-
-def _check_numbers(changes: Iterable[Change]) -> None:
-    """Check the numbers of rows if their bytes may have a too large one. Many rows' bytes do, so this must be quick."""
-    for change in changes:
-        if type(change) is Put:
-            largest = max(_numbers(type(change.row))(change.row))
-            if largest > _LARGEST:
-                raise OverflowError(f"{change.row.id}: expected a number up to {_LARGEST}, got {largest}")
-
-
-@functools.cache
-def _numbers(type_: type[Row]) -> Callable[[Row], tuple[int, ...]]:
-    names = [field.name for field in msgspec.structs.fields(type_) if field.type == Int64]
-    return attrgetter(*names, *names) if names else lambda _: (0,)  # twice: for one name it would return no tuple
-
-
 def _checked(name: str, number: int, data: bytes) -> bytes | None:
     """Check the header of a segment, and return the segment's bytes; None if the header was not written whole."""
     header = data[: _HEADER.size]
@@ -603,26 +579,7 @@ def _read_records(data: bytes, changes: list[Change]) -> tuple[End, RecordEnd]:
     end = RecordEnd(_HEADER.size, checksum)
     count = 0
     for body, after in records(data, end):
-        changes += _decoded(body)
+        changes += decoded(body)
         count += 1
         end = after
     return End(count, end.checksum), end
-
-
-def _decoded(body: bytes) -> list[Change]:
-    try:
-        return [_change(table, raw) for table, raw in _decoder(list[tuple[Table, msgspec.Raw]])(body)]
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise Damage(f"a bad record in its journal: {error}") from error
-
-
-def _change(table: Table, raw: msgspec.Raw) -> Change:
-    if bytes(raw)[0] & 0xF0 == _ARRAY:
-        return Put(_decoder(TABLES[table])(raw))
-    return Drop(table, _decoder(str)(raw))
-
-
-@functools.cache
-def _decoder(type_: Any) -> Callable[[Any], Any]:
-    """Return a decoder, made at the first reading: few openings find a journal."""
-    return msgspec.msgpack.Decoder(type_).decode
