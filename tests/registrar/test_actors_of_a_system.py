@@ -55,13 +55,14 @@ def app(system: rr.System) -> rr.Registrar:
 def delivered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     """What mailboxes of this process's registrars and clients took from now on: the actor's path and the message."""
     found: list[tuple[str, str]] = []
-    deliver = TurnActor.deliver
+    for name in ("deliver", "enqueue"):
+        put: Callable[..., None] = getattr(TurnActor, name)
 
-    def noted(actor: TurnActor, message: Any, sender: str | None = None, *, more: bool = False) -> None:
-        found.append((str(actor.actor_ref.path), type(message).__name__))
-        deliver(actor, message, sender, more=more)
+        def noted(actor: TurnActor, message: Any, *args: Any, put: Callable[..., None] = put, **kwargs: Any) -> None:
+            found.append((str(actor.actor_ref.path), type(message).__name__))
+            put(actor, message, *args, **kwargs)
 
-    monkeypatch.setattr(TurnActor, "deliver", noted)
+        monkeypatch.setattr(TurnActor, name, noted)
     return found
 
 

@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.actors.turns import Delivery
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.engine.commit_log import CommitLog
@@ -610,7 +609,7 @@ def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monke
 def test_while_something_waits_to_be_decided_the_loop_lets_it_go(app: rr.Registrar, watched: Watched) -> None:
     """It may be about the query."""
     query = taken_up(app, watched, saved=True)
-    actor_of(app).waiting.append(Delivery(c.LinkLost("nobody")))
+    actor_of(app).waiting.append((c.LinkLost("nobody"), None))
     assert not actor_of(app).owe(query.id)
     query.unload()
     assert watched.found == [Hold.OWED]

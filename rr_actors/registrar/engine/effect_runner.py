@@ -65,7 +65,7 @@ class EffectRunner:
         }
 
     def do(self, effects: Sequence[Effect]) -> None:
-        """Carry out the effects in their order, and flush each link once, at the end.
+        """Carry out the effects in their order; at the end each client sends its requests, and each link is flushed.
 
         A decision has its events before its answers, some of which leave at once, by direct lines. A process that is
         killed after an answer has therefore sent the event. Worker threads are woken once for all callbacks: otherwise
@@ -87,6 +87,7 @@ class EffectRunner:
         if self._dirty:
             dirty, self._dirty = self._dirty, {}
             for client in dirty.values():
+                client.take_turns()
                 client.flush()
 
     @with_lock
@@ -116,7 +117,7 @@ class EffectRunner:
 
     def _request(self, effect: e.SendRequest) -> None:
         client = self._clients[effect.registrar]
-        client.deliver(effect)
+        client.enqueue(effect)
         self._dirty[effect.registrar] = client
 
     def _connect(self, effect: e.Connect) -> None:

@@ -274,10 +274,7 @@ class RegistrarBase(RegistrarState, abc.ABC):
         failure = ""
         try:
             read = self.reader.read
-            items: list[Item] = [
-                (what.message, what.sender) if type(what.message) is not Load else read(what.message, what.sender)
-                for what in deliveries
-            ]
+            items: list[Item] = [item if type(item[0]) is not Load else read(*item) for item in deliveries]
             try:
                 decision = self.commit(items)
                 if decision.effects:
@@ -296,7 +293,7 @@ class RegistrarBase(RegistrarState, abc.ABC):
         refusals.close()  # this decision has effects only
         self._effects.append(refusals.effects)
         if again:
-            self.hold_up([Delivery(*item) for item in again], _RETRY_S)
+            self.hold_up(again, _RETRY_S)
 
     @on_loop
     def follow(self) -> None:

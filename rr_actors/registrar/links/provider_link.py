@@ -125,8 +125,8 @@ class ProviderLink(TurnActor):
 
     def handle(self, deliveries: Sequence[Delivery]) -> None:
         """Do what the registrar wants of its provider."""
-        for delivery in deliveries:
-            match delivery.message:
+        for message, _ in deliveries:
+            match message:
                 case SendRequest() as wanted:
                     self._request(wanted)
                 case Connect():
