@@ -35,6 +35,7 @@ from rr_actors.managers.program_usage import ProgramUsage
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.control_groups import ControlGroups
 from rr_actors.runtime.processes.process import signal_name
+from rr_actors.runtime.time_limits import RunningLimit
 
 logger = Log("rr_actors.managers.external_programs")
 
@@ -166,8 +167,8 @@ class ExternalPrograms:
             ProgramFailed: the program has ended, or its shim's state file is damaged: then the program is ended.
         """
         home = self._home(key)
-        deadline = time.monotonic() + _SHIM_LIMIT_S
-        while home.is_held() and time.monotonic() < deadline:
+        limit = RunningLimit(_SHIM_LIMIT_S)
+        while home.is_held() and not limit.is_over():
             state = home.state()
             if "damaged" in state:
                 raise ProgramFailed(state["damaged"])
@@ -333,7 +334,7 @@ class ExternalPrograms:
         timeout_s: float,
         spawned: ProcessHandle | None,
     ) -> Running:
-        deadline = time.monotonic() + timeout_s
+        limit = RunningLimit(timeout_s)
         asked: Future[bool] | None = None
         while True:
             state = home.state()
@@ -352,7 +353,7 @@ class ExternalPrograms:
                 asked = None
             if self._gives_up:
                 raise ProgramFailed(f"{command!r} was not ready yet, and its manager is being stopped")
-            if time.monotonic() > deadline:
+            if limit.is_over():
                 output = "\n".join(f"  {line}" for line in home.output(TAIL_LINES)) or "  (none)"
                 hangs = "" if asked is None else " (the check whether it is ready has not returned)"
                 raise ProgramFailed(f"{command!r} was not ready within {timeout_s:g} s{hangs}; its output:\n{output}")
@@ -397,21 +398,30 @@ class ExternalPrograms:
 
     def _stop_shim(self, home: Home) -> None:
         """Ask the shim that holds the lock to end its program, and wait until the shim has ended."""
-        deadline = time.monotonic() + _SHIM_LIMIT_S
+        limit = RunningLimit(_SHIM_LIMIT_S)
         while (shim := shim_of(state := home.state())) is None or shim.wait(0):
             if shim is not None:
                 shim.close()  # the previous shim, which has ended
             if not home.is_held():
                 return
-            if time.monotonic() > deadline:
+            if limit.is_over():
                 kill_allocation(home.key)  # the shim cannot write (a full disk?): it ends with its program
                 return
             time.sleep(_POLL_S)  # the shim is just starting
         with contextlib.closing(shim):
             shim.send_signal(signal.SIGTERM)
-            if not shim.wait(state["grace_s"] + _SHIM_LIMIT_S):
+            if not _has_ended(shim, state["grace_s"] + _SHIM_LIMIT_S):
                 shim.send_signal(signal.SIGKILL)
                 shim.wait(_SHIM_LIMIT_S)
+
+
+def _has_ended(shim: ProcessHandle, limit_s: float) -> bool:
+    """Wait, and return whether the shim has ended within the time. It may have stood still with this process."""
+    limit = RunningLimit(limit_s)
+    while not shim.wait(limit.slice_s):
+        if limit.is_over():
+            return False
+    return True
 
 
 def _signal_all(shim: ProcessHandle, program: Running, number: int) -> None:

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 
 LOG_LIMIT_BYTES = 256 * 1024
 LINE_LIMIT_BYTES = 64 * 1024
+_LONGEST_SLICE_S = 0.25  # of the grace
 TAKEN = 75  # exit code of a shim that is not needed: another holds the lock, the directory is gone, or no order came
 
 _PR_SET_PDEATHSIG = 1
@@ -107,7 +108,9 @@ class Shim:
         self._log_bytes = 0
         self._asked = False  # to stop
         self._searching = False
-        self._stop_at: float | None = None  # when the grace is over
+        self._grace_s: float | None = None  # what is left of it, once the program is being stopped
+        self._slice_s = min(order["grace_s"] / 16, _LONGEST_SLICE_S)
+        self._counted_at = 0.0
         self._ended = False
         self._wakeup = self._catch_signals()
 
@@ -118,9 +121,9 @@ class Shim:
         while not self._ended:
             self._wait()
             self._reap()
-            if self._asked and self._stop_at is None:
+            if self._asked and self._grace_s is None:
                 self._begin_stop()
-            if self._stop_at is not None and time.monotonic() >= self._stop_at:
+            if self._is_grace_over():
                 break
         self._kill_all()
         self._copy_output()
@@ -160,13 +163,13 @@ class Shim:
     # -- while it runs ---------------------------------------------------------------------------------------------
 
     def _wait(self) -> None:
-        """Sleep until there is output, a child's end, a signal, or the grace is over."""
+        """Sleep until there is output, a child's end, a signal, or a slice of the grace is over."""
         poll = select.poll()
         poll.register(self._wakeup, select.POLLIN)
         if self._output >= 0:
             poll.register(self._output, select.POLLIN)
-        limit_ms = None if self._stop_at is None else max(0, int((self._stop_at - time.monotonic()) * 1000) + 1)
-        for descriptor, _ in poll.poll(limit_ms):
+        slice_s = None if self._grace_s is None else min(self._grace_s, self._slice_s)
+        for descriptor, _ in poll.poll(None if slice_s is None else int(slice_s * 1000) + 1):
             if descriptor == self._output:
                 self._copy_output()
             else:
@@ -221,11 +224,21 @@ class Shim:
             raise _Interrupted
 
     def _begin_stop(self) -> None:
-        self._stop_at = time.monotonic() + self._order["grace_s"]
+        self._grace_s = self._order["grace_s"]
+        self._counted_at = time.monotonic()
         self._state["stopped"] = True
         self._signal_all(self._order["stop_signal"])
         _write(self._order["group"], "cgroup.freeze", "0")  # a paused program acts on no signal
         self._signal_all(signal.SIGCONT)
+
+    def _is_grace_over(self) -> bool:
+        """Count a slice at most: this process may have stood still longer, and the program with it."""
+        if self._grace_s is None:
+            return False
+        now = time.monotonic()
+        self._grace_s -= min(now - self._counted_at, self._slice_s)
+        self._counted_at = now
+        return self._grace_s <= 0
 
     def _reap(self) -> None:
         """Reap every child that has ended, and note the end of the program."""
@@ -234,7 +247,7 @@ class Shim:
                 pid, status = os.waitpid(-1, os.WNOHANG)
                 if pid == 0:
                     return
-                if self._note_end(pid, status) and self._stop_at is None:
+                if self._note_end(pid, status) and self._grace_s is None:
                     self._ended = True  # it ended unasked: its descendants have no purpose any more
         self._ended = True  # no child is left
 

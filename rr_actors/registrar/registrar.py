@@ -10,7 +10,6 @@ import abc
 import asyncio
 import functools
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, wait
@@ -91,7 +90,7 @@ from rr_actors.registrar.pages import Page, Wanted, counted_loads, load_rows, pa
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, response_bytes
 from rr_actors.registrar.replacements import Replacements, encoded_response
 from rr_actors.runtime.event_loop import check_asyncio
-from rr_actors.runtime.time_limits import finite_time, time_limit
+from rr_actors.runtime.time_limits import RunningLimit, finite_time, time_limit
 from rr_actors.streams.stream import StreamInfo
 
 if TYPE_CHECKING:
@@ -1040,14 +1039,15 @@ class Registrar(Consumer):
 
     def _measured(self, wanted: frozenset[str] | None, limit_s: float) -> dict[str, Measured]:
         """Run the usage callbacks, and return what they have said within the limit."""
-        deadline = time.monotonic() + limit_s
+        limit = RunningLimit(limit_s)
         asked = self._calls.call(self._measured_now, wanted)
         begun: dict[str, Future[Measured]] = {}
-        while len(begun) < len(asked) and (left_s := deadline - time.monotonic()) > 0:
+        while not limit.is_over() and len(begun) < len(asked):
             some = self._calls.call(_begun, asked[len(begun) : len(begun) + _AT_ONCE])
             begun |= some
-            wait(some.values(), left_s if len(begun) == len(asked) else min(_PATIENCE_S, left_s))
-        wait(begun.values(), max(0.0, deadline - time.monotonic()))
+            wait(some.values(), min(_PATIENCE_S, limit.slice_s))
+        while not limit.is_over() and wait(begun.values(), limit.slice_s).not_done:
+            pass  # wait on, by slices
         ended: dict[str, Measured] = {}
         for resource, server in asked:
             future, late = begun.get(resource.id), f"{server.origin}: usage: not returned within {limit_s:g} s"

@@ -1,4 +1,9 @@
-"""Time limits: the check of a user's limit, waits with a limit, one timer for many limits, and probes with a limit."""
+"""Time limits: the check of a user's limit, waits with a limit, one timer for many limits, and probes with a limit.
+
+Two clocks count limits. A caller's own `timeout_s` counts by the monotonic clock. The limits of callbacks, programs and
+processes count by RunningTime, which leaves out the time in which this process stood still itself: SIGSTOP, a frozen
+control group, a suspended machine, a debugger. What is limited may have stood still with it.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +24,9 @@ from rr_actors.runtime.thread_rules import any_thread, on_loop
 _LONGEST_S = 2_000_000  # 23 days
 LONGEST_GRACE_S = _LONGEST_S - 1.0
 """The longest time that a timer is set for."""
-_SLICE_S = 0.25  # the longest wait before the clock is read again,
-_SLICE = 1 / 16  # and the same as a part of the limit
+_SLICE_S = 0.25  # how far apart two readings of a running time are at most,
+_SLICE = 1 / 16  # and the same as a part of the limit,
+_SLICE_OF_LONG = 1 / 240  # and of a limit of more than a minute
 
 
 def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None:
@@ -64,20 +70,122 @@ def left_until(deadline: float) -> float | None:
     return None if deadline == math.inf else max(0.0, deadline - time.monotonic())
 
 
-async def wait_while_running(future: asyncio.Future[Any], limit_s: float | None) -> None:
-    """Wait until `future` is done, or this process has run for `limit_s` seconds meanwhile; None is no limit.
+class RunningTime:
+    """The seconds for which this process has run, for one thread, which reads them again and again.
 
-    Time in which the process stood still counts as a quarter of a second at most. The other side may have stood still
-    with it, as when a machine is suspended or a whole process group is stopped.
+    Two readings that are further apart than twice `slice_s` have a standstill between them, and count as `slice_s`.
+
+    Attributes:
+        slice_s: seconds until the next reading, as the thread plans it. Set it after a reading, and before the wait.
     """
-    loop = asyncio.get_running_loop()
-    left_s = math.inf if limit_s is None else limit_s
-    while not future.done() and left_s > 0:
-        slice_s = None if limit_s is None else min(left_s, limit_s * _SLICE, _SLICE_S)
-        began = loop.time()
-        await asyncio.wait((future,), timeout=slice_s)
-        if slice_s is not None:
-            left_s -= min(loop.time() - began, slice_s)
+
+    __slots__ = ("_clock", "_ran_s", "_read_at", "slice_s")
+
+    def __init__(self, slice_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self.slice_s = clock, slice_s
+        self._read_at, self._ran_s = clock(), 0.0
+
+    def read(self) -> float:
+        """Return the seconds since the beginning, without standstills."""
+        now = self._clock()
+        passed_s, self._read_at = now - self._read_at, now
+        self._ran_s += passed_s if passed_s < 2 * self.slice_s else self.slice_s
+        return self._ran_s
+
+
+class RunningLimit:
+    """A time limit that begins now, and counts the time for which this process runs. For one thread.
+
+    Wait at most `slice_s` at a time, and ask is_over() after each wait.
+    """
+
+    __slots__ = ("_limit_s", "_ran", "_ran_s")
+
+    def __init__(self, limit_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._limit_s, self._ran, self._ran_s = limit_s, RunningTime(slice_of(limit_s), clock), 0.0
+
+    def is_over(self) -> bool:
+        """Return whether the process has run for the whole limit."""
+        self._ran_s = self._ran.read()
+        return self._ran_s >= self._limit_s
+
+    @property
+    def slice_s(self) -> float:
+        """How many seconds the next wait may take."""
+        return max(0.0, min(self._ran.slice_s, self._limit_s - self._ran_s))
+
+
+def slice_of(limit_s: float) -> float:
+    """Return how far apart the readings of a running time are for a limit: a standstill counts as so much."""
+    return max(min(limit_s * _SLICE, _SLICE_S), limit_s * _SLICE_OF_LONG)
+
+
+async def wait_while_running(future: asyncio.Future[Any], limit_s: float | None) -> None:
+    """Wait until `future` is done, or this process has run for `limit_s` seconds meanwhile; None is no limit."""
+    if limit_s is None:
+        await asyncio.wait((future,))
+        return
+    limit = RunningLimit(limit_s, asyncio.get_running_loop().time)
+    while not future.done() and not limit.is_over():
+        await asyncio.wait((future,), timeout=limit.slice_s)
+
+
+class RunningTimers:
+    """Timers of one loop, by keys, which count the time for which this process runs. On the loop.
+
+    One more timer, the ticker, reads that time while any timer waits.
+    """
+
+    def __init__(self, loop: AbstractEventLoop) -> None:
+        self._loop = loop
+        self._ran = RunningTime(_SLICE_S, loop.time)
+        self._timers: dict[str, TimerHandle] = {}
+        self._slices: dict[str, float] = {}
+        self._ticker: TimerHandle | None = None
+
+    def set(self, key: str, delay_s: float, fire: Callable[[], object]) -> None:
+        """Call `fire` when the process has run for `delay_s` more seconds. It replaces the timer of the same key."""
+        self.cancel(key)
+        self._timers[key] = self._loop.call_later(delay_s, self._look, key, self._ran.read() + delay_s, fire)
+        if delay_s > 0:
+            slice_s = self._slices[key] = max(slice_of(delay_s), _SOON_S)
+            if self._ticker is None or slice_s < self._ran.slice_s:
+                self._tick_in(slice_s)
+
+    def cancel(self, key: str) -> None:
+        """Cancel the timer of a key, if there is one."""
+        timer = self._timers.pop(key, None)
+        if timer is not None:
+            timer.cancel()
+            self._slices.pop(key, None)
+
+    def close(self) -> None:
+        """Cancel all timers."""
+        for key in list(self._timers):
+            self.cancel(key)
+        if self._ticker is not None:
+            self._ticker.cancel()
+
+    def _look(self, key: str, due: float, fire: Callable[[], object]) -> None:
+        left_s = due - self._ran.read()
+        if left_s > _SOON_S:
+            self._timers[key] = self._loop.call_later(left_s, self._look, key, due, fire)
+            return
+        del self._timers[key]
+        self._slices.pop(key, None)
+        fire()
+
+    def _tick_in(self, slice_s: float) -> None:
+        if self._ticker is not None:
+            self._ticker.cancel()
+        self._ran.slice_s = slice_s
+        self._ticker = self._loop.call_later(slice_s, self._tick)
+
+    def _tick(self) -> None:
+        self._ticker = None
+        self._ran.read()
+        if self._slices:
+            self._tick_in(min(self._slices.values()))
 
 
 class TimeLimits:
@@ -133,18 +241,20 @@ class TimedRun(msgspec.Struct, eq=False):
 
     Attributes:
         began: when the callback began; None while it waits for a thread. Another thread sets it.
-        late_at: when the callback was last found late; None: it is not late.
+        ran_s: how long it has run, without standstills of this process, as of the last look.
+        late_at: when the callback was last found late, by the running time; None: it is not late.
         after: what waits until it has returned, or is late.
     """
 
     began: float | None = None
+    ran_s: float = 0.0
     late_at: float | None = None
     after: list[Callable[[], None]] = msgspec.field(default_factory=list[Callable[[], None]])
 
 
 @on_loop
 class Probes:
-    """The probes of the resources of one server.
+    """The probes of the resources of one server. Their time limits count the time for which this process runs.
 
     Args:
         every_s: the length of a period.
@@ -170,6 +280,8 @@ class Probes:
         self._left: deque[str] = deque()
         self._size = 0  # keys of this round
         self._round_began = -math.inf
+        self._slice_s = slice_of(timeout_s)
+        self._ran, self._ran_s = RunningTime(self._slice_s), 0.0  # and the running time at the last look
         self._timer: TimerHandle | None = None
         self._closed = False
 
@@ -184,6 +296,10 @@ class Probes:
             self._timer.cancel()
         for probe in list(self._running.values()):
             _go_on(probe)
+
+    def ran_s(self) -> float:
+        """Return the seconds for which this process has run; of a standstill between two rounds, at most a period."""
+        return self._ran.read()
 
     # -- one probe ---------------------------------------------------------------------------------------------------
 
@@ -226,8 +342,10 @@ class Probes:
         if not self._left and now >= self._round_began + self._every_s:
             self._left = deque(self._keys())
             self._size, self._round_began = len(self._left), now
-        self._probe(self._due(now), now)
-        self._timer = self._loop.call_later(max(self._next_at(now) - now, _SOON_S), self._tick)
+        self._probe(self._due(now))
+        wait_s = max(self._next_at(now) - now, _SOON_S)
+        self._ran.slice_s = max(wait_s, self._slice_s)
+        self._timer = self._loop.call_later(wait_s, self._tick)
 
     def _due(self, now: float) -> list[str]:
         """Take the next keys out of the round: as many as belong into the part of the period that is over."""
@@ -235,31 +353,35 @@ class Probes:
         due = len(self._left) - math.floor(self._size * (1 - min(part, 1.0)))
         return [self._left.popleft() for _ in range(due)]
 
-    def _probe(self, keys: list[str], now: float) -> None:
+    def _probe(self, keys: list[str]) -> None:
         free = [key for key in keys if key not in self._running]
         if len(free) < len(keys):
             for key in set(keys) - set(free):
-                self._still_late(key, self._running[key], now)
+                self._still_late(key, self._running[key])
         if free:
             self._running.update((key, TimedRun()) for key in free)
             self._start(free)
 
     def _end_late(self, now: float) -> None:
+        before_s, self._ran_s = self._ran_s, self._ran.read()
         for key, probe in list(self._running.items()):
-            if probe.late_at is None and probe.began is not None and now - probe.began >= self._timeout_s:
-                probe.late_at = now
-                self._late(key)
-                _go_on(probe)
+            if probe.late_at is None and probe.began is not None:
+                probe.ran_s += min(self._ran_s - before_s, now - probe.began)
+                if probe.ran_s >= self._timeout_s:
+                    probe.late_at = self._ran_s
+                    self._late(key)
+                    _go_on(probe)
 
-    def _still_late(self, key: str, probe: TimedRun, now: float) -> None:
-        if probe.late_at is not None and now - probe.late_at >= self._every_s / 2:  # else this round has counted it
-            probe.late_at = now
+    def _still_late(self, key: str, probe: TimedRun) -> None:
+        late_at = probe.late_at
+        if late_at is not None and self._ran_s - late_at >= self._every_s / 2:  # else this round has counted it
+            probe.late_at = self._ran_s
             self._late(key)
 
     def _next_at(self, now: float) -> float:
         round_at = now + _PART_S if self._left else self._round_began + self._every_s
-        limits = (probe.began or now for probe in self._running.values() if probe.late_at is None)
-        return min(round_at, min(limits, default=math.inf) + self._timeout_s)
+        left_s = (self._timeout_s - probe.ran_s for probe in self._running.values() if probe.late_at is None)
+        return min(round_at, now + min((min(left, self._slice_s) for left in left_s), default=math.inf))
 
 
 def _go_on(probe: TimedRun) -> None:

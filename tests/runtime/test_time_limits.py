@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rr_actors.runtime.time_limits import TimeLimits
+from rr_actors.runtime.time_limits import RunningLimit, RunningTimers, TimeLimits
 
 
 class Timer:
@@ -145,3 +145,63 @@ def test_one_that_raises_stops_no_other(clock: Clock) -> None:
         clock.pass_until(2.0)
     clock.pass_until(2.0)
     assert heard == ["raised", "called"]
+
+
+def timers_of(clock: Clock) -> RunningTimers:
+    return RunningTimers(cast("asyncio.AbstractEventLoop", clock))
+
+
+@given(st.floats(0.1, 300), st.floats(0, 1), st.floats(0.5, 1e6))
+def test_a_timer_leaves_out_a_standstill_but_for_a_sixteenth_of_its_time(
+    delay_s: float, part: float, still_s: float
+) -> None:
+    clock, fired = Clock(), list[float]()
+    timers_of(clock).set("one", delay_s, lambda: fired.append(clock.now))
+    clock.pass_until(part * delay_s)
+    clock.now += still_s
+    clock.pass_until(clock.now + 2 * delay_s)
+    assert len(fired) == (part < 1 or 1)
+    assert fired[0] <= delay_s + still_s + 0.01
+    assert part == 1 or fired[0] >= delay_s + (still_s - delay_s / 8 if still_s >= delay_s / 8 else 0) - 0.01
+    assert clock.timers == 0
+
+
+def test_timers_of_many_lengths_fire_in_their_time_and_share_one_ticker(clock: Clock) -> None:
+    timers, fired = timers_of(clock), list[tuple[float, float]]()
+    lengths = [0.0, 0.5, 1.0, 7.0, 100.0, 3600.0]
+    for length_s in lengths:
+        timers.set(f"{length_s}", length_s, lambda length_s=length_s: fired.append((length_s, clock.now)))
+    assert clock.timers == len(lengths) + 1
+    clock.pass_until(4000)
+    assert [length_s for length_s, _ in fired] == lengths
+    assert [at for _, at in fired] == pytest.approx(lengths)
+    assert clock.timers == 0
+
+
+def test_a_timer_that_is_replaced_or_cancelled_does_not_fire(clock: Clock) -> None:
+    timers, fired = timers_of(clock), list[str]()
+    timers.set("one", 1.0, lambda: fired.append("first"))
+    timers.set("one", 2.0, lambda: fired.append("second"))
+    timers.set("two", 1.0, lambda: fired.append("two"))
+    timers.cancel("two")
+    timers.cancel("three")
+    clock.pass_until(10)
+    assert fired == ["second"]
+    timers.set("one", 1.0, lambda: fired.append("closed"))
+    timers.close()
+    assert clock.timers == 0
+
+
+def test_a_limit_is_over_when_the_process_has_run_for_it(clock: Clock) -> None:
+    limit = RunningLimit(1.0, clock.time)
+    for _ in range(8):
+        clock.now += limit.slice_s
+        assert not limit.is_over()
+    clock.now += 100
+    assert not limit.is_over()
+    waits = 0
+    while not limit.is_over():
+        clock.now += limit.slice_s
+        waits += 1
+    assert waits == 7
+    assert RunningLimit(0.0).is_over()

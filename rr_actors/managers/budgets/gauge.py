@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import shown, text_of
 from rr_actors.managers.budgets.measures import Measure, Probe
+from rr_actors.runtime.time_limits import RunningLimit
 
 
 class Gauge:
@@ -55,10 +57,11 @@ class Gauge:
 
     def _wait(self) -> float | str | None:
         """Return the probe's answer, however late; None when the gauge is stopped."""
-        try:
-            return self._answers.get(timeout=self._measure.timeout_s)
-        except queue.Empty:
-            self._troubled(f"has not returned within {self._measure.timeout_s:g} s")
+        limit = RunningLimit(self._measure.timeout_s)
+        while not limit.is_over():
+            with contextlib.suppress(queue.Empty):
+                return self._answers.get(timeout=limit.slice_s)
+        self._troubled(f"has not returned within {self._measure.timeout_s:g} s")
         return self._answers.get()
 
     def _ask(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from asyncio import TimerHandle
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,6 +18,7 @@ from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.rows import OWED, Resource, is_revocation
 from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
+from rr_actors.runtime.time_limits import RunningTimers
 
 logger = Log("rr_actors.registrar")
 
@@ -38,7 +38,7 @@ class EffectRunner:
         self._clients = links
         self._loop = registrar.node.dispatcher.loop
         self._workers = registrar.node.dispatcher.workers
-        self._timers: dict[str, TimerHandle] = {}
+        self._timers = RunningTimers(self._loop)
         self._dirty: dict[str, ProviderLink] = {}  # the clients with unsent requests
         self._silent_until: dict[str, float] = {}  # by consumer: when the log says next that it is behind
         self._methods: dict[type, Callable[[Any], None]] = {
@@ -107,8 +107,7 @@ class EffectRunner:
 
     def close(self) -> None:
         """Cancel all timers."""
-        for timer in self._timers.values():
-            timer.cancel()
+        self._timers.close()
 
     # -- messages ------------------------------------------------------------------------------------------------
 
@@ -185,16 +184,10 @@ class EffectRunner:
     # -- timers --------------------------------------------------------------------------------------------------
 
     def _set_timer(self, effect: e.SetTimer) -> None:
-        old = self._timers.pop(effect.key, None)
-        if old is not None:
-            old.cancel()
-        if effect.delay_s is not None:
-            fire = functools.partial(self._timer_fired, effect.key, effect.command)
-            self._timers[effect.key] = self._loop.call_later(effect.delay_s, fire)
-
-    def _timer_fired(self, key: str, command: c.Command) -> None:
-        self._timers.pop(key, None)
-        self._registrar.post(command)
+        if effect.delay_s is None:
+            self._timers.cancel(effect.key)
+        else:
+            self._timers.set(effect.key, effect.delay_s, functools.partial(self._registrar.post, effect.command))
 
     # -- waiting callers and listeners ---------------------------------------------------------------------------
 

@@ -856,7 +856,7 @@ class ServerActor:
         if self.registrar.closed or not self._is_probed(resource_id):
             return
         counts = self._counts.get(resource_id) or first_counts(self.registrar.catalog.resources[resource_id].state)
-        self._counts[resource_id], state = judged(self._health, counts, found, time.monotonic())
+        self._counts[resource_id], state = judged(self._health, counts, found, self.probes.ran_s())
         if state is None:
             return
         text = readable(f"health: {found.message or found.state}")

@@ -90,7 +90,7 @@ class StartStatus(Effect, frozen=True):
 
 
 class SetTimer(Effect, frozen=True):
-    """Post `command` after `delay_s`. It replaces the timer of the same key; with None it cancels that."""
+    """Post `command` when the process has run for `delay_s`; None: never. It replaces the timer of the same key."""
 
     key: str
     delay_s: float | None

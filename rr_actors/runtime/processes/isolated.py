@@ -10,7 +10,6 @@ from __future__ import annotations
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,6 +19,7 @@ from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.fork_server import Inherited
 from rr_actors.runtime.processes.process import Process, Spawner, signal_name
+from rr_actors.runtime.time_limits import RunningLimit, RunningTime
 
 _ENTRY = f"{__name__}:main"
 _LOOK_S = 0.05
@@ -61,7 +61,7 @@ def run_isolated(
         begin: called when the process can begin. It calls its argument, which lets the call begin and returns when it
             has, and returns True. Or it returns False: the call does not begin.
         timeout_s: seconds after which the call's `stopping` is set; None: no limit.
-        grace_s: seconds that it has to stop; then its process is killed.
+        grace_s: seconds that it has to stop; then its process is killed. Both limits leave out standstills.
 
     Raises:
         StartFailed: there can be no process.
@@ -83,7 +83,8 @@ class _Watch:
     def __init__(self, child: Process, events: Events, timeout_s: float | None, grace_s: float) -> None:
         self._child, self._events = child, events
         self._timeout_s, self._grace_s = timeout_s, grace_s
-        self._began = time.monotonic()
+        self._ran = RunningTime(_LOOK_S)
+        self._began = 0.0
         self._stopped_at: float | None = None
         self._is_pausing = self._is_overdue = self._is_killed = False
         self._got = bytearray()
@@ -108,11 +109,11 @@ class _Watch:
     def _let_begin(self) -> None:
         """Let the call begin, and return when it does, or never will."""
         self._send(_GO)
-        deadline = time.monotonic() + _GO_S
-        while not self._got and time.monotonic() < deadline and self._child.wait(0.0) is None:
+        limit = RunningLimit(_GO_S)
+        while not self._got and not limit.is_over() and self._child.wait(0.0) is None:
             self._receive()
         del self._got[:1]
-        self._began = time.monotonic()
+        self._began = self._ran.read()
 
     def _is_whole(self) -> bool:
         size = len(self._got) - _LENGTH.size
@@ -128,7 +129,7 @@ class _Watch:
         return bool(data)
 
     def _tell(self) -> None:
-        now = time.monotonic()
+        now = self._ran.read()
         is_overdue = self._timeout_s is not None and now >= self._began + self._timeout_s
         if self._stopped_at is None and (is_overdue or self._events.stopping.is_set()):
             self._stopped_at, self._is_overdue = now, not self._events.stopping.is_set()
