@@ -8,7 +8,7 @@ import functools
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from rr_actors.base.config import RegistrarConfig
@@ -55,6 +55,10 @@ _LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile sends nothing
 
 MESSAGES: dict[str, Any] = {"registrar": Message, THREADS: Message, KIND: HandleMessage}
 """The message type of each kind of link to a registrar."""
+
+
+Whole = tuple[str, str]
+"""The name of a registrar, and the id of a resource that it serves."""
 
 
 class Node(ProcessNode):
@@ -263,7 +267,10 @@ class Node(ProcessNode):
         return False
 
     async def wind_down(self, name: str, timeout_s: float | None) -> None:
-        """Wind a registrar down for good: release all it holds and unload all it serves, within `timeout_s`."""
+        """Wind a registrar down for good: release all it holds and unload all it serves, within `timeout_s`.
+
+        While the whole process stops, what other registrars of the process serve on top of it is unloaded before.
+        """
         registrar = self.registrars.get(name)
         if registrar is None or registrar.closed:
             return
@@ -284,6 +291,8 @@ class Node(ProcessNode):
         self._withdraw_loads(registrar)
         releases: Releases | None = None
         try:
+            if self.stopping:
+                await self._unload_wholes(registrar)
             await self._unload_everything(registrar)
             tried: set[str] = set()
             for _ in range(2):
@@ -347,6 +356,19 @@ class Node(ProcessNode):
                 text = f"{held.registrar}/{held.server}: the load is withdrawn, as {self._why_closing(registrar)}"
                 failure = Failure("RegistrarDown", text, {"registrar": registrar.name, "status": "stopped"})
                 registrar.post(GiveUp(query_id, failure))
+
+    async def _unload_wholes(self, registrar: RegistrarActor) -> None:
+        """Unload what has a part at the registrar and is served by others of this process, the highest first."""
+        tried: set[Whole] = set()
+        while self._provides_for(registrar.name, list(self.registrars)) and (
+            highest := _highest_above(registrar.name, self.registrars.values(), tried)
+        ):
+            tried |= highest
+            unloaded = _AllDone(self.dispatcher.loop, len(highest), registrar.name)
+            for owner, resource_id in highest:
+                why = f"unloaded, as {self._why_closing(registrar)}"
+                self.registrars[owner].post(ForceUnload(resource_id, new_id(), unloaded, why))
+            await unloaded.future
 
     async def _unload_everything(self, registrar: RegistrarActor) -> None:
         with registrar.lock:
@@ -454,6 +476,27 @@ def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
         catalog = registrar.whole()
         left = [row.id for row in catalog.resources.values() if row.id not in tried and row.server in catalog.servers]
         return [id for id in left if not is_part(id)] or left
+
+
+def _highest_above(name: str, registrars: Iterable[RegistrarActor], tried: set[Whole]) -> set[Whole]:
+    """Return the untried resources with a part at registrar `name`, or in a part of theirs, that are no such part.
+
+    It looks at what these registrars hold. The registrar's own resources are left out. Of a ring, it returns all.
+    """
+    wholes: dict[Whole, list[Whole]] = {}
+    for registrar in registrars:
+        with registrar.lock:
+            for row in registrar.whole().held.values():
+                if row.parent and row.resource_id:
+                    wholes.setdefault((row.registrar, row.resource_id), []).append((registrar.name, row.parent))
+    found: set[Whole] = set()
+    left = [whole for part in wholes if part[0] == name for whole in wholes[part]]
+    while left:
+        if (whole := left.pop()) not in found:
+            found.add(whole)
+            left += wholes.get(whole, ())
+    above = {whole for whole in found if whole[0] != name} - tried
+    return {whole for whole in above if above.isdisjoint(wholes.get(whole, ()))} or above
 
 
 def _unless_owed(released: _AllDone, owed: set[str], query_id: str, error: RrError | None) -> None:
