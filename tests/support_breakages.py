@@ -321,7 +321,7 @@ def _trials_stay() -> None:
 
 
 def _no_reasons() -> None:
-    nothing: Any = vars(choice_manager)["_nothing"]
+    nothing: Any = vars(choice_manager)["nothing_left"]
     replace(nothing, lambda request, why: nothing(request, why[1:]))
     mission_managers.UNLUCKY_ARMS = 200  # so that choices are lost
 
@@ -438,7 +438,7 @@ BREAKAGES = {
         "choices", "Trials.release does nothing", _trials_stay, ("is held by nobody", "trials of", "is left")
     ),
     "a choice that is lost does not say why": Breakage(
-        "choices", "_nothing leaves out the first reason", _no_reasons, ("does not say why",)
+        "choices", "nothing_left leaves out the first reason", _no_reasons, ("does not say why",)
     ),
     "a replica is loaded beside the one before": Breakage(
         "keeper", "_is_in_the_way says no", _replicas_are_doubled, ("replicas of",)

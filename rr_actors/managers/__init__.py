@@ -12,7 +12,8 @@ from rr_actors.managers.budgets.measures import Measure
 from rr_actors.managers.budgets.pools import Pool, Reserve
 from rr_actors.managers.budgets.requests import PoolInfo, Share, Supply
 from rr_actors.managers.choices.alternatives import Alternative
-from rr_actors.managers.choices.choice_manager import Choices, Choose, Chosen
+from rr_actors.managers.choices.choice_manager import Choices
+from rr_actors.managers.choices.chosen import Choose, Chosen
 from rr_actors.managers.components import Component, Components, LoadComponent
 from rr_actors.managers.keeper.keep_manager import Keeper, Kept
 from rr_actors.managers.pipes.pipe_manager import BuiltPipe, Pipe, Pipes

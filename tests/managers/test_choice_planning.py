@@ -93,6 +93,11 @@ def test_those_that_failed_lately_are_the_last_resort() -> None:
     assert in_turn(["a", "b", "c", "d"], standings, {"d"}, NOW) == ["b", "c", "a"]
 
 
+def test_what_is_loaded_and_well_comes_first() -> None:
+    standings = {"a": Standing(NOW - 1, 2.0)}
+    assert in_turn(["a", "b", "c", "d"], standings, (), NOW, {"c", "d"}) == ["c", "d", "b", "a"]
+
+
 # -- properties ----------------------------------------------------------------------------------------------------
 
 KEYS = ("a", "b", "c", "d")

@@ -15,7 +15,7 @@ import msgspec
 import pytest
 
 import rr_actors as rr
-from rr_actors.managers import Alternative, Choices, Choose, Chosen
+from rr_actors.managers import Alternative, Budgets, Choices, Choose, Chosen, Pool, Share
 from support import Calls, Gate, Served, eventually, kill, pid_of, serve, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -298,6 +298,110 @@ def test_choices_of_several_share_what_they_choose(world: World) -> None:
     assert world.steps.items.count("load lidar") == 1
 
 
+def several(world: World) -> list[Any]:
+    return [world.choose(Choose("range", {"rate_hz": f">{-i}"}, ["rate_hz"])) for i in range(1, 8)]
+
+
+def test_one_failure_counts_once_however_many_choices_have_it(world: World) -> None:
+    choices = several(world)
+    world.broken = {"lidar"}
+    world.say("camera", "FATAL")
+    for choice in choices:
+        world.settled(choice, *["sonar"] * len(choices))
+    for rate in (10, 30):
+        trusted = Choose("range", {"reliability": ">=0.5", "rate_hz": rate})
+        world.broken = set()
+        assert world.choose(trusted).response.provides["rate_hz"] == rate
+
+
+def test_the_way_back_takes_as_long_for_many_choices_as_for_one(start: Start) -> None:
+    world = World(start, settle_s=0.5)
+    choices = several(world)
+    world.say("camera", "FATAL")
+    for choice in choices:
+        eventually(lambda choice=choice: choice.response.server == "sensors/lidar", LIMIT_S)
+    began = time.monotonic()
+    for choice in choices:
+        eventually(lambda choice=choice: choice.response.server == "sensors/camera", LIMIT_S)
+    assert time.monotonic() - began < 15  # if each choice had doubled the delay: 32 s
+
+
+def test_the_next_one_is_tried_beside_one_that_hangs_and_the_holders_hear_of_it(world: World) -> None:
+    choice, gate = world.choose(), Gate()
+    world.served["lidar"].do_load = lambda request: gate()
+    world.say("camera", "FATAL")
+    eventually(lambda: choice.state is rr.State.UPDATE, LIMIT_S)
+    assert choice.response.server == "sensors/sonar"
+    heard = [(status.state, status.message) for status in world.heard]
+    assert [state for state, _ in heard] == [rr.State.WARNING, rr.State.UPDATE]
+    assert heard[0][1] == 'sensors/camera "front": unplugged; the next one is being loaded'
+    gate.open()
+    eventually(lambda: world.has("lidar", "sonar"), LIMIT_S, "the lidar is on trial, and held once")
+
+
+def test_the_best_one_that_hangs_costs_a_new_choice_some_seconds_and_not_its_whole_time(world: World) -> None:
+    gate = Gate()
+    world.served["camera"].do_load = lambda request: gate()
+    choice = world.app.load("choices/choice", BEST, timeout_s=25.0)
+    assert choice.response.server == "sensors/lidar"
+    gate.open()
+    eventually(lambda: world.has("camera", "lidar"), LIMIT_S, "the camera is on trial, and held once")
+
+
+def test_what_another_choice_has_is_preferred_to_what_is_not_loaded(world: World) -> None:
+    world.choose(Choose("range", {"rate_hz": "<10"}))
+    choice = world.choose()
+    world.say("camera", "FATAL")
+    world.settled(choice, "sonar", "sonar")
+
+
+@pytest.mark.parametrize("file", ["reliability.json", "choices.json"])
+def test_a_failure_that_cannot_be_noted_on_disk_is_replaced_all_the_same(start: Start, file: str) -> None:
+    world = World(start, [sensor("camera"), sensor("lidar", break_first=True)])
+    (world.system.state_dir / "choices" / file).mkdir(parents=True)
+    choice = world.choose()
+    world.say("camera", "FATAL")
+    world.settled(choice, "lidar")
+
+
+def test_what_is_lost_again_and_again_waits_longer_each_time_and_the_holders_hear_that(start: Start) -> None:
+    world = World(start, [sensor("camera"), sensor("lidar")])
+    choice = world.choose()
+    warned = "as it has failed repeatedly"
+    while sum(warned in status.message for status in world.heard) < 3:
+        world.say(choice.response.server.removeprefix("sensors/"), "FATAL")
+        seen = choice.response.server
+        eventually(lambda: choice.response.server != seen, LIMIT_S)  # noqa: B023
+    waits = [status.message.split(" in ")[1].split(" s,")[0] for status in world.heard if warned in status.message]
+    assert len(world.steps.items) < 30
+    assert all(status.state is rr.State.WARNING for status in world.heard if warned in status.message)
+    assert max(map(float, waits)) > min(map(float, waits))
+
+
+RINGS = {
+    "itself": [Alternative("range", "choices/choice", {"kind": "range"}), sensor("lidar")],
+    "another": [
+        Alternative("range", "choices/choice", Choose("distance")),
+        sensor("lidar"),
+        Alternative("distance", "choices/choice", {"kind": "range", "where": {}}),
+    ],
+}
+
+
+@pytest.mark.parametrize("alternatives", RINGS.values(), ids=RINGS)
+def test_alternatives_that_hold_each_other_in_a_ring_are_refused_by_name(start: Start, alternatives: Any) -> None:
+    with pytest.raises(rr.StartFailed, match=r"alternative\[0\]: expected alternatives .* got the ring choices/choice"):
+        start(rr.ChildSpec(Choices, id="choices", args=(alternatives,)))
+
+
+def test_a_choice_may_be_an_alternative_of_another_kind(start: Start) -> None:
+    world = World(start, [Alternative("distance", "choices/choice", {"kind": "range"}), *SENSORS])
+    choice = world.choose(Choose("distance"))
+    assert choice.response.response["server"] == "sensors/sonar"
+    choice.unload()
+    eventually(lambda: world.has() and not world.system.registrar("choices").resources())
+
+
 # -- the way back --------------------------------------------------------------------------------------------------
 
 
@@ -355,13 +459,45 @@ def test_a_trial_ends_with_the_choice_that_wanted_it(start: Start) -> None:
     eventually(lambda: world.has(), LIMIT_S)
 
 
-def test_a_trial_is_as_urgent_as_the_choice_that_wants_it(start: Start) -> None:
+def test_a_trial_is_the_least_urgent_load_until_it_takes_its_place(start: Start) -> None:
     world = World(start, settle_s=1.0)
     choice = world.app.load("choices/choice", BEST, priority=7)
     world.say("camera", "FATAL")
     world.settled(choice, "camera", "lidar")
-    (camera,) = [info for info in world.sensors.resources() if info.server == "camera"]
-    assert camera.priority == 7
+
+    def urgency() -> list[int | None]:
+        return [info.priority for info in world.sensors.resources() if info.server == "camera"]
+
+    assert urgency() == [-1000]
+    world.settled(choice, "camera")
+    assert urgency() == [7]
+
+
+def test_a_trial_takes_no_room_of_others(start: Start) -> None:
+    pools = [Pool("watts", 40)]
+    world = World(start, SENSORS, 0.05, rr.ChildSpec(Budgets, id="budgets", args=(pools,)))
+    is_broken = threading.Event()
+
+    def open_camera(request: Any) -> Any:
+        world.sensors.load("budgets/share", Share("watts", 30))
+        if is_broken.is_set():
+            raise OSError("no camera")
+        world.steps("load camera")
+        return {"topic": "/camera"}
+
+    world.served["camera"].do_load = open_camera
+    choice = world.app.load("choices/choice", BEST, priority=9)
+    is_broken.set()
+    world.say("camera", "FATAL")
+    world.settled(choice, "lidar")
+    heater = world.app.load("budgets/share", Share("watts", 30, instance="heater"), priority=1, timeout_s=LIMIT_S)
+    seen = len(world.served["camera"].loads)
+    eventually(lambda: len(world.served["camera"].loads) > seen + 1, LIMIT_S, "trials of the camera")
+    assert heater.fetch_state() == "OK"
+    assert not heater.released
+    heater.unload()
+    is_broken.clear()
+    world.settled(choice, "camera")
 
 
 def test_a_choice_does_not_return_to_what_is_exclusive(start: Start) -> None:

@@ -12,7 +12,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.managers import Components, LoadComponent, Programs
 from rr_actors.managers.components import read_registry
-from rr_actors.managers.reliability import FALL, Reliabilities
+from rr_actors.managers.reliability import FALL, LEAST, RISE_S, Reliabilities
 from rr_actors.managers.templates import fill
 from support import Calls, child, eventually, kill, wait_respawned
 from support_programs import running_programs
@@ -245,6 +245,27 @@ def test_a_failure_counts_once_and_is_kept_on_disk(tmp_path: Path) -> None:
     assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL)
     Reliabilities(path).lower("a", 0.8, "failure-2")
     assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL * FALL)
+
+
+def test_reliability_rises_with_the_hours_without_a_failure_and_never_falls_out_of_sight(tmp_path: Path) -> None:
+    path, now = tmp_path / "reliability.json", [1_000_000.0]
+
+    def trust(name: str = "a") -> float:
+        return Reliabilities(path, lambda: now[0]).of(name, 0.8)
+
+    for i in range(100):
+        Reliabilities(path, lambda: now[0]).lower("a", 0.8, f"failure-{i}")
+    assert trust() == pytest.approx(0.8 * LEAST)
+    now[0] += RISE_S - 1
+    assert trust() == pytest.approx(0.8 * LEAST)
+    now[0] += 1
+    assert trust() == pytest.approx(0.8 * LEAST / FALL)
+    now[0] -= 5 * RISE_S  # the clock is set back
+    assert trust() == pytest.approx(0.8 * LEAST)
+    now[0] += 20 * RISE_S
+    assert trust() == 0.8
+    Reliabilities(path, lambda: now[0]).lower("a", 0.8, "later")
+    assert trust() == pytest.approx(0.8 * FALL)
 
 
 @pytest.mark.parametrize(

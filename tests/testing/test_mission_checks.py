@@ -11,7 +11,7 @@ from rr_actors.managers import Choose, Kept, RunAction
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_library import GraphLibrary
 from rr_actors.managers.actions.graph_runs import Begin, decide, feedback, first_run
-from rr_actors.managers.choices.choice_manager import Chosen
+from rr_actors.managers.choices.chosen import Chosen
 from rr_actors.managers.keeper.desired import Replica, parse_desired
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Resource, Row, State
 from rr_actors.registrar.queries import ResourceInfo

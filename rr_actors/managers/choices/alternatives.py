@@ -19,7 +19,7 @@ A file has one table for each, the preferred first::
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,9 @@ from rr_actors.managers.templates import Parameter
 from rr_actors.registrar.manager import Beginning
 
 _WHERE = "Choices"
+
+Allowed = Callable[[Any], Iterable[str]]
+"""Returns the keys of the alternatives that a request for a choice, as plain values, allows; none if it is wrong."""
 
 
 class Alternative(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -133,3 +136,28 @@ def _check(file: str | None, place: str, one: Alternative) -> None:
     if (found := wrong_label(one.provides)) is not None:
         key = ".".join(filter(None, (place, "provides", found.key)))
         raise wrong(file, key, found.expected, found.got, where=_WHERE)
+
+
+def check_rings(alternatives: Sequence[Alternative], server: str, allowed: Allowed) -> None:
+    """Check that no alternative is a choice that might choose this same alternative, directly or by others.
+
+    Args:
+        server: the id of the server of choices that has these alternatives.
+        allowed: returns the alternatives that a request for a choice allows.
+
+    Raises:
+        ConfigError: one might; the text names the ring.
+    """
+    inner = {one.key: allowed(shown_plain(encode(one.request))) for one in alternatives if one.server == server}
+
+    def follow(path: tuple[str, ...]) -> None:
+        for key in inner.get(path[-1], ()):
+            if key == path[0]:
+                place = f"alternative[{next(i for i, one in enumerate(alternatives) if one.key == key)}]"
+                expected, ring = "alternatives that do not hold each other in a ring", " -> ".join((*path, key))
+                raise wrong(None, place, expected, path[0], where=_WHERE, said=f"the ring {ring}")
+            if key in inner and key not in path:
+                follow((*path, key))
+
+    for key in inner:
+        follow((key,))

@@ -7,45 +7,40 @@ manager has.
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import functools
 import os
 import threading
 import time
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Literal, cast
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
+from typing import Any, cast
 
 import msgspec
-from msgspec.structs import replace
 
-from rr_actors.base.checks import RELIABILITY, is_number
-from rr_actors.base.errors import (
-    CircularDependency,
-    ConfigError,
-    LoadFailed,
-    OverCapacity,
-    RrError,
-    Unavailable,
-    UnknownQuery,
-    UnknownServer,
-)
+from rr_actors.actors.messaging.futures import Reply
+from rr_actors.base.checks import is_number
+from rr_actors.base.errors import ConfigError, LoadFailed, RrError, Unavailable, UnknownQuery, UnknownServer
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import wrong
-from rr_actors.base.values.canonical import encode, shown_plain
-from rr_actors.managers.choices.alternatives import Alternative, key_of, read_alternatives
+from rr_actors.managers.choices.addresses import Addresses
+from rr_actors.managers.choices.alternatives import Alternative, check_rings, read_alternatives
+from rr_actors.managers.choices.chosen import Choose, Chosen, Held, held_choice
 from rr_actors.managers.choices.labelled import Labelled
-from rr_actors.managers.choices.matching import ranked, why_none
+from rr_actors.managers.choices.offers import Offers, nothing_left
 from rr_actors.managers.choices.planning import Choice, in_turn
-from rr_actors.managers.choices.relays import Address, Relays, parse_address
-from rr_actors.managers.choices.trials import FAILED, Trials
+from rr_actors.managers.choices.trials import FAILED, TRIES, Trials
+from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
+from rr_actors.managers.planning.hedging import HEDGE_S, first_of
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.reliability import Reliabilities
-from rr_actors.managers.templates import Parameter
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
-from rr_actors.registrar.model.rows import Phase, State
+from rr_actors.registrar.model.rows import LOWEST, Phase, State
 from rr_actors.registrar.queries import Query, StatusCallback
 from rr_actors.registrar.registrar import NO_FIELDS
 
@@ -53,58 +48,30 @@ logger = Log("rr_actors.managers.choices")
 
 _TAKE = "returns to "  # and the key of an alternative: the message of a status that a choice gets from its own manager
 _AGAIN = "chooses again, as a crash came in between"
+_FIRST_HEDGE_S = 5.0  # nobody uses anything that has failed yet, and devices are slow to start
+_SOON_S = 0.1  # after which the holders hear that another alternative is being looked for
 
 
-class Choose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request for the best alternative of a kind.
-
-    Attributes:
-        kind: what is needed, such as "range".
-        where: what it must provide: `{"rate_hz": ">=10", "place": "roof"}`. A value alone is to be equal.
-        prefer: what is better, the most important first: "rate_hz" is more of it, "-cost" less. Of equal alternatives
-            the first that was given is better.
-        bind: "relay" opens an address that stays, `Chosen.address`, for programs that connect to what is chosen. The
-            response of each alternative has to be its own address, or to have it as its field "address":
-            "unix:/run/camera.sock" or "tcp:127.0.0.1:5000".
-    """
-
-    kind: str
-    where: dict[str, Parameter] = {}
-    prefer: list[str] = []
-    bind: Literal["", "relay"] = ""
-
-
-class Chosen(msgspec.Struct, frozen=True):
-    """The response: the alternative in use, what it provides, and its own response, as plain values.
-
-    When another one takes its place, the response changes, and its holders hear an UPDATE status.
-
-    Attributes:
-        address: of the relay, of the same form as the address of the alternative that was chosen first. It stays the
-            same. "" without `bind="relay"`.
-    """
-
-    server: str
-    request: Any
-    response: Any
-    provides: dict[str, Parameter]
-    address: str = ""
-
-
-class _Held(msgspec.Struct):
-    """A choice that is loaded. `moving`: it has been told to return to a better alternative, and has not done so."""
-
-    request: Choose
-    present: str
-    address: str = ""
-    failing: bool = False
-    moving: bool = False
+_Begin = Callable[[Alternative], Reply[Query]]
+_Take = Callable[[Alternative, Query], None]
+_Failed = Callable[[Alternative, Exception], None]
 
 
 class _Broken(msgspec.Struct):
     """The choices whose part has been released before another one was loaded in its place."""
 
     choices: list[str] = []
+
+
+class _Search:
+    """One search for an alternative that can be had, and why each of those before could not be."""
+
+    def __init__(self, id: str, held: Held, part: Query | None = None, tried: Sequence[str] = ()) -> None:
+        self.id, self.held, self.part = id, held, part
+        self.tried = list(tried)
+        self.decided_at = time.monotonic()  # when it was decided what to load
+        self.saying = threading.Lock()
+        self.is_over = False
 
 
 class Choices(Manager):
@@ -132,15 +99,13 @@ class Choices(Manager):
             ConfigError: the file cannot be read, or an alternative or a host is wrong. `.file`, `.key`, `.expected`,
                 `.got`
         """
-        self._given = self._every = read_alternatives(file_or_alternatives, self._beginning())
-        self._labelled_before: tuple[Alternative, ...] = ()
+        self._given = read_alternatives(file_or_alternatives, self._beginning())
         if not is_number(settle_s) or settle_s < 0:
             raise wrong(None, "settle_s", "a number of seconds, at least 0", settle_s, where="Choices")
         for i, host in enumerate(relay_hosts):
             if not host or not isinstance(host, str):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise wrong(None, f"relay_hosts[{i}]", "the name or number of a host", host, where="Choices")
         self._relay_hosts = tuple(relay_hosts)
-        self._relays = Relays()
         self._changed = threading.Condition(threading.RLock())
         self._trials = Trials(
             self._changed,
@@ -148,13 +113,19 @@ class Choices(Manager):
             self._choices,
             self._load_on_trial,
             self._have_taken,
-            self._has_new_labels,
+            lambda: self._offers.has_changed(),
             self._strays,
         )
         self._begun = ""
+        self._is_stopped = threading.Event()
 
     def on_start(self) -> None:
-        """Go on with the choices that are held. Trials of the process before are ended, and begin anew."""
+        """Go on with the choices that are held. Trials of the process before are ended, and begin anew.
+
+        Raises:
+            ConfigError: alternatives hold each other in a ring.
+        """
+        check_rings(self._given, f"{self.registrar.name}/choice", self._allowed_keys)
         with self._changed:
             held = dict(self._held)
             self._begun = new_id()
@@ -168,33 +139,39 @@ class Choices(Manager):
 
     def on_stop(self) -> None:
         """End the thread of the trials, and close the relays."""
+        self._is_stopped.set()
         self._trials.stop()
-        self._relays.stop()
+        self._addresses.stop()
 
     # -- the server ------------------------------------------------------------------------------------------------
 
     @server("choice", recovery="keep")
     def load_choice(self, request: Choose) -> Chosen:
         """Load the best alternative that can be loaded."""
-        best = self._allowed(request)
-        id, held = current().resource_id, _Held(request, "")
-        tried: list[str] = []
-        for one in self._in_turn(best, ()):
-            try:
-                chosen = self._first(id, held, one)
-            except RrError as error:
-                if current().stopping.is_set():
-                    self._relays.close(id)
-                    raise
-                tried.append(self._not_loaded(one, error))
-            else:
-                with self._changed:
-                    self._held[id] = held
-                if one is not best[0]:
-                    self._trials.look()
-                return chosen
-        self._relays.close(id)
-        raise LoadFailed(_nothing(request, tried), server=f"{self.registrar.name}/choice")
+        best = self._offers.allowed(request)
+        search = _Search(current().resource_id, Held(request, ""))
+        made: list[Chosen] = []
+
+        def take(one: Alternative, query: Query) -> None:
+            made[:] = [self._addresses.made(search.id, search.held, one, query)]
+
+        def failed(one: Alternative, error: Exception) -> None:
+            if current().stopping.is_set():
+                raise error
+            self._not_loaded(search, one, error)
+
+        try:
+            found = self._try(search, self._in_turn(best, ()), self._begin_part, take, failed, _FIRST_HEDGE_S)
+        except BaseException:
+            self._addresses.close(search.id)
+            raise
+        if not found:
+            self._addresses.close(search.id)
+            raise LoadFailed(nothing_left(request, search.tried), server=f"{self.registrar.name}/choice")
+        self._use(search, made[0])
+        if search.held.present != best[0].key:
+            self._trials.look()
+        return made[0]
 
     @load_choice.unload
     def unload_choice(self, request: Choose, response: Chosen | None) -> None:
@@ -217,8 +194,8 @@ class Choices(Manager):
 
     # -- hearing ---------------------------------------------------------------------------------------------------
 
-    def _hear_part(self, id: str, held: _Held | None, status: Status) -> None:
-        part = next((part for part in self.registrar.children(id) if part.id == status.query_id), None)
+    def _hear_part(self, id: str, held: Held | None, status: Status) -> None:
+        part = part_of(self.registrar, status).part
         if part is None or held is None:
             status.handled()  # a run before a crash has dealt with it
         elif status.state in FAILED:
@@ -228,19 +205,19 @@ class Choices(Manager):
         elif (one := self._in_use(held)) is not None:
             self._hear_response(id, held, one, part, status)
 
-    def _hear_response(self, id: str, held: _Held, one: Alternative, part: Query, status: Status) -> None:
+    def _hear_response(self, id: str, held: Held, one: Alternative, part: Query, status: Status) -> None:
         """Pass on a new response of the part; if it has no address and needs one, replace the part."""
         try:
-            chosen = self._made(id, held, one, part)
+            chosen = self._addresses.made(id, held, one, part)
         except (ConfigError, Unavailable) as error:
             logger.warning("%s: %s", one.key, error)
             self._replace(id, held, status, part)
             return
         self.registrar.update_response(id, chosen, status.message)
-        self._point(id, chosen)
+        self._addresses.point(id, chosen)
         status.handled()
 
-    def _hear_own(self, id: str, held: _Held | None, status: Status) -> None:
+    def _hear_own(self, id: str, held: Held | None, status: Status) -> None:
         """Do what this manager has told a choice to do; other statuses of the choice are for its holders."""
         if status.state is State.FATAL:
             self._forget(id)
@@ -255,94 +232,177 @@ class Choices(Manager):
 
     # -- replacing -------------------------------------------------------------------------------------------------
 
-    def _return(self, id: str, held: _Held, key: str, status: Status) -> None:
+    def _return(self, id: str, held: Held, key: str, status: Status) -> None:
         """Put a better alternative in the place of the one in use."""
         kind = held.request.kind
         try:
             parts = self.registrar.children(id)
-            better = self._find(kind, key)
+            better = self._offers.find(key, kind)
             if key != held.present and better is not None and parts:  # else a run before a crash has done it
-                self._put(id, held, better, status, parts[0])
+                self._swap(_Search(id, held, parts[0]), status, better)
                 logger.info("%s: returns to %s", kind, key)
         except RrError as error:
             logger.warning("%s: cannot return to %s: %s", kind, key, error)
-            self._trials.failed(key)
+            self._trials.failed(key, is_own=is_own_fault(error))
         finally:
             held.moving = False
             self._trials.look()
 
-    def _replace(self, id: str, held: _Held, status: Status, part: Query) -> None:
+    def _replace(self, id: str, held: Held, status: Status, part: Query) -> None:
         """Put the next best alternative in the place of one that has failed; give up if there is none."""
         failed, said = held.present, status.message or str(status.state)
-        if status.reason != "revoked":
-            self._lower(self._in_use(held), status.resource_id)
-        self._trials.failed(failed)
-        tried = [f"{failed}: {said}"]
-        if self._fill(id, held, status, part, {failed}, tried):
+        is_own = is_own_failure(status)
+        if is_own and (one := self._in_use(held)) is not None:
+            self._offers.lower(one, status.resource_id)
+        self._trials.failed(failed, status.resource_id, is_own=is_own)
+        search = _Search(id, held, part, [f"{failed}: {said}"])
+        if self._fill(search, status, {failed}):
             logger.warning("%s: %s takes the place of %s: %s", held.request.kind, held.present, failed, said)
         elif self._is_broken(id) or (status.state is State.FATAL and status.reason != "revoked"):
-            self._give_up(id, held, status, tried)
+            self._give_up(search, status)
         else:  # with ERROR it may be of some use still; a part that is revoked takes the choice with it
             held.failing = True
-            logger.warning("%s", _nothing(held.request, tried))
+            logger.warning("%s", nothing_left(held.request, search.tried))
         self._trials.look()
 
-    def _choose_again(self, id: str, held: _Held, status: Status) -> None:
+    def _choose_again(self, id: str, held: Held, status: Status) -> None:
         """Choose anew after a crash, when one had been released and it is not known how far the next one had come."""
         for part in self.registrar.children(id):
             self._release(part)
-        tried: list[str] = []
-        if not self._fill(id, held, status, None, (), tried):
-            self._give_up(id, held, status, tried)
+        search = _Search(id, held)
+        if not self._fill(search, status, ()):
+            self._give_up(search, status)
         self._trials.look()
 
-    def _fill(
-        self, id: str, held: _Held, status: Status, part: Query | None, without: Collection[str], tried: list[str]
-    ) -> bool:
-        """Put the first alternative that can be loaded in the place of the part; `tried` gets why others cannot.
+    def _fill(self, search: _Search, status: Status, without: Collection[str]) -> bool:
+        """Put the first alternative that can be had in the place of the part. Return whether there was one."""
+        say = functools.partial(self._say_slow, search, "the next one is being loaded")
+        soon = threading.Timer(_SOON_S, contextvars.copy_context().run, (say,))  # a part of this callback
+        soon.daemon = True
+        soon.start()
+        try:
+            return any(self._fill_from(search, status, group) for group in self._groups(search, without))
+        finally:
+            soon.cancel()
+            with search.saying:  # what is said from now on is said of what it has
+                search.is_over = True
 
-        Return whether there was one.
+    def _fill_from(self, search: _Search, status: Status, group: Sequence[Alternative]) -> bool:
+        present = self._in_use(search.held)
+        if search.part is not None and (group[0].break_first or (present is not None and present.break_first)):
+            self._break(search.id, search.part)
+            search.part = None
+        failed = functools.partial(self._not_loaded, search)
+        if search.part is None:
+            return self._try(search, group, self._load_part, functools.partial(self._put, search, status), failed)
+        begin = functools.partial(self._begin_beside, self._priority_of(search.id))
+        return self._try(search, group, begin, functools.partial(self._swap_loaded, search, status), failed)
+
+    def _groups(self, search: _Search, without: Collection[str]) -> Iterator[list[Alternative]]:
+        """Yield the alternatives to try in turn, in groups of those that may be loaded beside each other.
+
+        One that has failed again and again is waited for, and given up after some tries.
         """
-        present = self._in_use(held)
-        breaks = present is not None and present.break_first
-        for one in self._in_turn(self._allowed_now(held.request), without):
-            if part is not None and (breaks or one.break_first):
-                self._break(id, part)
-                part = None
+        search.decided_at = time.monotonic()
+        in_turn = self._in_turn(self._offers.allowed_now(search.held.request), without, self._well())
+        alone = {one.key: i for i, one in enumerate(in_turn, 1) if one.break_first or self._trials.wait_s(one.key) != 0}
+        for _, group in groupby(in_turn, key=lambda one: alone.get(one.key, 0)):
+            found = list(group)
+            wait_s = self._trials.wait_s(found[0].key) if found[0].key in alone else 0.0
+            if wait_s is None:
+                search.tried.append(f"{found[0].key}: it has failed {TRIES} times in a row or more")
+                continue
+            if wait_s:
+                self._say_slow(search, f"tries {found[0].key} again in {wait_s:.1f} s, as it has failed repeatedly")
+                self._is_stopped.wait(wait_s)
+                search.decided_at = time.monotonic()
+            yield found
+
+    def _try(
+        self,
+        search: _Search,
+        group: Iterable[Alternative],
+        begin: _Begin,
+        take: _Take,
+        failed: _Failed,
+        hedge_s: float = HEDGE_S,
+    ) -> bool:
+        """Take the first of these alternatives that can be had, the next one beside one that hangs."""
+        left, release = iter(group), self._trials.release
+        while (won := first_of(left, begin, release=release, on_failed=failed, hedge_s=hedge_s)) is not None:
             try:
-                self._put(id, held, one, status, part)
-                return True
-            except UnknownQuery:
-                raise
+                take(won.candidate, won.value)
             except RrError as error:
-                tried.append(self._not_loaded(one, error))
+                release(won.value)
+                if isinstance(error, UnknownQuery):  # the choice is being unloaded
+                    raise
+                failed(won.candidate, error)
+            else:
+                search.held.present, search.held.failing = won.candidate.key, False
+                self._trials.used(won.candidate.key)
+                return True
         return False
 
-    def _put(self, id: str, held: _Held, one: Alternative, status: Status, part: Query | None) -> None:
-        """Load an alternative in the place of the part, or as the part of a choice that has none now."""
-        made, request = functools.partial(self._made, id, held, one), _request_of(one)
-        if part is not None:
-            limit_s = one.timeout_s
-            query = self.registrar.replace_part(
-                status, request, one.server, part=part, response=made, timeout_s=limit_s
-            )
-        else:
-            query = self.registrar.load(one.server, request, timeout_s=one.timeout_s)
-            try:
-                self.registrar.update_response(id, made(query), f"{one.key} takes the place of another one")
-            except RrError:
-                self._release(query)
-                raise
-            self._mend(id)
-            status.handled()
-        held.present, held.failing = one.key, False
-        self._point(id, made(query))
+    def _begin_part(self, one: Alternative) -> Reply[Query]:
+        """Begin to load an alternative as a part of the choice whose callback runs."""
+        request, limit_s = _request_of(one), one.timeout_s
+        return cast("Reply[Query]", self.registrar.load(one.server, request, timeout_s=limit_s, block=False))
 
-    def _give_up(self, id: str, held: _Held, status: Status, tried: Sequence[str]) -> None:
-        text = _nothing(held.request, tried)
+    def _load_part(self, one: Alternative) -> Reply[Query]:
+        """Load the part of a choice that has none, and wait for it: a load that a crash left would be one too many."""
+        loaded: Reply[Query] = Reply()
+        loaded.set(self.registrar.load(one.server, _request_of(one), timeout_s=one.timeout_s))
+        return loaded
+
+    def _begin_beside(self, priority: int | None, one: Alternative) -> Reply[Query]:
+        """Begin to load an alternative as no part of anything: a crash leaves a stray, which the next process ends."""
+        load = functools.partial(
+            self.registrar.load, one.server, _request_of(one), priority=priority, timeout_s=one.timeout_s, block=False
+        )
+        return cast("Reply[Query]", contextvars.Context().run(load))
+
+    def _swap_loaded(self, search: _Search, status: Status, one: Alternative, query: Query) -> None:
+        """Put an alternative in the place of the part, and release the query by which it was tried."""
+        self._swap(search, status, one)
+        self._trials.release(query)
+
+    def _swap(self, search: _Search, status: Status, one: Alternative) -> None:
+        made = functools.partial(self._addresses.made, search.id, search.held, one)
+        limit_s, request = one.timeout_s, _request_of(one)
+        part = self.registrar.replace_part(
+            status, request, one.server, part=search.part, response=made, timeout_s=limit_s
+        )
+        search.held.present, search.held.failing = one.key, False
+        self._use(search, made(part))
+        self._trials.used(one.key)
+
+    def _put(self, search: _Search, status: Status, one: Alternative, query: Query) -> None:
+        """Use what is loaded as the part of a choice that has none now."""
+        chosen = self._addresses.made(search.id, search.held, one, query)
+        self.registrar.update_response(search.id, chosen, f"{one.key} takes the place of another one")
+        self._mend(search.id)
+        status.handled()
+        self._use(search, chosen)
+
+    def _use(self, search: _Search, chosen: Chosen) -> None:
+        """Note that a choice has this part now."""
+        self._addresses.point(search.id, chosen)
+        with self._changed:
+            self._held[search.id] = search.held
+
+    def _say_slow(self, search: _Search, what: str) -> None:
+        """Tell the holders of a choice that it has nothing that works, while it looks for something."""
+        with search.saying:
+            if not search.is_over:
+                text = "; ".join((*search.tried, what))
+                with contextlib.suppress(RrError):  # it is being unloaded
+                    self.registrar.send_status(search.id, Status(State.WARNING, text))
+
+    def _give_up(self, search: _Search, status: Status) -> None:
+        text = nothing_left(search.held.request, search.tried)
         logger.warning("%s", text)
-        self._forget(id)
-        self.registrar.send_status(id, Status(State.FATAL, text))
+        self._forget(search.id)
+        self.registrar.send_status(search.id, Status(State.FATAL, text))
         status.handled()
 
     def _break(self, id: str, part: Query) -> None:
@@ -350,7 +410,7 @@ class Choices(Manager):
         with self._changed:
             self._broken.now.choices.append(id)
             self._broken.save()
-        self._relays.point(id, None)
+        self._addresses.point(id, None)
         self._release(part)
 
     def _is_broken(self, id: str) -> bool:
@@ -369,54 +429,12 @@ class Choices(Manager):
         except RrError as error:
             logger.warning("%s cannot be released: %s", part.server_id, error)
 
-    # -- relays ----------------------------------------------------------------------------------------------------
-
-    def _first(self, id: str, held: _Held, one: Alternative) -> Chosen:
-        """Load an alternative as the part of a new choice, and open its relay if it is to have one."""
-        query = self.registrar.load(one.server, _request_of(one), timeout_s=one.timeout_s)
-        try:
-            chosen = self._made(id, held, one, query)
-        except RrError:
-            self._release(query)
-            raise
-        held.present = one.key
-        self._point(id, chosen)
-        return chosen
-
-    def _made(self, id: str, held: _Held, one: Alternative, query: Query) -> Chosen:
-        """Return the response of a choice with this part.
-
-        Raises:
-            ConfigError: it is to have a relay, and the part's response has no address that a relay may connect to.
-            Unavailable: the relay cannot be opened.
-        """
-        chosen = _chosen(one, query)
-        if held.request.bind:
-            source = self._source_of(chosen)
-            held.address = held.address or str(self._relays.open(id, self._new_address(id, source)))
-            chosen = replace(chosen, address=held.address)
-        return chosen
-
-    def _new_address(self, id: str, source: Address) -> Address:
-        return Address("127.0.0.1") if source.port else Address(str(self.registrar.directory / f"{id[-12:]}.sock"))
-
-    def _source_of(self, chosen: Chosen) -> Address:
-        given: object = chosen.response
-        if isinstance(given, dict):
-            given = cast("dict[str, object]", given).get("address")
-        return parse_address(given, self._relay_hosts)
-
-    def _point(self, id: str, chosen: Chosen) -> None:
-        if chosen.address:
-            self._relays.point(id, self._source_of(chosen))
-
-    def _restore_relays(self, held: Mapping[str, _Held]) -> None:
+    def _restore_relays(self, held: Mapping[str, Held]) -> None:
         """Open the relays at the addresses that programs know; a choice is lost if that is not possible."""
         for info in self.registrar.resources():
             if info.id in held and info.response.address:
                 try:
-                    self._relays.open(info.id, parse_address(info.response.address))
-                    self._point(info.id, info.response)
+                    self._addresses.restore(info.id, info.response)
                 except RrError as error:
                     self.registrar.send_status(info.id, Status(State.FATAL, f"its relay is lost: {error}"))
 
@@ -424,95 +442,64 @@ class Choices(Manager):
 
     def reliability(self, alternative: Alternative) -> float:
         """Return how far an alternative is trusted now, from 0 to 1."""
-        with self._changed:
-            return self._reliabilities.of(alternative.key, float(alternative.provides.get(RELIABILITY, 1.0)))
+        return self._offers.reliability(alternative)
 
-    def _allowed(self, request: Choose) -> list[Alternative]:
-        """Return the alternatives that a choice allows, the best first.
-
-        Raises:
-            ConfigError: the choice is wrong. `.key`, `.expected`, `.got`
-            LoadFailed: no alternative is allowed; it says why not.
-        """
-        of = (self._alternatives(), request.kind, request.where)
-        found = ranked(*of, request.prefer, self.reliability)
-        if not found:
-            raise LoadFailed(_nothing(request, why_none(*of, self.reliability).splitlines()))
-        return found
-
-    def _allowed_now(self, request: Choose) -> list[Alternative]:
-        """Return what a choice that was made before allows: the file may have changed, and nothing may be left."""
+    def _allowed_keys(self, request: Any) -> list[str]:
+        """Return what a request for a choice, as plain values, allows; nothing if it is wrong."""
         try:
-            return self._allowed(request)
-        except (ConfigError, LoadFailed):
+            return [one.key for one in self._offers.allowed(msgspec.convert(request, Choose))]
+        except (msgspec.ValidationError, ConfigError, LoadFailed):
             return []
 
-    def _in_turn(self, best: Sequence[Alternative], without: Collection[str]) -> list[Alternative]:
-        order = in_turn([one.key for one in best], self._trials.standings(), without, time.monotonic())
+    def _in_turn(
+        self, best: Sequence[Alternative], without: Collection[str], loaded: Collection[str] = ()
+    ) -> list[Alternative]:
+        order = in_turn([one.key for one in best], self._trials.standings(), without, time.monotonic(), loaded)
         by_key = {one.key: one for one in best}
         return [by_key[key] for key in order]
 
-    def _not_loaded(self, one: Alternative, error: RrError) -> str:
-        """Note that an alternative cannot be loaded, and return why. Only a fault of its own lowers its reliability."""
-        if isinstance(error, LoadFailed) and not isinstance(error, (CircularDependency, OverCapacity)):
-            self._lower(one, new_id())
-        self._trials.failed(one.key)
-        return f"{one.key}: {error}"
-
-    def _lower(self, one: Alternative | None, failure_id: str) -> None:
-        if one is not None:
-            with self._changed:
-                self._reliabilities.lower(one.key, float(one.provides.get(RELIABILITY, 1.0)), failure_id)
-
-    def _in_use(self, held: _Held) -> Alternative | None:
-        """Return the alternative that a choice has; None if neither the file nor a server names it any more."""
-        return self._find(held.request.kind, held.present)
-
-    def _find(self, kind: str, key: str) -> Alternative | None:
-        return next((one for one in self._alternatives() if (one.kind, one.key) == (kind, key)), None)
-
-    def _alternatives(self) -> tuple[Alternative, ...]:
-        """Return the alternatives that were given, and those of servers' labels that are no others' as well."""
+    def _well(self) -> set[str]:
         with self._changed:
-            labelled = self._labelled.alternatives()
-            if labelled is not self._labelled_before:
-                known = {(one.kind, one.key) for one in self._given}
-                more = tuple(one for one in labelled if (one.kind, one.key) not in known)
-                self._labelled_before, self._every = labelled, (*self._given, *more)
-            return self._every
+            return self._trials.well()
 
-    def _has_new_labels(self) -> bool:
-        return self._labelled.has_changed()
+    def _not_loaded(self, search: _Search, one: Alternative, error: Exception) -> None:
+        """Note that an alternative cannot be loaded. Only a fault of its own lowers its reliability, and once."""
+        is_own = is_own_fault(error)
+        counts = self._trials.failed(one.key, began=search.decided_at, is_own=is_own)
+        if is_own and counts:
+            self._offers.lower(one, new_id())
+        search.tried.append(f"{one.key}: {error}")
+
+    def _in_use(self, held: Held) -> Alternative | None:
+        """Return the alternative that a choice has; None if neither the file nor a server names it any more."""
+        return self._offers.find(held.present, held.request.kind)
+
+    def _priority_of(self, id: str) -> int | None:
+        return next((info.priority for info in self.registrar.resources() if info.id == id), None)
+
+    # -- for the trials --------------------------------------------------------------------------------------------
 
     def _strays(self) -> list[Query]:
         """Return what the process before has loaded on trial: ids grow with the time at which they are made."""
         return [query for query in self.registrar.queries() if not query.parent and query.id < self._begun]
 
-    # -- for the trials --------------------------------------------------------------------------------------------
-
     def _choices(self) -> dict[str, Choice]:
         return {id: self._choice(held) for id, held in self._held.items()}
 
-    def _choice(self, held: _Held) -> Choice:
-        allowed = self._allowed_now(held.request)
+    def _choice(self, held: Held) -> Choice:
+        allowed = self._offers.allowed_now(held.request)
         present = self._in_use(held)
         breaks = present is not None and present.break_first
         fixed = frozenset(one.key for one in allowed if breaks or one.break_first)
         return Choice(tuple(one.key for one in allowed), held.present, fixed, held.failing)
 
     def _load_on_trial(self, key: str, on_status: StatusCallback) -> Query:
-        """Load an alternative, as urgently as the choices that would have it."""
-        with self._changed:
-            wanting = {id for id, choice in self._choices().items() if key in choice.better()}
-        numbers = [info.priority for info in self.registrar.resources() if info.id in wanting]
-        priority = max((number for number in numbers if number is not None), default=None)
-        one = next((one for one in self._alternatives() if one.key == key), None)
+        """Load an alternative as the least urgent load there is: it takes room that is free, and nobody else's."""
+        one = self._offers.find(key)
         if one is None:
             raise UnknownServer(f"{key}: its server is not there any more", server=key, known=())
-        limit_s = one.timeout_s
-        return self.registrar.load(
-            one.server, _request_of(one), on_status=on_status, priority=priority, timeout_s=limit_s
-        )
+        limit_s, request = one.timeout_s, _request_of(one)
+        return self.registrar.load(one.server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
 
     def _have_taken(self, id: str, key: str) -> None:
         """Have a choice return to an alternative, in its status callback, where a crash can repeat it."""
@@ -530,7 +517,7 @@ class Choices(Manager):
     # -- what is known ---------------------------------------------------------------------------------------------
 
     def _forget(self, id: str) -> None:
-        self._relays.close(id)
+        self._addresses.close(id)
         with self._changed:
             self._held.pop(id, None)
             self._mend(id)
@@ -538,39 +525,27 @@ class Choices(Manager):
             self._trials.look()
 
     @functools.cached_property
-    def _held(self) -> dict[str, _Held]:
+    def _held(self) -> dict[str, Held]:
         """The choices by resource id; at first those of the catalog. With the lock."""
         return {
-            info.id: _held(info.request, info.response)
+            info.id: held_choice(info.request, info.response)
             for info in self.registrar.resources()
             if info.server == "choice" and info.phase == Phase.LOADED and info.status is not State.FATAL
         }
 
     @functools.cached_property
-    def _labelled(self) -> Labelled:
-        return Labelled(self._node.directory)
+    def _offers(self) -> Offers:
+        reliabilities = Reliabilities(self.registrar.directory / "reliability.json")
+        return Offers(self._given, Labelled(self._node.directory), reliabilities)
+
+    @functools.cached_property
+    def _addresses(self) -> Addresses:
+        return Addresses(self.registrar.directory, self._relay_hosts)
 
     @functools.cached_property
     def _broken(self) -> KeptRecord[_Broken]:
         return KeptRecord(self.registrar.directory / "choices.json", _Broken)
 
-    @functools.cached_property
-    def _reliabilities(self) -> Reliabilities:
-        return Reliabilities(self.registrar.directory / "reliability.json")
-
 
 def _request_of(one: Alternative) -> Any:
     return NO_FIELDS if one.request is None else one.request
-
-
-def _held(request: Choose, chosen: Chosen) -> _Held:
-    return _Held(request, key_of(chosen.server, chosen.request), chosen.address)
-
-
-def _chosen(one: Alternative, query: Query) -> Chosen:
-    request, response = (shown_plain(encode(value)) for value in (one.request, query.response))
-    return Chosen(one.server, request, response, one.provides)
-
-
-def _nothing(request: Choose, why: Sequence[str]) -> str:
-    return "\n".join([f"nothing is left for {request.kind!r}:", *why])

@@ -84,11 +84,18 @@ def failed(standing: Standing, now: float, settle_s: float) -> Standing:
 
 
 def in_turn(
-    ranked: Sequence[str], standings: Mapping[str, Standing], without: Collection[str], now: float
+    ranked: Sequence[str],
+    standings: Mapping[str, Standing],
+    without: Collection[str],
+    now: float,
+    loaded: Collection[str] = (),
 ) -> list[str]:
-    """Return the alternatives to try when the one in use has failed; those that failed lately are the last resort."""
+    """Return the alternatives to try, in this order.
+
+    First those that are `loaded` and well, as they can be had at once; last those that failed a short while ago.
+    """
     others = [key for key in ranked if key not in without]
-    return sorted(others, key=lambda key: standings.get(key, UNKNOWN).retry_at > now)
+    return sorted(others, key=lambda key: (key not in loaded, standings.get(key, UNKNOWN).retry_at > now))
 
 
 def plan(choices: Mapping[str, Choice], standings: Mapping[str, Standing], now: float, settle_s: float) -> Plan:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 
 from msgspec.structs import replace
@@ -12,6 +13,8 @@ from msgspec.structs import replace
 from rr_actors.base.errors import RegistrarDown, RrError
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.choices.planning import UNKNOWN, Choice, Plan, Standing, failed, plan
+from rr_actors.managers.planning.blame import is_own_failure, is_own_fault
+from rr_actors.managers.planning.setbacks import BACKOFF, Setbacks
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, StatusCallback
@@ -19,6 +22,10 @@ from rr_actors.registrar.queries import Query, StatusCallback
 logger = Log("rr_actors.managers.choices")
 
 _LOOK_S = 1.0  # no server says to Choices that it comes
+
+TRIES = 10
+"""How often in a row an alternative may fail, before the choices give it up; what runs well for a while begins anew."""
+_COUNTED = 1000  # so many failures are remembered, each of which several choices may hear of
 
 FAILED = (State.ERROR, State.FATAL)
 
@@ -52,6 +59,9 @@ class Trials:
         self._choices, self._load, self._take, self._has_news, self._strays = choices, load, take, has_news, strays
         self._standings: dict[str, Standing] = {}
         self._queries: dict[str, Query] = {}
+        self._setbacks = Setbacks[str]()
+        self._used_since: dict[str, float] = {}
+        self._counted: deque[str] = deque(maxlen=_COUNTED)
         self._is_new = False
         self._is_stopped = False
 
@@ -78,13 +88,50 @@ class Trials:
         with self._changed:
             return dict(self._standings)
 
-    def failed(self, key: str) -> None:
-        """Note that an alternative has failed. Its trial ends."""
+    def well(self) -> set[str]:
+        """Return the alternatives that are loaded, and have not failed: on trial, or for a choice. With the lock."""
+        now = time.monotonic()
+        used = {choice.present for choice in self._choices().values() if not choice.failing}
+        rested = {key for key in used if self._standings.get(key, UNKNOWN).retry_at <= now}
+        return rested | self._queries.keys()
+
+    def used(self, key: str) -> None:
+        """Note that a choice uses an alternative from now on."""
         with self._changed:
-            standing = self._standings.get(key, UNKNOWN)
-            self._standings[key] = failed(standing, time.monotonic(), self._settle_s)
+            self._used_since[key] = time.monotonic()
+
+    def wait_s(self, key: str) -> float | None:
+        """Return how long an alternative is to be left alone, also if nothing else is left; None: it is given up."""
+        now = time.monotonic()
+        with self._changed:
+            setback = self._setbacks.get(key)
+        if setback is None or now >= setback.retry_at + BACKOFF.maximum_s:
+            return 0.0
+        return None if setback.count >= TRIES else max(0.0, setback.retry_at - now)
+
+    def failed(self, key: str, failure_id: str = "", *, began: float | None = None, is_own: bool = True) -> bool:
+        """Note that an alternative has failed. Its trial ends.
+
+        Args:
+            failure_id: several choices may hear of one failure; it counts once.
+            began: when the load that failed was begun. One that others began before the last failure is the same load.
+            is_own: whether the alternative itself is to blame.
+
+        Returns:
+            Whether it counts.
+        """
+        with self._changed:
+            now, standing = time.monotonic(), self._standings.get(key, UNKNOWN)
+            if failure_id in self._counted or (began is not None and began <= (standing.failed_at or -1.0)):
+                return False
+            if failure_id:
+                self._counted.append(failure_id)
+            self._standings[key] = failed(standing, now, self._settle_s)
+            if is_own:
+                self._setbacks.note(key, now, ran_s=now - self._used_since.pop(key, now))
             self._end(key)
             self.look()
+            return True
 
     def release(self, query: Query) -> None:
         """Release a query in a thread of its own: that may wait for its provider."""
@@ -141,16 +188,15 @@ class Trials:
             query = self._load(key, self._heard)
         except RrError as error:
             logger.info("%s cannot be loaded again yet: %s", key, error)
-            query = None
+            with self._changed:
+                self._standings[key] = replace(self._standings[key], trial="")
+                self.failed(key, is_own=is_own_fault(error))
+            return
         with self._changed:
-            self._standings[key] = replace(self._standings[key], trial="")
-            if query is None:
-                self.failed(key)
-                return
             self._queries[key] = query
             self._standings[key] = replace(self._standings[key], trial="loaded", well_since=time.monotonic())
             if query.state in FAILED or query.released:  # the status came before the query was known
-                self.failed(key)
+                self._failed_on_trial(key, query.resource_id)
             self.look()
 
     def _heard(self, status: Status) -> None:
@@ -160,8 +206,13 @@ class Trials:
         with self._changed:
             for key, query in self._queries.items():
                 if query.id == status.query_id:
-                    self.failed(key)
+                    self._failed_on_trial(key, status.resource_id, is_own=is_own_failure(status))
                     return
+
+    def _failed_on_trial(self, key: str, failure_id: str, *, is_own: bool = True) -> None:
+        self.failed(key, failure_id, is_own=is_own)
+        self._standings[key] = replace(self._standings[key], trial="")
+        self._end(key)
 
     def _in_thread(self, do: Callable[[], None]) -> None:
         def run() -> None:
