@@ -355,7 +355,8 @@ def test_what_another_choice_has_is_preferred_to_what_is_not_loaded(world: World
     world.choose(Choose("range", {"rate_hz": "<10"}))
     choice = world.choose()
     world.say("camera", "FATAL")
-    world.settled(choice, "sonar", "sonar")
+    eventually(lambda: len(world.updates()) == 1, LIMIT_S, "an UPDATE")
+    assert choice.response.server == "sensors/sonar"
 
 
 @pytest.mark.parametrize("file", ["reliability.json", "choices.json"])

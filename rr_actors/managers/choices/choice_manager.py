@@ -304,7 +304,7 @@ class Choices(Manager):
         One that has failed again and again is waited for, and given up after some tries.
         """
         search.decided_at = time.monotonic()
-        in_turn = self._in_turn(self._offers.allowed_now(search.held.request), without, self._well())
+        in_turn = self._in_turn(self._offers.allowed_now(search.held.request), without, self._well_beside(search.id))
         alone = {one.key: i for i, one in enumerate(in_turn, 1) if one.break_first or self._trials.wait_s(one.key) != 0}
         for _, group in groupby(in_turn, key=lambda one: alone.get(one.key, 0)):
             found = list(group)
@@ -458,9 +458,9 @@ class Choices(Manager):
         by_key = {one.key: one for one in best}
         return [by_key[key] for key in order]
 
-    def _well(self) -> set[str]:
+    def _well_beside(self, id: str) -> set[str]:
         with self._changed:
-            return self._trials.well()
+            return self._trials.well_beside(id)
 
     def _not_loaded(self, search: _Search, one: Alternative, error: Exception) -> None:
         """Note that an alternative cannot be loaded. Only a fault of its own lowers its reliability, and once."""

@@ -88,10 +88,10 @@ class Trials:
         with self._changed:
             return dict(self._standings)
 
-    def well(self) -> set[str]:
-        """Return the alternatives that are loaded, and have not failed: on trial, or for a choice. With the lock."""
+    def well_beside(self, id: str) -> set[str]:
+        """Return what is loaded and has not failed, on trial or for another choice than this one. With the lock."""
         now = time.monotonic()
-        used = {choice.present for choice in self._choices().values() if not choice.failing}
+        used = {choice.present for other, choice in self._choices().items() if other != id and not choice.failing}
         rested = {key for key in used if self._standings.get(key, UNKNOWN).retry_at <= now}
         return rested | self._queries.keys()
 
