@@ -44,11 +44,13 @@ class World:
         self.app, self.sensors = self.system.open_registrar("app"), self.system.open_registrar("sensors")
         self.steps, self.heard = Calls(), Calls()
         self.broken: set[str] = set()
+        self.failures = Calls()
         self.served = {name: self._serve(name) for name in RATES}
 
     def _serve(self, name: str) -> Served:
         def load(request: Any) -> Any:
             if name in self.broken:
+                self.failures(name)
                 raise OSError(f"no {name}")
             self.steps(f"load {name}")
             return {"topic": f"/{name}"}
@@ -311,10 +313,24 @@ def test_one_failure_counts_once_however_many_choices_have_it(world: World) -> N
     world.say("camera", "FATAL")
     for choice in choices:
         world.settled(choice, *["sonar"] * len(choices))
-    for rate in (10, 30):
-        trusted = Choose("range", {"reliability": ">=0.5", "rate_hz": rate})
-        world.broken = set()
+    world.broken = set()
+    failures = {10: world.failures.items.count("lidar"), 30: 1}  # a busy machine may try the lidar once more
+    for rate, count in failures.items():
+        trusted = Choose("range", {"reliability": f">={0.5**count}", "rate_hz": rate})
         assert world.choose(trusted).response.provides["rate_hz"] == rate
+
+
+def test_an_error_that_comes_again_after_a_return_is_another_failure(start: Start) -> None:
+    world = World(start, settle_s=0.3)
+    choice, began = world.choose(), 0.0
+    with world.app.load("sensors/camera", "front"):  # so it stays the same resource
+        for _ in range(3):
+            world.say("camera", "ERROR")
+            began = time.monotonic()
+            eventually(lambda: choice.response.server == "sensors/lidar", LIMIT_S)
+            world.say("camera", "OK")
+            eventually(lambda: choice.response.server == "sensors/camera", LIMIT_S)
+    assert time.monotonic() - began > 1.2  # the delay doubles each time: 0.3 s, 0.6 s, 1.2 s
 
 
 def test_the_way_back_takes_as_long_for_many_choices_as_for_one(start: Start) -> None:

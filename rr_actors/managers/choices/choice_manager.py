@@ -284,7 +284,7 @@ class Choices(Manager):
             return any(self._fill_from(search, status, group) for group in self._groups(search, without))
         finally:
             soon.cancel()
-            with search.saying:  # what is said from now on is said of what it has
+            with search.saying:
                 search.is_over = True
 
     def _fill_from(self, search: _Search, status: Status, group: Sequence[Alternative]) -> bool:
@@ -303,9 +303,14 @@ class Choices(Manager):
 
         One that has failed again and again is waited for, and given up after some tries.
         """
-        search.decided_at = time.monotonic()
-        in_turn = self._in_turn(self._offers.allowed_now(search.held.request), without, self._well_beside(search.id))
-        alone = {one.key: i for i, one in enumerate(in_turn, 1) if one.break_first or self._trials.wait_s(one.key) != 0}
+        with self._changed:  # else what fails meanwhile is tried once more
+            search.decided_at = time.monotonic()
+            in_turn = self._in_turn(
+                self._offers.allowed_now(search.held.request), without, self._well_beside(search.id)
+            )
+            alone = {
+                one.key: i for i, one in enumerate(in_turn, 1) if one.break_first or self._trials.wait_s(one.key) != 0
+            }
         for _, group in groupby(in_turn, key=lambda one: alone.get(one.key, 0)):
             found = list(group)
             wait_s = self._trials.wait_s(found[0].key) if found[0].key in alone else 0.0
@@ -331,7 +336,9 @@ class Choices(Manager):
         left, release = iter(group), self._trials.release
         while (won := first_of(left, begin, release=release, on_failed=failed, hedge_s=hedge_s)) is not None:
             try:
-                take(won.candidate, won.value)
+                with search.saying:  # a WARNING comes before the UPDATE, or not at all
+                    take(won.candidate, won.value)
+                    search.is_over = True
             except RrError as error:
                 release(won.value)
                 if isinstance(error, UnknownQuery):  # the choice is being unloaded

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 
 from msgspec.structs import replace
@@ -25,7 +24,6 @@ _LOOK_S = 1.0  # no server says to Choices that it comes
 
 TRIES = 10
 """How often in a row an alternative may fail, before the choices give it up; what runs well for a while begins anew."""
-_COUNTED = 1000  # so many failures are remembered, each of which several choices may hear of
 
 FAILED = (State.ERROR, State.FATAL)
 
@@ -61,7 +59,7 @@ class Trials:
         self._queries: dict[str, Query] = {}
         self._setbacks = Setbacks[str]()
         self._used_since: dict[str, float] = {}
-        self._counted: deque[str] = deque(maxlen=_COUNTED)
+        self._counted: dict[str, str] = {}  # the last failure of each that is not used again
         self._is_new = False
         self._is_stopped = False
 
@@ -96,9 +94,10 @@ class Trials:
         return rested | self._queries.keys()
 
     def used(self, key: str) -> None:
-        """Note that a choice uses an alternative from now on."""
+        """Note that a choice uses an alternative from now on. What it says after that is another failure."""
         with self._changed:
             self._used_since[key] = time.monotonic()
+            self._counted.pop(key, None)
 
     def wait_s(self, key: str) -> float | None:
         """Return how long an alternative is to be left alone, also if nothing else is left; None: it is given up."""
@@ -122,10 +121,12 @@ class Trials:
         """
         with self._changed:
             now, standing = time.monotonic(), self._standings.get(key, UNKNOWN)
-            if failure_id in self._counted or (began is not None and began <= (standing.failed_at or -1.0)):
+            if began is not None and began <= (standing.failed_at or -1.0):
                 return False
             if failure_id:
-                self._counted.append(failure_id)
+                if self._counted.get(key) == failure_id:
+                    return False
+                self._counted[key] = failure_id
             self._standings[key] = failed(standing, now, self._settle_s)
             if is_own:
                 self._setbacks.note(key, now, ran_s=now - self._used_since.pop(key, now))
@@ -194,6 +195,7 @@ class Trials:
             return
         with self._changed:
             self._queries[key] = query
+            self._counted.pop(key, None)
             self._standings[key] = replace(self._standings[key], trial="loaded", well_since=time.monotonic())
             if query.state in FAILED or query.released:  # the status came before the query was known
                 self._failed_on_trial(key, query.resource_id)
