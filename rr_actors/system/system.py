@@ -90,7 +90,7 @@ from rr_actors.system.snapshots import (
     paths_to,
     streams_of,
 )
-from rr_actors.system.web_process import WebPage
+from rr_actors.system.web_process import WebPage, check_proxy
 from rr_actors.wire.name_service import Presence, StateDir, absolute_path, actor_key, open_state_dir, registrar_key
 
 logger = Log("rr_actors")
@@ -741,7 +741,9 @@ class System:
         """
         return self._subscribers.add(callback)
 
-    def serve_web(self, *, host: str = "127.0.0.1", port: int = 0) -> WebPage:
+    def serve_web(
+        self, *, host: str = "127.0.0.1", port: int = 0, prefix: str = "", hosts: Sequence[str] = ()
+    ) -> WebPage:
         """Serve a live web page of this system, from a process of its own that ends with the system.
 
         It needs the extra `web`. docs/console.md shows the page, docs/security.md says who can open it.
@@ -749,13 +751,17 @@ class System:
         Args:
             host: the address to listen at. Every program that reaches it and has the page's URL can drive the system.
             port: the port to listen at; 0 takes a free one.
+            prefix: the path before all paths of the page, if browsers reach it through a proxy: "/rr", or
+                "/user/me/proxy/{port}".
+            hosts: the names of the hosts at which a proxy serves it: "hub.example.org", with the port if it is not the
+                usual one. Pages of these hosts can drive the system.
 
         Returns:
             The page: its `.url`, and `.stop()`.
 
         Raises:
-            UsageError: the system does not run or has no console, the library nicegui is not installed, or `host` or
-                `port` is not valid.
+            UsageError: the system does not run or has no console, the library nicegui is not installed, or an argument
+                is not valid.
             Unavailable: the page did not start; the error output says why.
         """
         check_may_block("System.serve_web()")
@@ -764,11 +770,12 @@ class System:
             raise UsageError(f"serve_web: host: expected an address to listen at, got {shown(host)}")
         if not is_a(port, int) or is_a(port, bool) or not 0 <= port <= 65_535:
             raise UsageError(f"serve_web: port: expected a whole number from 0 to 65535, got {shown(port)}")
+        check_proxy("serve_web", prefix, hosts)
         if not self.config.console:
             raise UsageError(
                 f"system {self.name!r}: serve_web needs the console, which SystemConfig(console=False) ended"
             )
-        page = WebPage(str(absolute_path(self.state_dir)), host, port)
+        page = WebPage(str(absolute_path(self.state_dir)), host, port, prefix, hosts)
         with self._lock:
             if self._node is not None:
                 self._pages.append(page)

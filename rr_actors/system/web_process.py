@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.machinery
+import re
 import subprocess
 import time
-from typing import Self
+from collections.abc import Sequence
+from typing import Self, cast
 
 from rr_actors.base.checks import missing_library
-from rr_actors.base.errors import Unavailable, shown
+from rr_actors.base.errors import Unavailable, UsageError, shown
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.lifeline import is_readable, kill_group
 
@@ -20,6 +22,26 @@ _END_S = 5.0
 """Seconds that the program may take until it has ended, once it has closed its output."""
 
 
+_PREFIX = re.compile(r"(/[\w.~@:+,=!$'()*%-]+)*/?", re.ASCII)
+_NAME = re.compile(r"[\w.-]+(:\d+)?", re.ASCII)
+
+
+def check_proxy(where: str, prefix: object, hosts: object) -> None:
+    """Check what is said of a proxy between browsers and a page. "{port}" in the prefix is the port of the page.
+
+    Raises:
+        UsageError: the prefix is no path, or a host has no name.
+    """
+    if not isinstance(prefix, str) or not _PREFIX.fullmatch(prefix.replace("{port}", "1")):
+        raise UsageError(f'{where}: prefix: expected a path, such as "/user/me/proxy/8123", got {shown(prefix)}')
+    if isinstance(hosts, str) or not isinstance(hosts, Sequence):
+        raise UsageError(f"{where}: hosts: expected a list of names, got {shown(hosts)}")
+    for name in cast("Sequence[object]", hosts):
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            expected = 'the name of a host, such as "hub.example.org" or "hub.example.org:8443"'
+            raise UsageError(f"{where}: host name: expected {expected}, got {shown(name)}")
+
+
 class WebPage:
     """A web page that System.serve_web() serves. It ends with the system, or with stop(), or a `with` block.
 
@@ -27,11 +49,12 @@ class WebPage:
         url: its address, with the token that opens it.
     """
 
-    def __init__(self, state_dir: str, host: str, port: int) -> None:
+    def __init__(self, state_dir: str, host: str, port: int, prefix: str = "", hosts: Sequence[str] = ()) -> None:
         for library in _LIBRARIES:
             if importlib.machinery.PathFinder.find_spec(library) is None:
                 raise missing_library(library, "serve_web", "web")
         where = ["--state", state_dir, "--host", host, "--port", str(port), "--child"]
+        where += ["--prefix", prefix, *(word for name in hosts for word in ("--host-name", name))]
         self._program = subprocess.Popen(
             [interpreter.python("serve_web"), "-m", "rr_actors", "web", *where],
             stdin=subprocess.PIPE,

@@ -146,6 +146,39 @@ def test_a_name_that_is_not_this_servers_is_refused_whatever_is_shown(host: byte
     assert visit(keys, cookie(keys), (b"origin", b"http://" + host), kind="websocket", host=host).is_closed
 
 
+@pytest.mark.parametrize(
+    ("host", "origin", "is_in"),
+    [
+        (b"hub.example.org", b"https://hub.example.org", True),
+        (b"hub.example.org:443", b"https://hub.example.org", True),
+        (HOST, b"https://hub.example.org", True),  # a proxy that changes the Host
+        (HOST, b"https://hub.example.org:8443", False),
+        (HOST, b"https://attacker.example", False),
+        (b"hub.example.org", b"https://attacker.example", False),
+        (b"attacker.example", b"https://hub.example.org", False),
+    ],
+)
+def test_the_host_of_a_proxy_is_let_in_and_no_other(host: bytes, origin: bytes, is_in: bool) -> None:
+    keys = Keys()
+    sent: list[MutableMapping[str, Any]] = []
+
+    async def served(scope: Scope, receive: Receive, send: Send) -> None:
+        await send({"type": "served", "path": scope["path"]})
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        sent.append(message)
+
+    async def receive() -> MutableMapping[str, Any]:
+        raise AssertionError("nothing is read")
+
+    headers = [(b"host", host), (b"origin", origin), cookie(keys)]
+    scope = {"type": "websocket", "path": "/rr/ws", "query_string": b"", "headers": headers}
+    access = Access(served, keys, "127.0.0.1", 8123, "/rr", ["hub.example.org"])
+    asyncio.run(access(scope, receive, send))
+    assert (sent == [{"type": "served", "path": "/ws"}]) == is_in
+    assert len(sent) == 1
+
+
 def test_a_request_with_two_hosts_is_refused() -> None:
     keys = Keys()
 

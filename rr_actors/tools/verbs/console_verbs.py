@@ -630,13 +630,16 @@ def web(
     state: StateOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 for a free one.")] = 0,
     host: Annotated[str, typer.Option(help="The address to listen at; a browser needs the token, too.")] = "127.0.0.1",
+    prefix: Annotated[str, typer.Option(help="The path at which a proxy serves the page; {port} is its port.")] = "",
+    host_name: Annotated[list[str] | None, typer.Option(help="A host at which a proxy serves the page.")] = None,
     lab: Annotated[bool, typer.Option("--lab", help="Serve experiments to learn from, and no system.")] = False,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
 ) -> None:
     """Serve a live web page of a running system: its tree, its resources, the last minutes; print its address."""
     with needing("web", "web"):  # the other verbs work without it
         from rr_actors.tools.web.web_server import serve
-    serve(state, lab=lab, host=host, port=port, is_child=child, say=say)
+    names = host_name or ()
+    serve(state, lab=lab, host=host, port=port, prefix=prefix, names=names, is_child=child, say=say)
 
 
 @app.command(epilog="Example: rr-actors why 01a2085d3f7c")

@@ -33,8 +33,8 @@ _SIGNS = """({
 })"""
 _SOURCE = f"""{{
   getRows: (wanted) => {{
-    const match = encodeURIComponent(window.rrMatch || "");
-    fetch(`{_PATH}?match=${{match}}&offset=${{wanted.startRow}}&limit=${{wanted.endRow - wanted.startRow}}`)
+    const match = encodeURIComponent(window.rrMatch || ""), path = `${{window.path_prefix}}{_PATH}`;
+    fetch(`${{path}}?match=${{match}}&offset=${{wanted.startRow}}&limit=${{wanted.endRow - wanted.startRow}}`)
       .then((answer) => answer.json())
       .then((page) => wanted.successCallback(page.rows, page.total))
       .catch(() => wanted.failCallback());

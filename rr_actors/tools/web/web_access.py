@@ -9,7 +9,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import secrets
-from collections.abc import Awaitable, Callable, Iterable, MutableMapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, MutableMapping
 from html import escape
 from typing import Any
 from urllib.parse import parse_qs, quote
@@ -50,20 +50,27 @@ class Access:
         keys: the secrets.
         host: the address that the server listens at: one of its names, besides those of the loopback.
         port: a part of the cookie's name, since browsers share cookies between the ports of a host.
+        prefix: the path before all paths of this server, by which browsers reach it through a proxy: "/rr".
+        names: of the hosts that browsers reach it at through a proxy, "hub.example.org" or "hub.example.org:8443".
     """
 
-    def __init__(self, app: App, keys: Keys, host: str, port: int) -> None:
+    def __init__(
+        self, app: App, keys: Keys, host: str, port: int, prefix: str = "", names: Collection[str] = ()
+    ) -> None:
         self.app = app  # NiceGUI looks for the application that serves it, by this name
         self._keys = keys
         self._cookie = f"rr_actors_{port}"
         self._is_open = not is_loopback(host)
-        self._names = _LOOPBACK | {host.lower()}
+        self._prefix = prefix
+        self._origins = {f"{scheme}://{name.lower()}" for name in names for scheme in ("http", "https")}
+        self._names = _LOOPBACK | {host.lower()} | {name.lower().partition(":")[0] for name in names}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request or a connection on, or refuse it."""
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
+        scope = self._without_prefix(scope)
         headers = _Headers(scope["headers"])
         problem = self._foreign(scope["type"], headers)
         if not problem and self._has(headers):
@@ -73,6 +80,14 @@ class Access:
         else:
             text = problem or "open the address that rr-actors web has printed: it ends in a token"
             await _refuse(scope["type"], send, text)
+
+    def _without_prefix(self, scope: Scope) -> Scope:
+        """Return a request as if there were no proxy: most proxies remove the prefix. NiceGUI puts it before links."""
+        path: str = scope["path"]
+        if self._prefix and f"{path}/".startswith(f"{self._prefix}/"):
+            path = path.removeprefix(self._prefix) or "/"
+        headers = [one for one in scope["headers"] if one[0] != b"x-forwarded-prefix"]
+        return {**scope, "path": path, "headers": [*headers, (b"x-forwarded-prefix", self._prefix.encode())]}
 
     async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on. NiceGUI's middleware raises an error for a client that has left: it concerns nobody."""
@@ -95,7 +110,8 @@ class Access:
         host, origin = headers.one(b"host"), headers.one(b"origin")
         if not self._is_own_name(host):
             return f"this server is not {host or 'a server without a name'}"
-        if origin != f"http://{host}" and (origin or kind == "websocket"):
+        is_own = origin == f"http://{host}" or origin.lower() in self._origins
+        if not is_own and (origin or kind == "websocket"):
             return f"this comes from another page: {origin or 'it does not say which'}"
         return ""
 
@@ -121,9 +137,10 @@ class Access:
 
         It is no redirect: after a redirect, a browser that came from another page would not send a strict cookie.
         """
-        target = escape(quote("/" + path.lstrip("/\\")))
-        cookie = f"{self._cookie}={self._keys.cookie}; HttpOnly; SameSite=Strict; Path=/"
-        text = f'<!doctype html><meta http-equiv="refresh" content="0;url={target}"><title>rr-actors</title>'
+        target = escape(self._prefix + quote("/" + path.lstrip("/\\")))
+        cookie = f"{self._cookie}={self._keys.cookie}; HttpOnly; SameSite=Strict; Path={self._prefix}/"
+        icon = '<link rel="icon" href="data:,">'  # else the browser asks for one outside of the prefix
+        text = f'<!doctype html><meta http-equiv="refresh" content="0;url={target}">{icon}<title>rr-actors</title>'
         return text, [(b"set-cookie", cookie.encode()), (b"content-type", b"text/html; charset=utf-8")]
 
 

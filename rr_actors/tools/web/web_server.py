@@ -12,7 +12,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 
 import uvicorn
@@ -24,6 +24,7 @@ from rr_actors.base.errors import RrError, UsageError
 from rr_actors.runtime.processes import lifeline
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.recording.figures import prometheus_text
+from rr_actors.system.web_process import check_proxy
 from rr_actors.tools.web.lab.lab_pages import add_lab
 from rr_actors.tools.web.resource_table import add_rows
 from rr_actors.tools.web.sequence_page import Recorder, SequencePage, end_unseen
@@ -48,6 +49,8 @@ def serve(
     lab: bool,
     host: str,
     port: int,
+    prefix: str = "",
+    names: Collection[str] = (),
     is_child: bool,
     say: Callable[[str], None],
 ) -> None:
@@ -57,20 +60,25 @@ def serve(
         state_dir: the directory of the system that is shown; None for the one that runs.
         lab: serve the experiments in place of a system.
         port: the port, or 0 for a free one.
+        prefix: the path before all paths, by which browsers reach this server through a proxy.
+        names: of the hosts that they reach it at through a proxy.
         is_child: end when the other end of the standard input is closed, also by a crash.
         say: called with the address, once it can be opened.
 
     Raises:
         NotRunning: no system runs in the directory, or none at all.
-        UsageError: several systems run, and no state directory was given; or the address cannot be used.
+        UsageError: several systems run, and no state directory was given; or the address cannot be used, or the prefix
+            or a name is none.
     """
+    check_proxy("web", prefix, names)
     if is_child:
         lifeline.hold(sys.stdin.fileno(), os.getppid())
     listening = _listen(host, port)
     port = listening.getsockname()[1]
+    prefix = prefix.replace("{port}", str(port)).rstrip("/")
     keys = Keys()
     if lab:
-        add_lab(takes_code=is_loopback(host))
+        add_lab(takes_code=is_loopback(host) and not names)
     else:
         watch = Watch(state_dir)
         recorder = Recorder(watch)
@@ -90,7 +98,9 @@ def serve(
         app.on_shutdown(recorder.close)
         app.on_shutdown(watch.stop)
     shown = f"[{host}]" if ":" in host else host
-    app.on_startup(lambda: say(f"http://{shown}:{port}/{'lab' if lab else ''}?token={keys.token}"))
+    name = next(iter(names), f"{shown}:{port}")
+    server = f"{'http' if is_loopback(name.partition(':')[0]) or not names else 'https'}://{name}"
+    app.on_startup(lambda: say(f"{server}{prefix}/{'lab' if lab else ''}?token={keys.token}"))
     served = FastAPI(openapi_url=None)
     binding.MAX_PROPAGATION_TIME = math.inf  # it prints a warning where the machine is busy
     ui.run_with(
@@ -103,7 +113,10 @@ def serve(
         reconnect_timeout=_LAB_AWAY_S if lab else _AWAY_S,
     )
     config = uvicorn.Config(
-        Access(served, keys, host, port), log_level="warning", timeout_graceful_shutdown=_CLOSE_S, server_header=False
+        Access(served, keys, host, port, prefix, names),
+        log_level="warning",
+        timeout_graceful_shutdown=_CLOSE_S,
+        server_header=False,
     )
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn closes all, then raises the signal again
     with contextlib.suppress(KeyboardInterrupt):
