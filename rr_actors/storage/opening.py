@@ -409,7 +409,17 @@ def _lost(ignored: Sequence[Change], content: Content) -> list[str]:
 
 def _compare(path: Path, meta: sql_tables.Meta, known: LastOpening, registrar: str) -> None:
     """Compare the catalog with its last known opening, and warn of differences."""
-    if not meta.id:
+    if known.id != meta.id and known.path != str(path) and not is_missing(Path(known.path)):
+        _log.warning(
+            "%s: expected its catalog %s, which is there, got %s in another location: the configuration was changed."
+            " What %s held and served in the first stays there, and is not read. To have it read, set its location to"
+            " that directory again, or move the directory to the new place while no system runs",
+            registrar,
+            known.path,
+            path,
+            registrar,
+        )
+    elif not meta.id:
         _log.warning("%s", missing_text(registrar, known))
     elif known.id != meta.id:
         _log.warning(

@@ -176,6 +176,27 @@ def test_a_directory_that_is_removed_is_told_of_at_the_start_and_when_it_is_open
     assert warnings_in(caplog) == []
 
 
+def test_a_catalog_whose_location_was_changed_is_not_said_to_be_removed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    one, two = (tmp_path / name / "catalog.sqlite3" for name in ("one", "two"))
+    for path in (one, two):
+        store = open_store(path, witness=Witness(tmp_path, "app"))
+        store.commit(committed(1))
+        store.close()
+    (text,) = warnings_in(caplog)
+    assert f"app: expected its catalog {one}, which is there, got {two} in another location" in text
+    assert "removed" not in text
+    caplog.clear()
+    open_store(one, witness=Witness(tmp_path, "app")).close()
+    (text,) = warnings_in(caplog)
+    assert f"app: expected its catalog {two}, which is there, got {one} in another location" in text
+    shutil.rmtree(one.parent)
+    caplog.clear()
+    open_store(two, witness=Witness(tmp_path, "app")).close()
+    assert "another catalog than the one that app had last" in caplog.text
+
+
 def test_a_catalog_that_is_all_in_its_journal_is_missed_and_one_that_has_come_to_nothing_is_not(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
