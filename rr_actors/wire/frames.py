@@ -117,6 +117,13 @@ class FrameReader(Generic[T]):
         self.error = Unavailable(f"a frame of {length} bytes that is no message: {type(error).__name__}: {error}")
 
 
+ADVICE = (
+    "send the name of a file, pictures and scans by a stream, or raise the limit; a request or a response is to be"
+    " small: it is a row on disk"
+)
+"""What to do instead of sending what is too long for a frame."""
+
+
 def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
     """Return a message's frame; raise NotSerializable if it has none, or is longer than `limit`, the setting `key`."""
     try:
@@ -127,8 +134,7 @@ def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
         ) from error
     if len(body) > limit:
         raise NotSerializable(
-            f"{type(message).__name__} of {len(body)} bytes is over the limit of {limit} ({key}): "
-            "send less, or raise the limit in the configuration",
+            f"{type(message).__name__} of {len(body)} bytes is over the limit of {limit} ({key}): {ADVICE}",
             path=type(message).__name__,
             limit=limit,
             size=len(body),

@@ -71,6 +71,14 @@ def test_a_response_that_is_longer_than_a_frame_may_be_by_now_is_refused_to_who_
     assert [query.request for query in pair.shop.queries()] == ["held", "another"]
 
 
+def test_the_error_for_a_picture_in_a_request_or_a_response_says_that_it_goes_by_a_stream(pair: Pair) -> None:
+    serve(pair.provider, "picture", lambda _request: BIG)
+    for request in (BIG, "x"):
+        with pytest.raises(rr.RrError, match=r"pictures and scans by a stream.* it is a row on disk"):
+            pair.shop.load("provider/picture", request, timeout_s=5.0)
+    assert pair.lives()
+
+
 def test_an_update_that_is_too_long_is_heard_without_its_response(pair: Pair, higher_limit: pytest.MonkeyPatch) -> None:
     pair.provider.update_response(pair.held.resource_id, BIG, "grown")
     eventually(lambda: [query.state for query in pair.shop.queries()] == [rr.State.UPDATE])

@@ -78,6 +78,7 @@ from rr_actors.runtime.user_loop import COROUTINE, Done, closing
 from rr_actors.runtime.workers import is_async
 from rr_actors.streams.publisher import Publisher
 from rr_actors.streams.stream import StreamNews
+from rr_actors.wire.frames import ADVICE
 from rr_actors.wire.name_service import LABELS_BYTES
 
 
@@ -589,7 +590,7 @@ class ServerActor:
         if size + _ROW_BYTES <= limit:
             return None
         why = f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
-        return NotSerializable(f"{why}: give the name of a file, say, or raise the limit", path="response")
+        return NotSerializable(f"{why}: {ADVICE}", path="response")
 
     def load_failure(self, error: BaseException) -> Failure:
         """Return the failure that consumers hear if a load callback raises; a group of one error is that error."""
