@@ -741,6 +741,41 @@ def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room
     noted.close(erase=False)
 
 
+def test_a_full_disk_is_said_more_and_more_rarely_and_its_end_once(
+    path: Path, ledger: tuple[CommitLog, Loop, JournaledStore], caplog: pytest.LogCaptureFixture
+) -> None:
+    noted, loop, store = ledger
+    caplog.set_level("INFO")
+    open_tables(store)
+    commit(noted, part("large", os.urandom(20_000)))
+    with full_disk(path.with_name(path.name + "-wal").stat().st_size + 4096):
+        loop.advance(300.0)
+    assert 6 <= caplog.text.count("stay in the journal") <= 12
+    loop.advance(2.0)
+    assert caplog.text.count("app: its SQLite file takes changes again") == 1
+    caplog.clear()
+    commit(noted, part("large", os.urandom(30_000)))
+    with full_disk(4096):
+        loop.advance(3.0)
+    assert "stay in the journal" in caplog.text, "another failure is said at once"
+    noted.close(erase=False)
+
+
+def test_changes_that_a_full_disk_does_not_take_are_said_more_and_more_rarely(
+    path: Path, ledger: tuple[CommitLog, Loop, JournaledStore], caplog: pytest.LogCaptureFixture
+) -> None:
+    noted, loop, _ = ledger
+    batch = Decision(Catalog("app"))
+    batch.put_later(part("large", os.urandom(20_000)))
+    noted.commit(batch)
+    with full_disk(100):
+        loop.advance(300.0)
+    assert 6 <= caplog.text.count("tried again several times a second") <= 12
+    loop.advance(1.0)
+    assert [row.id for row in read_rows(path)] == ["large"]
+    noted.close(erase=False)
+
+
 # -- damage, and other users ---------------------------------------------------------------------------------------
 
 

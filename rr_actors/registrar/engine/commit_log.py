@@ -28,6 +28,8 @@ _SAVE_SOON_S = 0.05
 _TIDY_SOON_S = 0.1  # after the last commit
 _TIDY_AT_LAST_S = 2.0  # after the first
 _TIDY_AGAIN_S = 1.0
+_SAY_AGAIN_S = 1.0  # twice as long after each line about one failure,
+_SAY_AT_LEAST_S = 60.0  # up to this
 
 
 class _Activity:
@@ -37,6 +39,27 @@ class _Activity:
 
 
 _activity = _Activity()
+
+
+class _Repeated:
+    """Says when a failure that is tried again and again is to be logged: at once, then more and more rarely."""
+
+    def __init__(self) -> None:
+        self._after_s = 0.0
+        self._next = 0.0
+
+    def is_due(self, now: float) -> bool:
+        """Return whether to log a failure at the time `now`."""
+        if self._after_s and now < self._next:
+            return False
+        self._after_s = min(2 * self._after_s or _SAY_AGAIN_S, _SAY_AT_LEAST_S)
+        self._next = now + self._after_s
+        return True
+
+    def is_over(self) -> bool:
+        """Note that there was no failure this time; return whether there had been one."""
+        was, self._after_s = self._after_s, 0.0
+        return was > 0
 
 
 class CommitLog:
@@ -82,6 +105,8 @@ class CommitLog:
         self.timed_s = 0.0
         self.watched: Watched | None = None
         self._closed = False
+        self._not_tidied = _Repeated()
+        self._not_saved = _Repeated()
 
     def content(self) -> Content:
         """Return the rows on disk. Write unsaved changes first; with save_on_modify off, forget them instead.
@@ -216,8 +241,10 @@ class CommitLog:
     @on_loop
     def _tidied(self, _result: None, error: BaseException | None) -> None:
         self._tidying = False
-        if error is not None:
-            logger.warning("%s: %s; tried again later", self._name, error)
+        if error is None and self._not_tidied.is_over():
+            logger.info("%s: its SQLite file takes changes again", self._name)
+        elif error is not None and self._not_tidied.is_due(self._loop.time()):
+            logger.warning("%s: %s; tried again each second", self._name, error)
         if not self._closed and self.store.wants_tidying():
             self._tidying = True
             if error is None:
@@ -252,6 +279,10 @@ class CommitLog:
         try:
             self._save()
         except CatalogError as error:
-            logger.error("%s: %s; tried again later", self._name, error)
+            if self._not_saved.is_due(self._loop.time()):
+                logger.error("%s: %s; tried again several times a second", self._name, error)
             self.saving = True
             self._save_after(_RETRY_S)
+        else:
+            if self._not_saved.is_over():
+                logger.info("%s: its changes are written again", self._name)
