@@ -22,12 +22,13 @@ class Picture:
 
 class Cameras(rr.Manager):
     def __init__(self) -> None:
-        self.off: dict[str, threading.Event] = {}
+        self.off: dict[str, threading.Event] = {}  # by the id of the resource: a device may have two for a while
 
     @rr.server("camera", recovery="reload")  # a respawned manager opens its cameras again
     def open_camera(self, device: str) -> rr.Stream:
-        images = rr.current().open_stream("images")
-        off = self.off[device] = threading.Event()
+        me = rr.current()
+        images = me.open_stream("images")
+        off = self.off[me.resource_id] = threading.Event()
 
         def run() -> None:
             while not off.wait(0.01):
@@ -38,7 +39,7 @@ class Cameras(rr.Manager):
 
     @open_camera.unload
     def close_camera(self, device: str, response: rr.Stream) -> None:
-        self.off.pop(device).set()
+        self.off.pop(rr.current().resource_id).set()
 
 
 def main() -> None:

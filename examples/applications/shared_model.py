@@ -15,11 +15,13 @@ import rr_actors as rr
 
 class Models(rr.Manager):
     def __init__(self) -> None:
-        self.models: dict[str, dict[str, int]] = {}
+        self.models: dict[str, dict[str, int]] = {}  # by the id of the resource
 
     @rr.server("model")
     def load_model(self, name: str) -> str:
-        self.models[name] = {word: number for number, word in enumerate(["zero", "one", "two"])}  # some gigabytes
+        self.models[rr.current().resource_id] = {
+            word: number for number, word in enumerate(["zero", "one", "two"])
+        }  # some gigabytes
         return name
 
     @load_model.recover
@@ -28,7 +30,7 @@ class Models(rr.Manager):
 
     @load_model.unload
     def drop_model(self, name: str, response: str) -> None:
-        self.models.pop(name, None)
+        self.models.pop(rr.current().resource_id, None)
 
     def on_receive(self, message: Any) -> dict[str, Any]:
         return {"number": self.models[message["model"]].get(message["word"]), "model_pid": os.getpid()}
@@ -38,8 +40,8 @@ class Models(rr.Manager):
 async def lifespan(app: FastAPI) -> AsyncIterator[None]:
     with rr.connect("rr_state") as client:
         registrar = client.open_registrar(f"web-{os.getpid()}")
-        async with await registrar.load_async("models/model", "words"):  # all workers hold the same one
-            app.state.client = client
+        async with await registrar.load_async("models/model", "words") as model:  # all workers hold the same one
+            app.state.client, app.state.model = client, model.resource_id
             yield
 
 
@@ -48,7 +50,8 @@ app = FastAPI(lifespan=lifespan)
 
 @app.get("/numbers/{word}")
 def number(word: str, request: Request) -> dict[str, Any]:
-    return request.app.state.client.ask("models", {"model": "words", "word": word}) | {"worker": os.getpid()}
+    state = request.app.state
+    return state.client.ask("models", {"model": state.model, "word": word}) | {"worker": os.getpid()}
 
 
 @app.exception_handler(rr.Unavailable)

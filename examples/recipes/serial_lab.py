@@ -16,13 +16,14 @@ import rr_actors as rr
 
 class Instruments(rr.Manager):
     def __init__(self) -> None:
-        self.lines: dict[str, int] = {}
+        self.lines: dict[str, int] = {}  # by the id of the resource: a device may have two for a while
         self.lock = threading.Lock()  # a load and a message may come at once
 
     @rr.server("instrument")
     def open_line(self, device: str) -> str:
-        self.lines[device] = os.open(device, os.O_RDWR | os.O_NOCTTY)
-        return self.ask(device, "*IDN?")
+        me = rr.current().resource_id
+        self.lines[me] = os.open(device, os.O_RDWR | os.O_NOCTTY)
+        return self.ask(me, "*IDN?")
 
     @open_line.recover
     def open_again(self, device: str, name: str) -> str:
@@ -30,15 +31,15 @@ class Instruments(rr.Manager):
 
     @open_line.unload
     def close_line(self, device: str, name: str) -> None:
-        os.close(self.lines.pop(device))
+        os.close(self.lines.pop(rr.current().resource_id))
 
     def on_receive(self, message: tuple[str, str]) -> str:
         return self.ask(*message)
 
-    def ask(self, device: str, command: str) -> str:
+    def ask(self, resource_id: str, command: str) -> str:
         with self.lock:
-            os.write(self.lines[device], f"{command}\n".encode())
-            return os.read(self.lines[device], 100).decode().strip()
+            os.write(self.lines[resource_id], f"{command}\n".encode())
+            return os.read(self.lines[resource_id], 100).decode().strip()
 
 
 def instrument() -> str:
@@ -59,10 +60,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
         first, second = (system.open_registrar(name) for name in ("plotter", "logger"))
         meter = first.load("instruments/instrument", device)
-        print(f"{meter.response}: {system.ref('instruments').ask((device, 'READ?'))}")
+        print(f"{meter.response}: {system.ref('instruments').ask((meter.resource_id, 'READ?'))}")
         system.ref("instruments").kill()
         shared = second.load("instruments/instrument", device)  # waits for the new manager, and shares the line
-        print(f"after kill -9: {system.ref('instruments').ask((device, 'READ?'))}, {meter.state}")
+        print(f"after kill -9: {system.ref('instruments').ask((meter.resource_id, 'READ?'))}, {meter.state}")
         print(f"one line for both: {shared.resource_id == meter.resource_id}")
 
 

@@ -54,6 +54,46 @@ def test_the_snippets_of_a_page_run_from_top_to_bottom(page: Path, tmp_path: Pat
         )
 
 
+TWO_OF_ONE_REQUEST = """
+import rr_actors as rr
+
+def test(manager, server, request):
+    with rr.System([rr.ChildSpec(manager, id="m", placement="thread")], state_dir="state") as system:
+        app = system.open_registrar("app")
+        lost = app.load(f"m/{server}", request)
+        system.registrar("m").send_status(lost.resource_id, rr.Status(rr.State.FATAL, "unplugged"))
+        lost.wait_status(rr.State.FATAL, timeout_s=20)
+        fresh = app.load(f"m/{server}", request)
+        assert fresh.resource_id != lost.resource_id
+        lost.unload()
+        assert app.load(f"m/{server}", request).resource_id == fresh.resource_id
+        for one in app.queries():
+            one.unload()
+        assert system.registrar("m").resources() == []
+"""
+
+
+@pytest.mark.parametrize(
+    ("page", "manager", "server"),
+    [
+        ("docs/streams.md", "Cameras", "camera"),
+        ("examples/camera.py", "Cameras", "camera"),
+        ("examples/recipes/serial_lab.py", "Instruments", "instrument"),
+        ("examples/applications/shared_model.py", "Models", "model"),
+    ],
+)
+def test_a_manager_that_is_shown_holds_two_resources_of_one_request(
+    page: str, manager: str, server: str, tmp_path: Path
+) -> None:
+    file = ROOT / page
+    (tmp_path / "shown.py").write_text(script(file) if file.suffix == ".md" else file.read_text())
+    request = "shown.instrument()" if server == "instrument" else repr("door")
+    end = f'import shown\nif __name__ == "__main__":\n    test(shown.{manager}, "{server}", {request})\n'
+    (tmp_path / "two.py").write_text(TWO_OF_ONE_REQUEST + end)
+    ran = subprocess.run([sys.executable, "two.py"], cwd=tmp_path, capture_output=True, text=True, timeout=50)
+    assert ran.returncode == 0, ran.stderr
+
+
 def test_the_first_program_prints_what_the_page_shows_and_nothing_else(tmp_path: Path) -> None:
     page = ROOT / "README.md"
     text = page.read_text()
