@@ -6,8 +6,11 @@ import asyncio
 import gc
 import os
 import pickle
+import resource
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -85,6 +88,16 @@ class Boards(rr.Manager):
 
     def pid(self) -> int:
         return os.getpid()
+
+    def take_no_descriptors(self) -> None:
+        self.limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, self.limits[1]))
+
+    def take_descriptors(self) -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, self.limits)
+
+    def cpu_s(self) -> float:
+        return time.process_time()
 
 
 def in_child(run: Callable[[], object]) -> str:
@@ -457,6 +470,57 @@ def test_a_signal_handler_publishes_while_the_main_thread_does(start: Start) -> 
         assert next(reader).missed >= 0
 
 
+READER = """
+import os, sys, time
+import rr_actors as rr
+
+with rr.connect(sys.argv[1]) as client:
+    reader = client.open_registrar("reader").load("boards/board", ["a"]).stream("a", keep="all", depth=2)
+    if not (pid := os.fork()):
+        time.sleep(600)
+    print(pid, flush=True)
+    next(reader)
+    print("read", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_killed_reader_holds_up_nobody_although_its_child_of_fork_lives(system: rr.System, boards: Any) -> None:
+    with load(system, "a").stream("a", keep="all", depth=200, timeout_s=20) as other:
+        command = [sys.executable, "-c", READER, system.state_dir]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as reader:
+            assert reader.stdout is not None
+            child = int(reader.stdout.readline())
+            try:
+                when_wanted(boards, count=2)
+                boards.publish("a", "first").get()
+                assert reader.stdout.readline() == "read\n"
+                reader.kill()
+                when_wanted(boards, count=1)
+                assert sum(boards.publish("a", *range(100)).get()) == 100
+                assert [next(other).value for _ in range(101)] == ["first", *range(100)]
+            finally:
+                reader.kill()
+                os.kill(child, signal.SIGKILL)
+
+
+def test_a_reader_that_cannot_be_accepted_takes_no_time_of_the_manager(system: rr.System, boards: Any) -> None:
+    query = load(system, "a")
+    boards.publish("a", "before").get()
+    boards.take_no_descriptors().get()
+    with query.stream("a", timeout_s=0.3) as reader:
+        with pytest.raises(TimeoutError):
+            next(reader)  # it has knocked
+        assert boards.wanted("a").get() == 0
+        before = boards.cpu_s().get()
+        time.sleep(1)  # the time is what is measured
+        assert boards.cpu_s().get() - before < 0.15
+        boards.take_descriptors().get()
+        when_wanted(boards)
+        boards.publish("a", "after").get()
+        assert next(reader).value == "after"
+
+
 def test_a_child_of_fork_uses_no_end_of_a_stream(start: Start) -> None:
     system = start(rr.ChildSpec(Boards, id="boards"))
     boards = system.ref("boards").proxy()
@@ -490,6 +554,40 @@ def test_publish_that_is_interrupted_anywhere_breaks_nothing(start: Start, size:
         for number in range(20):
             assert publisher.publish(bytes([number]) * size) == 1
             assert next(reader).value == bytes([number]) * size
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("keep", ["latest", "all"])
+def test_a_loan_that_is_interrupted_anywhere_breaks_nothing_and_leaves_no_memory(start: Start, keep: Any) -> None:
+    size = 300_000  # too long for a packet: without shared memory it would be missed
+    config = rr.SystemConfig(segments_limit_bytes=40 * size)
+    system = start(rr.ChildSpec(Boards, id="boards", placement="thread"), config=config)
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", keep=keep, depth=5, timeout_s=20) as reader:
+        when_wanted(boards)
+        publisher = boards.streams.get()["a"]
+
+        def lend(fill: int) -> None:
+            with publisher.loan((size,), "u1", timeout_s=5) as picture:
+                picture[:] = fill
+
+        lend(1)  # an import of numpy that is interrupted cannot be repeated
+        next(reader)
+        point, where = 0, "at first"
+        while where:
+            point += 1
+            where = interrupted(lambda: lend(1), point).where
+            publisher.publish(point)
+            while not isinstance(next(reader).value, int):
+                pass
+        assert point > 40
+        gc.collect()  # errors refer to pictures
+        lend(255)
+        while isinstance(value := next(reader).value, int) or value[0] != 255:
+            pass
+        for number in range(60):
+            lend(number)
+            assert next(reader).value[0] == number
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # an interrupt in __del__ goes nowhere
