@@ -25,6 +25,7 @@ from rr_actors.runtime.group_limits import group_limit
 from rr_actors.runtime.processes.control_groups import CONTROLLERS, ControlGroups
 from rr_actors.supervision.core.specs import ChildSpec
 from rr_actors.system.system import System
+from rr_actors.wire.unix_sockets import NO_PROC, has_proc
 
 _OWN_FDS = 64  # descriptors of an application with a system and no children
 _CHILD_FDS = 6  # descriptors that the application has open for each child
@@ -54,6 +55,7 @@ def examine(state_dir: Path) -> list[Finding]:
         _python,
         _descriptors,
         _processes,
+        _proc,
         _control_groups,
         _program_groups,
         _shared_memory,
@@ -102,6 +104,11 @@ def _processes() -> Iterator[Finding]:
         limits=0 <= fits < _FEW_CHILDREN,
         todo="raise ulimit -u, or TasksMax= in the systemd unit",
     )
+
+
+def _proc() -> Iterator[Finding]:
+    found, _, todo = NO_PROC.partition(": ")
+    yield _judge("/proc", "mounted" if has_proc() else found, lacks=not has_proc(), todo=todo)
 
 
 def _control_groups() -> Iterator[Finding]:

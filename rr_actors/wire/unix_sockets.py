@@ -24,6 +24,15 @@ _CREDENTIALS = struct.Struct("3i")  # process, user, group
 _OF_PROCESS = re.compile(r"(\d+)-[0-9a-f]{8}\.sock")
 
 
+NO_PROC = "/proc is not mounted, and processes reach their sockets by it: mount it (mount -t proc proc /proc)"
+"""What a system lacks where has_proc() is false."""
+
+
+def has_proc() -> bool:
+    """Return whether a process finds its own descriptors below /proc."""
+    return os.path.isdir("/proc/self/fd")
+
+
 def new_name() -> str:
     """Return a new, unique name for a socket of this process."""
     return f"{os.getpid()}-{os.urandom(4).hex()}.sock"
@@ -145,7 +154,7 @@ class SocketDir:
             unbound.bind(_address(folder, name))
         except OSError as error:
             unbound.close()
-            why = wanted_by(error) or error.strerror or error
+            why = wanted_by(error) or (NO_PROC if not has_proc() else error.strerror) or error
             file = f"{self._path}/{name}"
             raise ConfigError(f"cannot make the socket {file}: {why}", file=file) from error
         except BaseException:

@@ -14,7 +14,7 @@ from support import REPOSITORY
 from support_cli import run_cli
 
 EXAMINED = (
-    "versions", "threads", "descriptors", "processes", "control group: memory", "control group: tasks",
+    "versions", "threads", "descriptors", "processes", "/proc", "control group: memory", "control group: tasks",
     "control group: programs", "memfd", "/dev/shm", "ptrace", "clock", "state: file system", "state: room",
     "state: fsync", "fork server", "terminal",
 )  # fmt: skip
@@ -25,12 +25,19 @@ def findings(output: str) -> dict[str, dict[str, str]]:
     return {finding["what"]: finding for finding in json.loads(output)}
 
 
-def in_a_shell(place: Path, before: str, program: str = MAIN) -> subprocess.CompletedProcess[str]:
+def in_a_shell(
+    place: Path, before: str, program: str = MAIN, *, apart: tuple[str, ...] = ()
+) -> subprocess.CompletedProcess[str]:
     """Run `rr-actors doctor --json` after these words of a shell."""
     command = f'{before}exec {sys.executable} -c "$0" doctor --json --state state'
     environment = {"PYTHONPATH": str(REPOSITORY), "PATH": "/usr/bin:/bin"}
     return subprocess.run(
-        ["/bin/sh", "-c", command, program], cwd=place, env=environment, capture_output=True, text=True, timeout=50
+        [*apart, "/bin/sh", "-c", command, program],
+        cwd=place,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=50,
     )
 
 
@@ -60,6 +67,17 @@ def test_too_few_descriptors_for_two_children_are_a_lack(tmp_path: Path) -> None
     found = findings(ran.stdout)["descriptors"]
     assert (found["level"], found["found"].split()[0]) == ("lacks", "70")
     assert "LimitNOFILE=" in found["todo"]
+
+
+def test_without_proc_the_doctor_and_the_error_of_a_system_say_that_it_is_not_mounted(tmp_path: Path) -> None:
+    if subprocess.run(["unshare", "-m", "true"], check=False, capture_output=True).returncode:
+        pytest.skip("this user may not make a mount namespace")
+    ran = in_a_shell(tmp_path, "umount -l /proc && ", apart=("unshare", "-m"))
+    assert ran.returncode == 1, ran.stderr
+    found = findings(ran.stdout)
+    assert (found["/proc"]["level"], found["fork server"]["level"]) == ("lacks", "lacks")
+    assert "mount -t proc proc /proc" in found["/proc"]["todo"]
+    assert "/proc is not mounted" in found["fork server"]["found"]
 
 
 def test_few_descriptors_are_a_limit_and_no_lack(tmp_path: Path) -> None:
