@@ -30,7 +30,7 @@ from rr_actors.base.errors import RrError
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.process_marks import VARIABLE, kill_allocation
-from rr_actors.managers.program_directory import Home, shim_of
+from rr_actors.managers.program_directory import Home, remove_retired, shim_of
 from rr_actors.managers.program_usage import ProgramUsage
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.control_groups import ControlGroups
@@ -129,6 +129,7 @@ class ExternalPrograms:
         self._watched: dict[str, ProcessHandle] = {}
         self._usages: dict[str, ProgramUsage] = {}
         self._gives_up = False
+        remove_retired(directory)  # a killed predecessor left them
 
     def start(
         self,
@@ -199,9 +200,10 @@ class ExternalPrograms:
                 if mine:  # no shim has the lock, and none can take it while this thread has it
                     if not home.state().keys() & {"ended", "failed"}:
                         kill_allocation(key)  # its shim was killed
-                    home.remove()
-                    return
+                    home.retire()
+                    break
             self._stop_shim(home)
+        remove_retired(self._directory)  # without the lock's file open
         if home.exists():
             held = f"its shim holds {home.path}/lock and does not react"
             raise ProgramFailed(f"the program of {home.path} cannot be ended: {held}")

@@ -21,6 +21,7 @@ from rr_actors.runtime.processes.control_groups import ControlGroup
 logger = Log("rr_actors.managers.program_directory")
 
 _LINE_LIMIT = 500  # characters
+_RETIRED = ".retired-"
 
 
 class _End(TypedDict, total=False):
@@ -60,12 +61,12 @@ class Home:
                 break
         (self.path / "lock").touch(mode=0o600)
 
-    def remove(self) -> None:
-        """Remove the directory with its contents, and the program's control group, in which no process is left."""
+    def retire(self) -> None:
+        """Rename the directory, for remove_retired(), and remove the control group, in which no process is left."""
         group = self.group()
         if group is not None and not group.remove():
             logger.warning("%s cannot be removed: a process of another user runs in it", group.path)
-        shutil.rmtree(self.path)
+        self.path.rename(self.path.with_name(f"{self.key}{_RETIRED}{os.urandom(4).hex()}"))
 
     def note_group(self, group: ControlGroup) -> None:
         """Note the program's control group, before it is made."""
@@ -141,6 +142,16 @@ class Home:
                 data += (self.path / name).read_bytes()
         last = data.decode(errors="replace").rstrip("\n").split("\n")[-lines:] if data else []
         return tuple(line[:_LINE_LIMIT] for line in last)
+
+
+def remove_retired(directory: Path) -> None:
+    """Remove the directories of programs that are over. One that cannot be removed now is left to the next call.
+
+    On NFS and FUSE a file that is removed while it is open stays under another name, and its directory with it.
+    """
+    with contextlib.suppress(OSError):
+        for path in directory.glob(f"*{_RETIRED}*"):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def shim_of(state: dict[str, Any]) -> ProcessHandle | None:

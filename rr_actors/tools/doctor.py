@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import platform
 import resource
@@ -36,6 +37,7 @@ _REAL_FSYNC_S = 20e-6  # a disk with a battery takes longer
 _SLOW_CLOCK_S = 1e-6
 _SHARED = ("nfs", "cifs", "smb", "9p", "ceph", "gluster", "lustre", "afs")
 _GONE_AT_BOOT = ("tmpfs", "ramfs", "overlay")
+_FUSE = "fuse"
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -186,11 +188,14 @@ def _clock() -> Iterator[Finding]:
 
 def _files(place: Path) -> Iterator[Finding]:
     kind, free = _file_system(place), shutil.disk_usage(place).free
-    is_shared = kind.startswith(_SHARED)
-    todo = "catalogs are not safe where locks cross machines: use a local disk"
-    if not is_shared:
-        todo = "nothing here outlives the container or the machine's start: give the state directory a volume or disk"
-    yield _judge("state: file system", f"{kind}, {place}", limits=kind in _GONE_AT_BOOT, lacks=is_shared, todo=todo)
+    is_shared, is_fuse = kind.removeprefix("fuse.").startswith(_SHARED), kind.startswith(_FUSE)
+    todo = "nothing here outlives the container or the machine's start: give the state directory a volume or disk"
+    if is_shared:
+        todo = "catalogs are not safe where locks cross machines: use a local disk"
+    elif is_fuse:
+        todo = "a directory stays while a removed file in it is open, and goes later; a local disk is faster, and safer"
+    limits = is_fuse or kind in _GONE_AT_BOOT
+    yield _judge("state: file system", f"{kind}, {place}", limits=limits, lacks=is_shared, todo=todo)
     yield _judge("state: room", f"{free // 2**20} MiB free", limits=free < _FEW_BYTES, todo="make room on this disk")
     try:
         taken_s = _fsync_s(place)
@@ -237,15 +242,21 @@ class Patient(Manager):
         return os.getpid()
 
 
+def _serve_once(state: str) -> None:
+    children = [ChildSpec(Patient, id="patient")]
+    with System(children, state_dir=state, config=SystemConfig(console=False)) as system:
+        system.open_registrar("doctor").load("patient/pulse").unload()
+
+
 def _system(place: Path) -> Iterator[Finding]:
     """Start a system beside the state: fork server, sockets, locks, links and the lifeline have to work."""
     try:
         with tempfile.TemporaryDirectory(prefix="rr-doctor-", dir=place, ignore_cleanup_errors=True) as state:
             began = time.perf_counter()
-            children = [ChildSpec(Patient, id="patient")]
-            with System(children, state_dir=state, config=SystemConfig(console=False)) as system:
-                system.open_registrar("doctor").load("patient/pulse").unload()
+            _serve_once(state)
             taken_s = time.perf_counter() - began
+        gc.collect()  # closes the file that all processes of the system map:
+        shutil.rmtree(state, ignore_errors=True)  # until then its directory stays on NFS and FUSE
     except Exception as error:  # whatever it is, it is what a user's system would raise
         first, *rest = str(error).splitlines() or [type(error).__name__]
         yield Finding("lacks", "fork server", first, " ".join(rest) or "this is what System.start() raises here")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import gc
 import os
 import signal
@@ -13,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 import psutil
@@ -652,6 +654,48 @@ def test_a_program_whose_shim_cannot_write_its_state_can_be_ended(
     started.wait(10)
     assert not home.exists()
     assert not find_processes(VARIABLE, KEY)
+
+
+def test_a_directory_that_cannot_be_removed_now_is_no_failure_and_is_removed_at_the_next_start(
+    tmp_path: Path, exits: Exits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs, places, removed = ExternalPrograms(tmp_path / "programs", exits), tmp_path / "programs", os.rmdir
+
+    def on_a_share(path: Any, **options: Any) -> None:
+        """As on NFS and FUSE, where a file that is removed while it is open stays in its directory."""
+        if lock_files(places):
+            raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY))
+        removed(path, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rmdir", on_a_share)
+        running = programs.start(KEY, python(SLEEP, ready="ready"))
+        programs.stop(KEY)
+        assert not is_running(running.pid)
+        assert list(places.iterdir()) == [], "this process has closed the files in it by then"
+        patch.setattr(os, "rmdir", lambda *_, **__: _raise(OSError(errno.EBUSY, os.strerror(errno.EBUSY))))
+        for _ in range(2):
+            running = programs.start(KEY, python(SLEEP, ready="ready"))
+            programs.stop(KEY)
+            assert not is_running(running.pid)
+        assert len(list(places.iterdir())) == 2
+    programs.close()
+    ExternalPrograms(places, exits).close()
+    assert list(places.iterdir()) == []
+
+
+def lock_files(places: Path) -> list[int]:
+    """The descriptors of this process that have a lock of a program open."""
+    found: list[int] = []
+    for name in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            if f"{places}/" in os.readlink(f"/proc/self/fd/{name}") and not os.path.isdir(f"/proc/self/fd/{name}"):
+                found.append(int(name))
+    return found
+
+
+def _raise(error: Exception) -> NoReturn:
+    raise error
 
 
 def test_killing_the_shim_ends_the_program_and_its_children_and_is_heard_of(

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import rr_actors as rr
+from rr_actors.tools import doctor
 from support import REPOSITORY
 from support_cli import run_cli
 
@@ -103,6 +104,16 @@ def test_a_state_directory_that_cannot_be_written_is_a_lack(tmp_path: Path) -> N
     assert ran.returncode == 1
     found = findings(ran.stdout)["state: fsync"]
     assert (found["level"], "Not a directory" in found["found"], "--state" in found["todo"]) == ("lacks", True, True)
+
+
+@pytest.mark.parametrize(("kind", "level"), [("fuse.sshfs", "limits"), ("fuse.glusterfs", "lacks"), ("nfs4", "lacks")])
+def test_a_file_system_that_keeps_removed_files_or_shares_locks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, level: str
+) -> None:
+    monkeypatch.setattr("rr_actors.tools.doctor._file_system", lambda _place: kind)
+    (found,) = [finding for finding in doctor.examine(tmp_path) if finding.what == "state: file system"]
+    assert (found.level, kind in found.found, "local disk" in found.todo) == (level, True, True)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif("tmpfs /dev/shm" not in Path("/proc/self/mounts").read_text(), reason="/dev/shm is no tmpfs here")
