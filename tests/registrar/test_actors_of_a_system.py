@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors.messaging.mailbox import Mailbox
-from rr_actors.actors.turns import TurnActor
+from rr_actors.actors.turns import AT_ONCE, TurnActor
 from support import REPOSITORY, eventually
 from support_inside import actor_of
 
@@ -190,3 +190,10 @@ def test_the_messages_of_one_sender_keep_their_order_over_both_ways(
         query.unload() if not waits else app.unload(query)
         expected += [name, name]
     assert order == expected
+
+
+def test_all_requests_are_sent_also_if_there_are_more_than_share_a_turn(system: rr.System, app: rr.Registrar) -> None:
+    loads = [app.load("cameras/camera", f"camera {number}", block=False) for number in range(3 * AT_ONCE)]
+    assert [load.get(timeout=LIMIT_S).response for load in loads] == [
+        f"camera {number} is open" for number in range(3 * AT_ONCE)
+    ]

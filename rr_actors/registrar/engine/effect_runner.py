@@ -88,7 +88,6 @@ class EffectRunner:
             dirty, self._dirty = self._dirty, {}
             for client in dirty.values():
                 client.take_turns()
-                client.flush()
 
     @with_lock
     def by_thread(self, effects: Sequence[Effect]) -> Callable[[], None] | None:
@@ -187,7 +186,13 @@ class EffectRunner:
         if effect.delay_s is None:
             self._timers.cancel(effect.key)
         else:
-            self._timers.set(effect.key, effect.delay_s, functools.partial(self._registrar.post, effect.command))
+            self._timers.set(effect.key, effect.delay_s, functools.partial(self._fired, effect))
+
+    def _fired(self, effect: e.SetTimer) -> None:
+        if effect.key in self._registrar.outside:  # the callback waits for room, and its time has not begun
+            self._set_timer(effect)
+        elif effect.command is not None:
+            self._registrar.post(effect.command)
 
     # -- waiting callers and listeners ---------------------------------------------------------------------------
 

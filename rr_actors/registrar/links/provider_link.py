@@ -138,8 +138,8 @@ class ProviderLink(TurnActor):
                 case other:
                     raise TypeError(f"{self.actor_ref}: unknown message {type(other).__name__}")
 
-    def flush(self) -> None:
-        """Send the requests that wait, together."""
+    def follow(self) -> None:
+        """Send the requests of the turn, together."""
         if self._unflushed is not None:
             link, self._unflushed = self._unflushed, None
             link.flush()
