@@ -166,9 +166,11 @@ class Spare:
         """Raise Damage if the -wal is not that of the spare: only recover() gets the right rows."""
         spare, number = _checked(self._read(self._name))  # nearly always nothing
         wal = self._read(self._wal)
-        is_of_it = number is not None and _generation(wal) == spare[_SALTS]
-        if is_of_it and wal[: len(spare)] != spare:
-            raise Damage(f"{self._wal}, which is damaged; opening the catalog mends it")
+        if number is None:
+            return
+        is_mixed = not wal and not _has_all(self._read(self._path.name), spare)
+        if is_mixed or (_generation(wal) == spare[_SALTS] and wal[: len(spare)] != spare):
+            raise Damage(f"{self._wal}, which is damaged or missing; opening the catalog mends it")
 
 
 def leftovers(path: Path) -> list[str]:
@@ -252,6 +254,19 @@ def _checked(data: bytes) -> tuple[bytes, int | None]:
     wal = data[: -_TRAILER.size]
     number, checksum = _TRAILER.unpack(data[-_TRAILER.size :])
     return wal, number if zlib.crc32(wal + number.to_bytes(8, "little")) == checksum else None
+
+
+def _has_all(file: bytes, wal: bytes) -> bool:
+    """Return whether a catalog's file has the last version of each page in a sound -wal."""
+    size = int.from_bytes(wal[_PAGE_AT : _PAGE_AT + 4], "big")
+    last: dict[int, int] = {}  # the place of each page's last frame
+    pages = 0
+    for at in range(_WAL_HEADER, len(wal), _FRAME_HEADER + size):
+        number, pages = struct.unpack_from(">2I", wal, at)
+        last[number - 1] = at + _FRAME_HEADER
+    return all(
+        file[page * size : (page + 1) * size] == wal[at : at + size] for page, at in last.items() if page < pages
+    )
 
 
 def _generation(wal: bytes) -> bytes | None:

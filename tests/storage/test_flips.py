@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import shutil
@@ -40,6 +41,21 @@ def test_the_sweep_would_find_the_loss(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("rr_actors.storage.write_ahead.Spare.recover", lambda *_: None)
     _, failures = flips.sweep(tmp_path, "process", step=9001, chosen=lambda _, stage: "pages copied" in stage.name)
     assert any("catalog.sqlite3-wal" in failure for failure in failures)
+
+
+def test_who_reads_a_catalog_without_its_lock_gets_no_mixture_of_old_and_new_pages(tmp_path: Path) -> None:
+    (tmp_path / "made").mkdir()
+    found = [stage for stage in flips.stages(tmp_path / "made", "process") if "pages copied" in stage.name]
+    assert found
+    for stage in found:
+        path = stage.directory / "app" / "catalog.sqlite3"
+        assert frozenset(read_rows(path)) == stage.rows
+        for spoil in (flip_at(600), cut_to_nothing, Path.unlink):
+            copy = shutil.copytree(path.parent, tmp_path / "copy")
+            spoil(copy / "catalog.sqlite3-wal")
+            with contextlib.suppress(CatalogDamaged):
+                assert frozenset(read_rows(copy / path.name)) == stage.rows
+            shutil.rmtree(copy)
 
 
 # -- while the catalog is open -------------------------------------------------------------------------------------
