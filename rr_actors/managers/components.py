@@ -20,18 +20,19 @@ from __future__ import annotations
 
 import functools
 import sys
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, LoadFailed, RrError
+from rr_actors.base.errors import ConfigError, LoadFailed, RrError, UnknownQuery
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
+from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
 from rr_actors.managers.planning.last_good import last_good_file, path_of
+from rr_actors.managers.planning.retries import GIVEN_UP, Retries
 from rr_actors.managers.program_checks import parameter_faults, program_faults
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
@@ -44,6 +45,8 @@ from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 
 logger = Log("rr_actors.managers.components")
+
+C = TypeVar("C")
 
 LOAD_MARGIN_S = 20.0  # added to the program's own limit: its manager may be restarting after a crash
 
@@ -104,7 +107,8 @@ class NoComponent(LoadFailed):
 class Components(Manager):
     """Serves `component`: runs the most reliable component of a type, and the next best when that one fails.
 
-    The holders of a replaced component hear UPDATE. They hear FATAL only if no other component could replace it.
+    The holders of a replaced component hear UPDATE. They hear FATAL only if no other component could replace it. One
+    that fails again and again waits longer each time, with a WARNING, and is given up after ten failures in a row.
     """
 
     def __init__(self, registry: str, programs: str = "programs/program", replace: bool = True) -> None:
@@ -119,7 +123,11 @@ class Components(Manager):
         self._registry = self._read()
         self._programs = programs
         self._replace = replace
-        self._lock = threading.Lock()
+        self._retries = Retries[tuple[str, str]]()  # of components, by the id of the resource that has them and by name
+
+    def on_stop(self) -> None:
+        """Wait for no component that has failed any more."""
+        self._retries.stop()
 
     def _read(self) -> list[ComponentDescription]:
         return read_registry(self._path, self._beginning())
@@ -127,33 +135,91 @@ class Components(Manager):
     @server("component")
     def load_component(self, request: LoadComponent) -> Component:
         """Run the most reliable component of the type whose program can be run."""
-        return self._run_best(request, self._load)
+        return self._run_best(request, self._load, self.candidates(request.type), [])
 
     @load_component.status
     def component_status(self, request: LoadComponent, status: Status) -> None:
-        """Lower the reliability of a component whose program has ended, and put the next best one in its place.
+        """Put the next best component in the place of one whose program has ended. Only its own fault lowers it.
 
         A crash may repeat this. The failure counts once, so the same component is chosen again.
         """
-        if status.state is not State.FATAL or not self._replace:
-            return
-        if status.resource_id == current().resource_id:
-            return  # a status of the component itself: its holders hear it
-        part = next(
-            (part for part in self.registrar.children(current().resource_id) if part.id == status.query_id), None
-        )
+        part = self._failed_part(status)
         if part is None:
-            status.handled()  # a run before the crash has replaced it already
             return
-        self._lower(self._component_of(request, part.request), status.resource_id)
+        failed = self._component_of(request, part.request)
+        run, why = functools.partial(self._swap, status), list[str]()
         try:
-            component = self._run_best(request, functools.partial(self._swap, status))
+            in_turn = self._after(failed, status, lambda: self.candidates(request.type), why)
+            component = self._run_best(request, run, in_turn, why)
+        except UnknownQuery:
+            status.handled()  # it is being unloaded
         except RrError as error:
             logger.warning("%s: nothing takes the place of one that failed: %s", request.type, error)
         else:
             logger.warning(
                 "%s: %s takes the place of one that failed: %s", request.type, component.name, status.message
             )
+
+    # -- replacing -------------------------------------------------------------------------------------------------
+
+    def _failed_part(self, status: Status) -> Query | None:
+        """Return the part of which a status says that it has failed; None if there is nothing to replace."""
+        if status.state is not State.FATAL or not self._replace:
+            return None
+        about = part_of(self.registrar, status)
+        if about.part is None and not about.is_whole:
+            status.handled()  # a run before a crash has replaced it, or it was released while loading
+        return about.part
+
+    def _after(
+        self,
+        failed: ComponentDescription | None,
+        status: Status,
+        candidates: Callable[[], Sequence[ComponentDescription]],
+        why: list[str],
+    ) -> Iterator[ComponentDescription]:
+        """Blame what has failed, and yield the candidates to try in its place, each when it has rested.
+
+        Those that have to rest come last. One that is given up is noted in `why`.
+        """
+        id = current().resource_id
+        if failed is not None and is_own_failure(status):
+            self._lower(failed, status.resource_id)
+
+        def is_resting(one: ComponentDescription) -> bool:
+            return not self._retries.is_ready((id, one.name))
+
+        def say(text: str) -> None:
+            self.registrar.send_status(id, Status(State.WARNING, f"{text}: {status.message}"))
+
+        for one in sorted(candidates(), key=is_resting):
+            if one is failed and status.reason == "revoked":
+                why.append(f"{one.name}: {status.message}")  # it would wait for the end of this one
+            elif self._retries.rest((id, one.name), one.name, say) is None:
+                why.append(f"{one.name}: {GIVEN_UP}")
+            else:
+                yield one
+
+    def _first_of(
+        self, candidates: Iterable[ComponentDescription], run: Callable[[ComponentDescription], C], why: list[str]
+    ) -> C | None:
+        """Return what `run` makes of the first candidate that can be run; `why` gets why each other cannot."""
+        for one in candidates:
+            try:
+                made = run(one)
+            except LoadFailed as error:
+                why.append(f"{one.name}: {error}")
+                if is_own_fault(error):
+                    self._lower(one, new_id())
+            else:
+                self._retries.used((current().resource_id, one.name))
+                return made
+        return None
+
+    def _lower(self, component: ComponentDescription, failure_id: str) -> None:
+        """Note a failure that is a component's own fault."""
+        self._reliabilities.lower(component.name, component.reliability, failure_id)
+        self._retries.failed((current().resource_id, component.name), failure_id)
 
     # -- choosing --------------------------------------------------------------------------------------------------
 
@@ -164,17 +230,11 @@ class Components(Manager):
 
     def reliability(self, component: ComponentDescription) -> float:
         """Return how far a component is trusted now, from 0 to 1."""
-        with self._lock:
-            return self._reliabilities.of(component.name, component.reliability)
+        return self._reliabilities.of(component.name, component.reliability)
 
     @functools.cached_property
     def _reliabilities(self) -> Reliabilities:
         return Reliabilities(self.registrar.directory / "reliability.json")
-
-    def _lower(self, component: ComponentDescription | None, failure_id: str) -> None:
-        if component is not None:
-            with self._lock:
-                self._reliabilities.lower(component.name, component.reliability, failure_id)
 
     def _load(self, program: RunProgram, made: Made, timeout_s: float) -> Component:
         return made(self.registrar.load(self._programs, program, timeout_s=timeout_s))
@@ -182,23 +242,24 @@ class Components(Manager):
     def _swap(self, status: Status, program: RunProgram, made: Made, timeout_s: float) -> Component:
         return made(self.registrar.replace_part(status, program, self._programs, response=made, timeout_s=timeout_s))
 
-    def _run_best(self, request: LoadComponent, run: Run) -> Component:
-        """Run the first candidate that can be run, and lower the reliability of those that cannot.
+    def _run_best(
+        self, request: LoadComponent, run: Run, candidates: Iterable[ComponentDescription], why: list[str]
+    ) -> Component:
+        """Run the first candidate that can be run.
 
         Raises:
             NoComponent: no candidate could be run.
         """
-        failures: list[str] = []
-        for candidate in self.candidates(request.type):
+
+        def run_one(candidate: ComponentDescription) -> Component:
             program, parameters = self._filled(candidate, request)
             made = functools.partial(component_of, candidate, parameters)
-            try:
-                return run(program, made, program.ready.timeout_s + LOAD_MARGIN_S)
-            except LoadFailed as error:
-                failures.append(f"{candidate.name}: {error}")
-                self._lower(candidate, new_id())
-        if failures:
-            raise NoComponent(f"no component of type {request.type!r} could be loaded:\n" + "\n".join(failures))
+            return run(program, made, program.ready.timeout_s + LOAD_MARGIN_S)
+
+        if (found := self._first_of(candidates, run_one, why)) is not None:
+            return found
+        if why:
+            raise NoComponent(f"no component of type {request.type!r} could be loaded:\n" + "\n".join(why))
         known = ", ".join(sorted({component.type for component in self._registry})) or "none"
         raise NoComponent(f"no component of type {request.type!r} in {self._path}: expected one of {known}")
 

@@ -15,11 +15,13 @@ from pathlib import Path
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, LoadFailed, RrError
+from rr_actors.base.errors import ConfigError, LoadFailed, RrError, UnknownQuery
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.components import Component, LoadComponent
+from rr_actors.managers.planning.blame import is_own_failure, part_of
 from rr_actors.managers.planning.last_good import last_good_file, path_of
+from rr_actors.managers.planning.retries import GIVEN_UP, Retries
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
@@ -97,6 +99,11 @@ class Robots(Manager):
         self._robots = read_robots(self._path, self._beginning())
         self._components = components
         self._replace = replace
+        self._retries = Retries[tuple[str, str, str]]()  # of parts, by the id of the robot, the type and the number
+
+    def on_stop(self) -> None:
+        """Wait for no part that has failed any more."""
+        self._retries.stop()
 
     @server("robot")
     def load_robot(self, request: LoadRobot) -> Robot:
@@ -107,16 +114,20 @@ class Robots(Manager):
     @load_robot.status
     def robot_status(self, request: LoadRobot, status: Status) -> None:
         """Pass a part's new component on (UPDATE), or load a failed part again in its place (FATAL)."""
-        if status.resource_id == current().resource_id:
-            return  # a status of the robot itself: its holders hear it
-        parts = self.registrar.children(current().resource_id)
         try:
+            about = part_of(self.registrar, status)
+            if about.is_whole:
+                return  # its holders hear it
             if status.state is State.UPDATE:
-                self._update(request, parts, status.message)
-            elif status.state is State.FATAL and self._replace:
-                self._replace_part(request, parts, status)
-            else:
+                self._update(request, self.registrar.children(current().resource_id), status.message)
+            elif status.state is not State.FATAL or not self._replace:
                 return
+            elif about.part is not None:  # else a run before a crash has replaced it
+                if not is_own_failure(status):
+                    return  # the component manager has found no other
+                self._replace_part(request, about.part, status)
+        except UnknownQuery:
+            pass  # it is being unloaded
         except RrError as error:
             logger.warning("%s: nothing takes the place of a part that failed: %s", request.name, error)
             return
@@ -124,17 +135,25 @@ class Robots(Manager):
 
     # -- parts -----------------------------------------------------------------------------------------------------
 
-    def _replace_part(self, request: LoadRobot, parts: list[Query], status: Status) -> None:
-        failed = next((part for part in parts if part.id == status.query_id), None)
-        if failed is None:
-            return  # a run before the crash has replaced it already
-        others = [part for part in parts if part.request != failed.request]
+    def _replace_part(self, request: LoadRobot, failed: Query, status: Status) -> None:
+        id = current().resource_id
+        others = [part for part in self.registrar.children(id) if part.request != failed.request]
+        what = failed.request.type
+        key = id, what, failed.request.instance
+        self._retries.failed(key, status.resource_id)
+
+        def say(text: str) -> None:
+            self.registrar.send_status(id, Status(State.WARNING, f"{text}: {status.message}"))
+
+        if self._retries.rest(key, what, say) is None:
+            raise LoadFailed(f"{what}: {GIVEN_UP}")
         spare = self.registrar.replace_part(
             status,
             failed.request,
             response=lambda spare: self._assembled(request, self._in_order(request, [*others, spare])),
             timeout_s=_LOAD_LIMIT_S,
         )
+        self._retries.used(key)
         name = spare.response.name
         logger.warning("%s: %s takes the place of a part that failed: %s", request.name, name, status.message)
 

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rr_actors as rr
+from rr_actors.managers.planning.retries import TRIES, Retries
 from rr_actors.managers.planning.setbacks import Setback, Setbacks, next_setback
 
 backoffs = st.builds(
@@ -66,3 +67,27 @@ def test_what_is_forgotten_may_be_tried_at_once() -> None:
     assert (some.may_try("b", 0.0), some.may_try("c", 0.0)) == (False, True)
     some.clear()
     assert some.may_try("b", 0.0)
+
+
+def test_what_has_failed_ten_times_in_a_row_is_given_up_and_the_others_are_not() -> None:
+    retries = Retries[str]()
+    retries.failed("other")
+    for i in range(TRIES):
+        assert retries.wait_s("one") is not None
+        retries.failed("one", f"failure {i}")
+    said: list[str] = []
+    retries.stop()
+    assert retries.rest("one", "it", said.append) is None
+    assert retries.rest("other", "it", said.append) is not None
+    assert retries.is_ready("third")
+    assert said == []
+
+
+def test_before_a_wait_that_is_not_short_the_holders_hear_of_it() -> None:
+    retries, said = Retries[str](), list[str]()
+    for failure in ("one", "two", "two", "three"):
+        retries.failed("camera", failure)
+    retries.stop()
+    assert not retries.is_ready("camera")
+    assert retries.rest("camera", "camera", said.append)
+    assert said == ["camera is tried again in 0.4 s, as it has failed repeatedly"]

@@ -31,10 +31,11 @@ from rr_actors.managers.choices.chosen import Choose, Chosen, Held, held_choice
 from rr_actors.managers.choices.labelled import Labelled
 from rr_actors.managers.choices.offers import Offers, nothing_left
 from rr_actors.managers.choices.planning import Choice, in_turn
-from rr_actors.managers.choices.trials import FAILED, TRIES, Trials
+from rr_actors.managers.choices.trials import FAILED, Trials
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
 from rr_actors.managers.planning.hedging import HEDGE_S, first_of
 from rr_actors.managers.planning.kept_record import KeptRecord
+from rr_actors.managers.planning.retries import GIVEN_UP, SOON_S
 from rr_actors.managers.reliability import Reliabilities
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
@@ -49,7 +50,6 @@ logger = Log("rr_actors.managers.choices")
 _TAKE = "returns to "  # and the key of an alternative: the message of a status that a choice gets from its own manager
 _AGAIN = "chooses again, as a crash came in between"
 _FIRST_HEDGE_S = 5.0  # nobody uses anything that has failed yet, and devices are slow to start
-_SOON_S = 0.1  # after which the holders hear that another alternative is being looked for
 
 
 _Begin = Callable[[Alternative], Reply[Query]]
@@ -117,7 +117,6 @@ class Choices(Manager):
             self._strays,
         )
         self._begun = ""
-        self._is_stopped = threading.Event()
 
     def on_start(self) -> None:
         """Go on with the choices that are held. Trials of the process before are ended, and begin anew.
@@ -139,7 +138,6 @@ class Choices(Manager):
 
     def on_stop(self) -> None:
         """End the thread of the trials, and close the relays."""
-        self._is_stopped.set()
         self._trials.stop()
         self._addresses.stop()
 
@@ -277,7 +275,7 @@ class Choices(Manager):
     def _fill(self, search: _Search, status: Status, without: Collection[str]) -> bool:
         """Put the first alternative that can be had in the place of the part. Return whether there was one."""
         say = functools.partial(self._say_slow, search, "the next one is being loaded")
-        soon = threading.Timer(_SOON_S, contextvars.copy_context().run, (say,))  # a part of this callback
+        soon = threading.Timer(SOON_S, contextvars.copy_context().run, (say,))  # a part of this callback
         soon.daemon = True
         soon.start()
         try:
@@ -303,24 +301,23 @@ class Choices(Manager):
 
         One that has failed again and again is waited for, and given up after some tries.
         """
+        retries = self._trials.retries
         with self._changed:  # else what fails meanwhile is tried once more
             search.decided_at = time.monotonic()
             in_turn = self._in_turn(
                 self._offers.allowed_now(search.held.request), without, self._well_beside(search.id)
             )
-            alone = {
-                one.key: i for i, one in enumerate(in_turn, 1) if one.break_first or self._trials.wait_s(one.key) != 0
-            }
+            alone = {one.key: i for i, one in enumerate(in_turn, 1) if one.break_first or retries.wait_s(one.key) != 0}
         for _, group in groupby(in_turn, key=lambda one: alone.get(one.key, 0)):
             found = list(group)
-            wait_s = self._trials.wait_s(found[0].key) if found[0].key in alone else 0.0
-            if wait_s is None:
-                search.tried.append(f"{found[0].key}: it has failed {TRIES} times in a row or more")
-                continue
-            if wait_s:
-                self._say_slow(search, f"tries {found[0].key} again in {wait_s:.1f} s, as it has failed repeatedly")
-                self._is_stopped.wait(wait_s)
-                search.decided_at = time.monotonic()
+            first = found[0].key
+            if first in alone:
+                waited_s = retries.rest(first, first, functools.partial(self._say_slow, search))
+                if waited_s is None:
+                    search.tried.append(f"{first}: {GIVEN_UP}")
+                    continue
+                if waited_s:
+                    search.decided_at = time.monotonic()
             yield found
 
     def _try(

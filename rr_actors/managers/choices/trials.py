@@ -13,7 +13,7 @@ from rr_actors.base.errors import RegistrarDown, RrError
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.choices.planning import UNKNOWN, Choice, Plan, Standing, failed, plan
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault
-from rr_actors.managers.planning.setbacks import BACKOFF, Setbacks
+from rr_actors.managers.planning.retries import Retries
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, StatusCallback
@@ -21,9 +21,6 @@ from rr_actors.registrar.queries import Query, StatusCallback
 logger = Log("rr_actors.managers.choices")
 
 _LOOK_S = 1.0  # no server says to Choices that it comes
-
-TRIES = 10
-"""How often in a row an alternative may fail, before the choices give it up; what runs well for a while begins anew."""
 
 FAILED = (State.ERROR, State.FATAL)
 
@@ -57,8 +54,7 @@ class Trials:
         self._choices, self._load, self._take, self._has_news, self._strays = choices, load, take, has_news, strays
         self._standings: dict[str, Standing] = {}
         self._queries: dict[str, Query] = {}
-        self._setbacks = Setbacks[str]()
-        self._used_since: dict[str, float] = {}
+        self.retries = Retries[str]()
         self._counted: dict[str, str] = {}  # the last failure of each that is not used again
         self._is_new = False
         self._is_stopped = False
@@ -73,6 +69,7 @@ class Trials:
         """End the thread, soon."""
         with self._changed:
             self._is_stopped = True
+            self.retries.stop()
             self._changed.notify_all()
 
     def look(self) -> None:
@@ -96,17 +93,8 @@ class Trials:
     def used(self, key: str) -> None:
         """Note that a choice uses an alternative from now on. What it says after that is another failure."""
         with self._changed:
-            self._used_since[key] = time.monotonic()
+            self.retries.used(key)
             self._counted.pop(key, None)
-
-    def wait_s(self, key: str) -> float | None:
-        """Return how long an alternative is to be left alone, also if nothing else is left; None: it is given up."""
-        now = time.monotonic()
-        with self._changed:
-            setback = self._setbacks.get(key)
-        if setback is None or now >= setback.retry_at + BACKOFF.maximum_s:
-            return 0.0
-        return None if setback.count >= TRIES else max(0.0, setback.retry_at - now)
 
     def failed(self, key: str, failure_id: str = "", *, began: float | None = None, is_own: bool = True) -> bool:
         """Note that an alternative has failed. Its trial ends.
@@ -129,7 +117,7 @@ class Trials:
                 self._counted[key] = failure_id
             self._standings[key] = failed(standing, now, self._settle_s)
             if is_own:
-                self._setbacks.note(key, now, ran_s=now - self._used_since.pop(key, now))
+                self.retries.failed(key)
             self._end(key)
             self.look()
             return True

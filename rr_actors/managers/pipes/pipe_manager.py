@@ -26,12 +26,12 @@ from rr_actors.managers.components import (
 )
 from rr_actors.managers.pipes.chains import Goal, Link, best_chain, substitutes, why_none
 from rr_actors.managers.pipes.pipe_files import PipeDescription, read_pipe_file
+from rr_actors.managers.planning.blame import is_own_fault
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.templates import Parameters
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
-from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 
 logger = Log("rr_actors.managers.pipes")
@@ -87,18 +87,12 @@ class Pipes(Components):
 
     @load_pipe.status
     def pipe_status(self, request: Pipe, status: Status) -> None:
-        """Lower the reliability of a component whose program has ended, and put another in its place.
+        """Put another component in the place of one whose program has ended. Only its own fault lowers it.
 
         A crash may repeat this. The failure counts once, so the same component is chosen again.
         """
-        if status.state is not State.FATAL or not self._replace:
-            return
-        id = current().resource_id
-        if status.resource_id == id:
-            return  # a status of the pipe itself: its holders hear it
-        part = next((part for part in self.registrar.children(id) if part.id == status.query_id), None)
+        part = self._failed_part(status)
         if part is None:
-            status.handled()  # a run before the crash has replaced it already, or it was released while loading
             return
         try:
             self._replace_segment(request, status, part)
@@ -128,7 +122,8 @@ class Pipes(Components):
                     raise
                 name = chain[len(held)].name
                 failures[name] = str(error)
-                self._lower(self._described[name], new_id())
+                if is_own_fault(error):
+                    self._lower(self._described[name], new_id())
         if failures:
             why = [f"{name}: {text}" for name, text in failures.items()]
             raise NoPipe("\n".join([f"no pipe for {request.of_type!r} could be run:", *why]))
@@ -174,23 +169,19 @@ class Pipes(Components):
             UnknownQuery: the pipe is being unloaded.
         """
         segments, place = self._segments(), _place_of(part)
-        failed, revoked = segments[place].name, status.reason == "revoked"
-        if not revoked:
-            self._lower(self._described.get(failed), status.resource_id)
-        fitting = self._fitting(request, segments, place)
-        if revoked:  # the same component would wait for the end of this one
-            fitting = [link for link in fitting if link.name != failed]
-        tried: list[str] = []
-        for link in fitting:
-            try:
-                self._put(request, status, segments, place, link.name)
-            except LoadFailed as error:
-                tried.append(f"{link.name}: {error}")
-                self._lower(self._described[link.name], new_id())
-            else:
-                logger.warning("%s: %s takes the place of %s: %s", request.of_type, link.name, failed, status.message)
-                return
-        raise NoPipe("\n".join([f"no component can take the place of {failed}:", *(tried or ["none fits there"])]))
+        failed, why = segments[place].name, list[str]()
+
+        def fitting() -> list[ComponentDescription]:
+            return [self._described[link.name] for link in self._fitting(request, segments, place)]
+
+        def put(one: ComponentDescription) -> str:
+            self._put(request, status, segments, place, one.name)
+            return one.name
+
+        found = self._first_of(self._after(self._described.get(failed), status, fitting, why), put, why)
+        if found is None:
+            raise NoPipe("\n".join([f"no component can take the place of {failed}:", *(why or ["none fits there"])]))
+        logger.warning("%s: %s takes the place of %s: %s", request.of_type, found, failed, status.message)
 
     def _put(self, request: Pipe, status: Status, segments: list[Component], place: int, name: str) -> None:
         program, parameters = self._segment(request, name, place)

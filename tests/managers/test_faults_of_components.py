@@ -1,0 +1,130 @@
+"""Components, pipes and robots: whose fault a failure is, and what fails again and again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.managers import Budgets, Components, LoadComponent, LoadRobot, Pipe, Pipes, Pool, Programs, Robots, Share
+from support import Calls, eventually
+
+Start = Callable[..., rr.System]
+
+LIMIT_S = 30.0
+REQUESTS: dict[str, Any] = {
+    "components/component": LoadComponent("camera"),
+    "components/pipe": Pipe("image"),
+    "robots/robot": LoadRobot("rover"),
+}
+
+
+def camera(name: str, code: str = "", **more: object) -> str:
+    """Return the entry of a camera whose program runs for ever, and costs 70 W, or runs `code`."""
+    program = code or "import time; print('ready', flush=True); time.sleep(600)"
+    lines = [f"{key} = {value}" for key, value in more.items()]
+    return "\n".join(
+        [
+            "[[component]]",
+            f'name = "{name}"',
+            'type = "camera"',
+            'outputs = ["image"]',
+            *lines,
+            "[component.program]",
+            'command = "${python}"',
+            f'arguments = ["-c", """{program}""", "{name}"]',
+            'ready = { line = "ready" }',
+            f"cost = {{ watts = {0 if code else 70} }}",
+            "",
+        ]
+    )
+
+
+@pytest.fixture(params=[*REQUESTS])
+def served(request: pytest.FixtureRequest, start: Start, tmp_path: Path) -> Callable[..., tuple[rr.System, Any]]:
+    """Start a system with these cameras; return it, and what loads one of them by the manager that is tested."""
+    server: str = request.param
+
+    def begin(*entries: str, replace: bool = True) -> tuple[rr.System, Any]:
+        kind = Pipes if server == "components/pipe" else Components
+        text = "\n".join(entries)
+        if kind is Components:
+            text = text.replace('outputs = ["image"]\n', "")
+        (tmp_path / "cameras.toml").write_text(text)
+        (tmp_path / "robots.toml").write_text('[[robot]]\nname = "rover"\ndriver = { type = "camera" }\n')
+        system = start(
+            rr.ChildSpec(Budgets, id="budgets", args=([Pool("watts", 100)],)),
+            rr.ChildSpec(Programs, id="programs"),
+            rr.ChildSpec(kind, id="components", args=(str(tmp_path / "cameras.toml"),), kwargs={"replace": replace}),
+            rr.ChildSpec(Robots, id="robots", args=(str(tmp_path / "robots.toml"),)),
+        )
+        app = system.open_registrar("app")
+
+        def load(heard: Calls) -> rr.Query:
+            return app.load(server, REQUESTS[server], on_status=heard, priority=1, timeout_s=LIMIT_S)
+
+        return system, load
+
+    return begin
+
+
+def reliabilities(system: rr.System) -> dict[str, float]:
+    """Return the reliability of each component that has lost some."""
+    file = system.registrar("components").directory / "reliability.json"
+    with contextlib.suppress(FileNotFoundError):
+        return json.loads(file.read_text())["reliability"]
+    return {}
+
+
+def lives_shortly(starts: Path) -> str:
+    return camera(
+        "front", f"import time; open({str(starts)!r}, 'a').write('.'); print('ready', flush=True); time.sleep(0.3)"
+    )
+
+
+def test_one_that_ends_again_and_again_waits_longer_each_time_and_the_holders_hear_warning(
+    served: Any, tmp_path: Path
+) -> None:
+    _, load = served(lives_shortly(tmp_path / "starts"))
+    heard = Calls()
+    load(heard)
+    eventually(lambda: [status.state for status in heard].count(rr.State.WARNING) == 3, LIMIT_S)
+    assert [status.state for status in heard] == [rr.State.UPDATE, rr.State.WARNING] * 3
+    assert len((tmp_path / "starts").read_text()) == 4  # the first failure waits for 0.1 s alone
+    waits = [status.message.partition(",")[0] for status in heard if status.state is rr.State.WARNING]
+    assert waits == [f"front is tried again in {seconds} s" for seconds in (0.2, 0.4, 0.8)]
+    assert "exited with code 0" in heard.items[-1].message
+
+
+@pytest.mark.parametrize("served", ["robots/robot"], indirect=True)
+def test_a_robot_waits_for_its_part_also_if_its_components_are_not_replaced(served: Any, tmp_path: Path) -> None:
+    _, load = served(lives_shortly(tmp_path / "starts"), replace=False)
+    heard = Calls()
+    load(heard)
+    eventually(lambda: [status.state for status in heard].count(rr.State.WARNING) == 2, LIMIT_S)
+    assert [status.state for status in heard] == [rr.State.UPDATE, rr.State.WARNING] * 2
+    assert heard.items[-1].message.startswith("camera is tried again in 0.4 s, as it has failed repeatedly: ")
+
+
+def test_one_that_gives_way_to_something_more_urgent_does_so_at_once_and_keeps_its_reliability(served: Any) -> None:
+    system, load = served(camera("front", reliability=0.9), camera("rear", reliability=0.8))
+    heard = Calls()
+    load(heard)
+    pump = system.registrar("robots").load("budgets/share", Share("watts", 60, instance="pump"), priority=9)
+    (status,) = heard.wait()
+    assert (status.state, status.reason) == (rr.State.FATAL, "revoked")
+    assert pump.state is rr.State.OK
+    assert reliabilities(system) == {}
+
+
+def test_want_of_room_is_no_fault_of_a_component(served: Any) -> None:
+    system, load = served(camera("front", reliability=0.9), camera("rear", reliability=0.8))
+    system.registrar("robots").load("budgets/share", Share("watts", 60, instance="pump"), priority=9)
+    with pytest.raises(rr.LoadFailed, match=r"asked 70, free 40 of 100"):
+        load(Calls())
+    assert reliabilities(system) == {}
