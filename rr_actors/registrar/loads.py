@@ -36,6 +36,7 @@ from rr_actors.registrar.model.rows import STANDBY, Held, Hold, Resource
 from rr_actors.registrar.progress_hearers import Hearing, HearsHere, HearsInWorkers, HearsOnThisLoop, hearer_of
 from rr_actors.registrar.queries import Query, Views, loaded, loaded_directly
 from rr_actors.runtime.callback_errors import described
+from rr_actors.runtime.gates import LettingIn
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until
 from rr_actors.wire.name_service import Presence
@@ -323,10 +324,11 @@ class Loads:
         query = self.views.new(query_id or new_id(), target, request, parent, options.codec)
         try:
             self._listen(query, options)
-            if hearer is not None:
-                self._wait_hearing(query, request, options, HearsHere(hearer))
-            elif query_id or not self._directly(query, request, options):
-                self._wait_for(self._begin(query, request, options))
+            with LettingIn():
+                if hearer is not None:
+                    self._wait_hearing(query, request, options, HearsHere(hearer))
+                elif query_id or not self._directly(query, request, options):
+                    self._wait_for(self._begin(query, request, options))
         except RrError:
             raise
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
@@ -609,8 +611,10 @@ class Unloads:
         """
         if has_a_turn():  # a finalizer, which the garbage collector runs: it cannot wait
             self.begin(query_id, timeout_s)
-        elif not self._directly(query_id, timeout_s):
-            self._finish(self.begin(query_id, timeout_s))
+            return
+        with LettingIn():
+            if not self._directly(query_id, timeout_s):
+                self._finish(self.begin(query_id, timeout_s))
 
     def begin(self, query_id: str, timeout_s: float | None) -> Unloading:
         """Begin to release a query, and return a future of its end at once."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, ClassVar, NoReturn, cast
 
 import msgspec
 from pykka import ActorDeadError
@@ -13,13 +13,14 @@ from pykka import ActorDeadError
 from rr_actors.actors.actor import Actor
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base import pickling
-from rr_actors.base.errors import NameTaken, StartFailed, UsageError
+from rr_actors.base.errors import NameTaken, StartFailed, UsageError, shown
 from rr_actors.registrar.arguments import check_text
 from rr_actors.registrar.declarations import Declared, spec_for
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.server import ServerSpec, current, serving
 from rr_actors.registrar.registrar import Registrar, register_spec
+from rr_actors.runtime.gates import Gate
 from rr_actors.wire.name_service import Presence
 
 
@@ -55,14 +56,38 @@ class Manager(Actor):
     """An actor that serves resources, or uses those of others, or both, through `self.registrar`.
 
     Subclass it, declare servers with ``@rr.server``, and put it into a ChildSpec: its child id is its registrar's name.
+
+    Its callbacks and on_receive run **side by side**, hundreds at once over one `self`, unless it is serial::
+
+        class Cameras(rr.Manager, serial=True): ...
+
+    Then one of them runs at a time, as the messages of every other actor do: load, unload, status, recover, usage,
+    health, pause and resume callbacks, status callbacks of what it holds, on_receive, and methods that are called by a
+    proxy. One that waits for a load, an unload or a reply lets another in meanwhile, so what `self` has may have
+    changed when it goes on. on_start and on_stop may run beside them, so that on_stop can end one that hangs. Where
+    one server alone needs it, ``@rr.server(..., at_once=1)`` does the same for that.
+
     A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers: their
     recover callbacks begin, and the manager waits for them, though not for long. ``on_start`` runs, with
     ``self.registrar.queries()`` restored. Other registrars connect, and all other callbacks begin: those that a crash
     has interrupted, and probes.
     """
 
+    serial: ClassVar[bool] = False
+    """Whether one callback runs at a time. The class statement sets it: ``class Cameras(rr.Manager, serial=True)``."""
+
     registrar: Registrar = cast("Registrar", _NotYet())
     """This manager's registrar. It exists before the first recover callback, and so before on_start."""
+
+    _gate: Gate | None = None  # of a serial manager
+
+    def __init_subclass__(cls, *, serial: bool | None = None, **kwargs: Any) -> None:
+        """Make a class of managers; `serial`: whether one callback runs at a time. Default: as its base class."""
+        super().__init_subclass__(**kwargs)
+        if serial is not None:
+            if type(serial) is not bool:
+                raise UsageError(f"class {cls.__name__}: serial: expected True or False, got {shown(serial)}")
+            cls.serial = serial
 
     def ref(self, id: str) -> ActorRef[Any]:
         """Return a reference to another actor of the system; from on_start on, and in every callback.
@@ -105,6 +130,7 @@ class Manager(Actor):
         actor = await node.open_registrar(place.id, node.config.registrar(place.id), place.path)
         self.registrar = Registrar(node, actor)
         self._served = actor
+        actor.gate = self._gate = Gate(1) if self.serial else None
         actor.on_defect = self._failed
         place.abandoned = functools.partial(self._close_registrar, None)
         try:
@@ -180,7 +206,9 @@ class Manager(Actor):
     def _handle_receive(self, message: Any) -> Any:
         if isinstance(message, _Failed):
             raise message.error
-        return super()._handle_receive(message)
+        if self._gate is None:
+            return super()._handle_receive(message)
+        return self._gate.around(super()._handle_receive, enters=True)(message)
 
 
 def ref(id: str) -> ActorRef[Any]:

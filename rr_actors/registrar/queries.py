@@ -25,6 +25,7 @@ from rr_actors.registrar.engine.status import Status, state_of, status_of
 from rr_actors.registrar.model.rows import OK, Held, Notice, Phase, ServerType, State
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.event_loop import check_asyncio, check_may_block
+from rr_actors.runtime.gates import LettingIn
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.user_loop import CallersLoop
@@ -262,7 +263,9 @@ class Query(Generic[Response]):
                 if self._is_released or self._is_copy():
                     raise self._silence()
                 left_s = None if deadline is None else deadline - time.monotonic()
-                if not flag.wait(left_s) and left_s is not None and left_s <= 0:
+                with LettingIn():
+                    has_come = flag.wait(left_s)
+                if not has_come and left_s is not None and left_s <= 0:
                     what = "status" if wanted is None else f"status {wanted}"
                     text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
                     raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
@@ -715,7 +718,9 @@ class Views:
                 log_raised(logger, error, "%s: a status callback for %s raised", self._actor.name, held.server)
 
         try:
-            self._actor.workers.serial(("hear", held.id), self._while_heard(held.id, callback), status, done=done)
+            run, gate = self._while_heard(held.id, callback), self._actor.gate
+            run = run if gate is None else gate.around(run, enters=True)
+            self._actor.workers.serial(("hear", held.id), run, status, done=done)
         except Unavailable as error:
             done(None, error)
 

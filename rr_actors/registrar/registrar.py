@@ -564,6 +564,7 @@ class Registrar(Consumer):
         health: Health | None = None,
         probe: Callable[..., Any] | None = None,
         provides: Mapping[str, Mapping[str, object]] | None = None,
+        at_once: int | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
@@ -604,6 +605,9 @@ class Registrar(Consumer):
             probe: ``probe(request, response)`` says how well a loaded resource is: it returns None (well), a State or a
                 Status, or it raises. Default: None. Give one with `health`.
             provides: labels, as `{"range": {"rate_hz": 30}}`. Default: None. Give them where Choices shall find it.
+            at_once: how many callbacks of the server run at a time; others wait, in their order. A callback that waits
+                for a load, an unload or a reply lets another in meanwhile. Default: None, as many as there are. Give 1
+                where a driver is not safe for threads. A serial manager has 1 for all its servers.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -614,7 +618,8 @@ class Registrar(Consumer):
         callbacks, types = (load, unload, status, recover), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, usage=usage, idle=idle, paused_s=paused_s)
-        spec = replace(spec, pause=pause, resume=resume, health=health, probe=probe, provides=provides)
+        spec = replace(spec, pause=pause, resume=resume, health=health, probe=probe)
+        spec = replace(spec, provides=provides, at_once=at_once)
         self._register_spec(checked_whole(checked_spec(spec)))
 
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:

@@ -140,6 +140,7 @@ class RunningTimers:
         self._loop = loop
         self._ran = RunningTime(_SLICE_S, loop.time)
         self._timers: dict[str, TimerHandle] = {}
+        self._wanted: dict[str, tuple[float, Callable[[], object]]] = {}
         self._slices: dict[str, float] = {}
         self._ticker: TimerHandle | None = None
 
@@ -147,16 +148,23 @@ class RunningTimers:
         """Call `fire` when the process has run for `delay_s` more seconds. It replaces the timer of the same key."""
         self.cancel(key)
         self._timers[key] = self._loop.call_later(delay_s, self._look, key, self._ran.read() + delay_s, fire)
+        self._wanted[key] = delay_s, fire
         if delay_s > 0:
             slice_s = self._slices[key] = max(slice_of(delay_s), _SOON_S)
             if self._ticker is None or slice_s < self._ran.slice_s:
                 self._tick_in(slice_s)
+
+    def restart(self, key: str) -> None:
+        """Let the time of a key's timer begin again, if there is one."""
+        if key in self._wanted:
+            self.set(key, *self._wanted[key])
 
     def cancel(self, key: str) -> None:
         """Cancel the timer of a key, if there is one."""
         timer = self._timers.pop(key, None)
         if timer is not None:
             timer.cancel()
+            del self._wanted[key]
             self._slices.pop(key, None)
 
     def close(self) -> None:
@@ -171,7 +179,7 @@ class RunningTimers:
         if left_s > _SOON_S:
             self._timers[key] = self._loop.call_later(left_s, self._look, key, due, fire)
             return
-        del self._timers[key]
+        del self._timers[key], self._wanted[key]
         self._slices.pop(key, None)
         fire()
 

@@ -27,6 +27,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import traceback_of
 from rr_actors.runtime import event_loop
 from rr_actors.runtime.callback_errors import log_raised, raised_by
+from rr_actors.runtime.gates import LettingIn, letting_in
 from rr_actors.runtime.shielding import is_interruptible, shielded
 from rr_actors.runtime.time_limits import time_limit
 
@@ -275,7 +276,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             return (yield from super().__await__())
         self._run_hook()
         if not self._set:
-            yield from self._wait_on(loop)
+            yield from letting_in(self._wait_on(loop))
         if self._open is not None and (process := event_loop.current()) is not None and process.is_loop_thread():
             yield from process.workers.run(self._unpack).__await__()
         return self.get()
@@ -394,7 +395,9 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         waiting = ask_cycles.begin_wait(self)
         try:
             self.when_set(waiter.release)
-            if not waiter.acquire(timeout=-1 if limit_s is None else limit_s):
+            with LettingIn():
+                in_time = waiter.acquire(timeout=-1 if limit_s is None else limit_s)
+            if not in_time:
                 self._forget(waiter.release)
                 if not self._set:
                     raise self.overdue(timeout)

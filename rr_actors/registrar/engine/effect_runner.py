@@ -189,10 +189,15 @@ class EffectRunner:
             self._timers.set(effect.key, effect.delay_s, functools.partial(self._fired, effect))
 
     def _fired(self, effect: e.SetTimer) -> None:
-        if effect.key in self._registrar.outside:  # the callback waits for room, and its time has not begun
+        if effect.key in self._registrar.outside:
             self._set_timer(effect)
-        elif effect.command is not None:
+        else:
             self._registrar.post(effect.command)
+
+    @on_loop
+    def let_in(self, key: str) -> None:
+        """Let the time limit of a callback begin that has waited for room."""
+        self._timers.restart(key)
 
     # -- waiting callers and listeners ---------------------------------------------------------------------------
 

@@ -35,6 +35,7 @@ from rr_actors.registrar.model.effects import AnswerCall, Effect
 from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, Message, Noticed
 from rr_actors.registrar.model.rows import Change, Held, Notice
 from rr_actors.registrar.model.store import Store
+from rr_actors.runtime.gates import Gate
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.streams.publishers import Publishers
 from rr_actors.wire.transport import Exchange, Hello
@@ -57,6 +58,10 @@ class Runner(Protocol):
 
     def close(self) -> None:
         """Carry out nothing more."""
+        ...
+
+    def let_in(self, key: str) -> None:
+        """Let the time limit of a callback begin that has waited for room."""
         ...
 
 
@@ -125,6 +130,8 @@ class RegistrarBase(RegistrarState, abc.ABC):
         serving: whether on_start has returned, and consumers are let in.
         on_happened: called on the loop after each event of a resource; None: nobody asks.
         listeners: those that hear how far a load has come.
+        gate: lets one callback of a serial manager in at a time; None: they run side by side.
+        outside: the timers' keys of callbacks that wait for room in a gate: their time limits have not begun.
     """
 
     progress: ProgressReports
@@ -142,6 +149,8 @@ class RegistrarBase(RegistrarState, abc.ABC):
         self.audience: Audience | None = None
         self.on_happened: Callable[[], object] | None = None
         self.callback_failures = 0
+        self.gate: Gate | None = None
+        self.outside: set[str] = set()
         self.listeners = ProgressListeners()
         self._effects: deque[list[Effect]] = deque()  # those of each decision, to be carried out on the loop
         self._failure = ""  # why the last commit failed

@@ -72,6 +72,7 @@ from rr_actors.registrar.model.rows import (
     State,
 )
 from rr_actors.runtime.callback_errors import Raised, described, log_raised, traceback_of
+from rr_actors.runtime.gates import Gate
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.time_limits import Probes
 from rr_actors.runtime.user_loop import COROUTINE, Done, closing
@@ -353,6 +354,7 @@ class ServerSpec(msgspec.Struct, frozen=True):
     health: Health | None = None
     probe: Callback | None = None
     provides: Labels | None = None
+    at_once: int | None = None  # None: as many as ask
 
     @property
     def labels(self) -> str:
@@ -413,7 +415,8 @@ class ServerActor:
     """Runs one server's callbacks, each in a worker (``async def`` ones as tasks), each with its context.
 
     The registrar tells it which callback to start; it posts LoadDone, LoadErred and so on back. Callbacks of different
-    resources run at the same time; status callbacks of one resource run one after another.
+    resources run at the same time, unless its manager is serial, or it has `at_once`; status callbacks of one resource
+    run one after another.
 
     Raises:
         InvalidSpec: a callback has attributes that cannot be read.
@@ -457,6 +460,7 @@ class ServerActor:
         self._health, self._counts = health, dict[str, ProbeCounts]()  # by resource
         self._inherited = self._held_before() if spec.health else frozenset[str]()
         self._careful_until = math.inf
+        self._gate = registrar.gate or (None if spec.at_once is None else Gate(spec.at_once))
 
     def _described(
         self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
@@ -885,16 +889,52 @@ class ServerActor:
         place = resource.id, attempt, holder, self.spec.name, self.registrar
         current = Current(*place, role, number, interrupted, resource.request, self._runs_again)
         run = self._runs[role] if run is None else run
-        workers = self.registrar.workers
+        workers, gate = self.registrar.workers, self._gate
         if self.registrar.node.watched.level[0] > 1:
             done, at_once = _recorded(current, done, at_once)
         try:
             if role.in_order:
+                run = run if gate is None else gate.around(run, enters=True)
                 workers.serial((role.name, resource.id), run, current, resource, *more, done=done)
-            else:
+            elif gate is None:
                 workers.submit(run, current, resource, *more, done=done, patient=role.patient, at_once=at_once)
+            else:
+                self._enter(gate, role, run, (current, resource, *more), done, at_once)
         except (MailboxFull, Unavailable) as error:
             done(None, error)
+
+    def _enter(
+        self,
+        gate: Gate,
+        role: Role,
+        run: Callback,
+        args: tuple[Any, ...],
+        done: Done,
+        at_once: Callable[[Any], bool] | None,
+    ) -> None:
+        """Run a callback when it has room in the gate. It needs no thread before."""
+        registrar, key = self.registrar, f"{role.name}:{args[1].id}"
+        inside = gate.around(run, enters=False)
+        registrar.outside.add(key)
+
+        def ended(result: Any, error: BaseException | None) -> None:
+            if error is not None and type(error) is not Raised:  # it got no thread, and so has not left the gate
+                gate.leave()
+            done(result, error)
+
+        def begin() -> bool:
+            registrar.outside.discard(key)
+            call = registrar.node.dispatcher.call
+            try:
+                call(registrar.runner.let_in, key)
+                registrar.workers.submit(inside, *args, done=ended, patient=True, at_once=at_once)
+            except Unavailable as error:
+                with contextlib.suppress(Unavailable):  # the process ends
+                    call(done, None, error)
+                return False
+            return True
+
+        gate.enter(begin)
 
     def _request_of(self, resource: Resource) -> tuple[Any]:
         return (self.request.decode(resource.request, self.origin),)
@@ -1180,6 +1220,8 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
         _check_idle(name, spec)
         if spec.health is not None and not is_a(spec.health, Health):
             _invalid(name, "health", "an rr.Health or None", spec.health)
+        if spec.at_once is not None and (type(spec.at_once) is not int or spec.at_once < 1):
+            _invalid(name, "at_once", "a whole number of at least 1, or None", spec.at_once)
         for field in ("load_timeout_s", "recover_timeout_s"):
             limit_s = getattr(spec, field)
             if limit_s is not None and not (is_number(limit_s) and limit_s > 0):
