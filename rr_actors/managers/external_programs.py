@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import psutil
 
-from rr_actors.base.errors import RrError
+from rr_actors.base.errors import RrError, shown
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.process_marks import VARIABLE, kill_allocation
@@ -137,12 +137,13 @@ class ExternalPrograms:
         order: Order,
         *,
         attempt: int = 1,
-        ready: Callable[[Running], bool] = lambda running: True,
+        missing: Callable[[Running], str] = lambda running: "",
         timeout_s: float = 10.0,
     ) -> Running:
         """Start a program, or take over the one that an interrupted start of this key left; return once it is ready.
 
-        The program is ready when its output has had the order's `ready_line` and `ready(running)` is true.
+        The program is ready when its output has had the order's `ready_line` and `missing(running)` returns "". Until
+        then it returns what is missing.
 
         Raises:
             ProgramFailed: the program could not be started, ended, or was not ready in time. No process of it is left.
@@ -153,7 +154,7 @@ class ExternalPrograms:
             if not home.is_held():
                 self._clear(home)
                 spawned = self._spawn(home, order, f"{key}.{attempt}")
-            return self._wait_ready(home, order.command, ready, timeout_s, spawned)
+            return self._wait_ready(home, order, missing, timeout_s, spawned)
         except BaseException:
             self.stop(key)
             raise
@@ -331,13 +332,14 @@ class ExternalPrograms:
     def _wait_ready(
         self,
         home: Home,
-        command: str,
-        ready: Callable[[Running], bool],
+        order: Order,
+        missing: Callable[[Running], str],
         timeout_s: float,
         spawned: ProcessHandle | None,
     ) -> Running:
         limit = RunningLimit(timeout_s)
-        asked: Future[bool] | None = None
+        asked: Future[str] | None = None
+        command, seen = order.command, ""
         while True:
             state = home.state()
             if state:
@@ -345,10 +347,11 @@ class ExternalPrograms:
             elif (spawned is None or spawned.wait(0)) and not (home.is_held() or home.state()):
                 raise ProgramFailed(f"cannot start {command!r}: its shim ended ({sys.executable} {_SHIM})")
             if state.get("ready") and asked is None:
-                asked = _ask(ready, _running(state))
+                asked = _ask(missing, _running(state))
                 wait((asked,), _POLL_S)
             if asked is not None and asked.done():
-                if asked.result() and self._watch(home.key, state):
+                seen = asked.result()
+                if not seen and self._watch(home.key, state):
                     if spawned is not None and spawned.pid != state["shim"][0]:
                         spawned.send_signal(signal.SIGKILL)  # not needed: an interrupted start's shim has the lock
                     return _running(state)
@@ -357,8 +360,10 @@ class ExternalPrograms:
                 raise ProgramFailed(f"{command!r} was not ready yet, and its manager is being stopped")
             if limit.is_over():
                 output = "\n".join(f"  {line}" for line in home.output(TAIL_LINES)) or "  (none)"
-                hangs = "" if asked is None else " (the check whether it is ready has not returned)"
-                raise ProgramFailed(f"{command!r} was not ready within {timeout_s:g} s{hangs}; its output:\n{output}")
+                if asked is None and not seen:
+                    seen = f"no line of its output has {shown(order.ready_line)}"
+                seen = seen or "the check whether it is ready has not returned"
+                raise ProgramFailed(f"{command!r} was not ready within {timeout_s:g} s: {seen}; its output:\n{output}")
             time.sleep(_POLL_S)
 
     def _check_alive(self, home: Home, command: str, state: dict[str, Any]) -> None:
@@ -450,13 +455,13 @@ def _outside(shim: int, group: int) -> Iterator[psutil.Process]:
                     yield process
 
 
-def _ask(ready: Callable[[Running], bool], running: Running) -> Future[bool]:
-    """Call ready(running) in a thread of its own, in the caller's context: it may be a user's probe, and hang."""
-    answer: Future[bool] = Future()
+def _ask(missing: Callable[[Running], str], running: Running) -> Future[str]:
+    """Call missing(running) in a thread of its own, in the caller's context: it may be a user's probe, and hang."""
+    answer: Future[str] = Future()
 
     def run() -> None:
         try:
-            answer.set_result(ready(running))
+            answer.set_result(missing(running))
         except BaseException as error:
             answer.set_exception(error)
 

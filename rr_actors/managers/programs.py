@@ -8,24 +8,29 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib
 import os
 import re
 import signal
-import socket
 import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec.structs import replace
 
-from rr_actors.base.errors import InvalidRequest, RrError, shown, text_of
+from rr_actors.base.errors import InvalidRequest, RrError, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
-from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running
+from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order
+from rr_actors.managers.program_conditions import (
+    Condition,
+    Probe,
+    file_is_written,
+    port_accepts,
+    probe_agrees,
+    what_is_missing,
+)
 from rr_actors.registrar.declarations import costing, server
 from rr_actors.registrar.engine.server import ServerSpec, checked_spec, checked_whole, current
 from rr_actors.registrar.engine.status import Status
@@ -36,11 +41,6 @@ from rr_actors.runtime.processes.control_groups import CONTROLLERS
 logger = Log("rr_actors.managers.programs")
 
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
-Probe = Callable[[int], bool]
-_CONNECT_LIMIT_S = 0.2
-_CLOCK_SLACK_S = 0.05  # a process's start is known to 10 ms, a file's time to one tick of the kernel
-
-
 Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 
 
@@ -146,9 +146,9 @@ class Programs(Manager):
     def run_program(self, request: RunProgram) -> Program:
         """Start a program, or adopt one that an interrupted load has started."""
         me = current()
-        order, ready = _order(request), self._readiness(request.ready, repeated=me.attempt > 1)
+        order, missing = _order(request), self._missing(request.ready, repeated=me.attempt > 1)
         timeout_s = request.ready.timeout_s
-        running = self._external.start(me.resource_id, order, attempt=me.attempt, ready=ready, timeout_s=timeout_s)
+        running = self._external.start(me.resource_id, order, attempt=me.attempt, missing=missing, timeout_s=timeout_s)
         return Program(*running)
 
     @run_program.unload
@@ -208,17 +208,17 @@ class Programs(Manager):
         except RrError as error:
             logger.warning("%s: the program %s; its holders could not be told: %s", resource_id, end, error)
 
-    def _readiness(self, ready: Ready, *, repeated: bool) -> Callable[[Running], bool]:
-        conditions: list[Callable[[Running], bool]] = []
+    def _missing(self, ready: Ready, *, repeated: bool) -> Condition:
+        """Return what says which conditions of a program's readiness do not hold. The probe is asked last."""
+        conditions: list[Condition] = []
         if ready.file is not None:
-            file = Path(ready.file)
-            conditions.append(functools.partial(_is_written, file, _look_of(file), repeated))
+            conditions.append(file_is_written(Path(ready.file), repeated=repeated))
         if ready.port is not None:
-            conditions.append(functools.partial(_accepts, (ready.host, ready.port)))
-        if ready.probe is not None:
-            probe = self._probes.get(ready.probe) or _import(ready.probe)
-            conditions.append(lambda running: probe(running.pid))
-        return lambda running: all(condition(running) for condition in conditions)
+            conditions.append(port_accepts(ready.host, ready.port))
+        if ready.probe is None:
+            return functools.partial(what_is_missing, conditions)
+        probe = probe_agrees(ready.probe, self._probes, "ready.probe")
+        return lambda running: what_is_missing(conditions, running) or probe(running)
 
 
 def _order(request: RunProgram) -> Order:
@@ -248,47 +248,3 @@ def _signal_number(name: str) -> int:
     except KeyError:
         text = f"stop_signal: expected a name like 'SIGTERM', got {shown(name)}"
         raise InvalidRequest(text, path="stop_signal", expected="a signal's name") from None
-
-
-def _look_of(path: Path) -> tuple[int, ...] | None:
-    """Return a value that changes when the file is written again; None if there is no file."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
-
-
-def _is_written(path: Path, before: tuple[int, ...] | None, repeated: bool, running: Running) -> bool:
-    """Return whether the file was written after the program was started, even if the clock was set since.
-
-    Args:
-        before: the file's look when this attempt began.
-        repeated: an earlier attempt may have started the program. Its file may then exist already, and its time is
-            compared with the program's start.
-    """
-    found = _look_of(path)
-    if found is None or found != before or not repeated:
-        return found is not None and found != before
-    started = time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - running.start_time)
-    return found[-1] / 1e9 >= started - _CLOCK_SLACK_S
-
-
-def _accepts(address: tuple[str, int], running: Running) -> bool:
-    try:
-        socket.create_connection(address, _CONNECT_LIMIT_S).close()
-    except OSError:
-        return False
-    return True
-
-
-def _import(name: str) -> Probe:
-    """Return the function that "package.module:function" names."""
-    module, _, function = name.partition(":")
-    try:
-        found: Any = getattr(importlib.import_module(module), function)
-    except (Exception, SystemExit) as error:  # importing runs the module: it may raise anything
-        got = f"{shown(name)}: {text_of(error)}"
-        text = f"ready.probe: expected a probe of the manager, or 'package.module:function', got {got}"
-        raise InvalidRequest(text, path="ready.probe", expected="'package.module:function'") from error
-    return found

@@ -194,7 +194,7 @@ def test_a_program_that_is_not_ready_in_time_is_ended(
 def test_ready_may_be_a_condition_checked_from_outside(programs: ExternalPrograms, tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     code = f"import time; time.sleep(0.1); open({str(mark)!r}, 'w').close(); time.sleep(600)"
-    programs.start(KEY, python(code), ready=lambda running: mark.exists())
+    programs.start(KEY, python(code), missing=lambda running: "" if mark.exists() else "the mark")
     assert mark.exists()
 
 

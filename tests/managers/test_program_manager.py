@@ -169,6 +169,23 @@ def test_a_program_can_be_ready_when_a_function_says_so(start: Start, tmp_path: 
         assert is_running(program.response)
 
 
+def test_a_program_that_is_not_ready_in_time_says_what_is_missing_and_what_was_seen(
+    app: rr.Registrar, tmp_path: Path
+) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        port = closed.getsockname()[1]
+        ready = Ready(line="ready", port=port, file=str(tmp_path / "never"), timeout_s=3.0)
+        with pytest.raises(rr.LoadFailed) as failed:
+            app.load("programs/program", python(SLEEP, ready=ready))
+    seen = f"file {tmp_path}/never: not there; port {port} of 127.0.0.1: ConnectionRefusedError"
+    assert f"was not ready within 3 s: {seen}" in str(failed.value)
+    with pytest.raises(rr.LoadFailed, match=r"within 2 s: no line of its output has 'never'; its output"):
+        app.load("programs/program", python(SLEEP, ready=Ready(line="never", timeout_s=2.0)))
+    with pytest.raises(rr.LoadFailed, match=r"within 2 s: probe builtins:callable: it returned False"):
+        app.load("programs/program", python(SLEEP, ready=Ready(probe="builtins:callable", timeout_s=2.0)))
+
+
 @pytest.mark.parametrize(
     ("request_", "says"),
     [
@@ -227,7 +244,7 @@ def hanging(start: Start, tmp_path: Path) -> Iterator[rr.System]:
 
 
 def test_a_probe_that_hangs_is_given_up_in_time(hanging: rr.System) -> None:
-    with pytest.raises(rr.LoadFailed, match=r"not ready within 2 s \(the check whether it is ready has not returned\)"):
+    with pytest.raises(rr.LoadFailed, match=r"not ready within 2 s: the check whether it is ready has not returned"):
         hanging.open_registrar("app").load("programs/program", python(SLEEP, ready=Ready(probe="hangs", timeout_s=2.0)))
     assert not running_programs()
 
