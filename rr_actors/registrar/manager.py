@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn, cast
 
@@ -24,6 +25,10 @@ from rr_actors.runtime.gates import Gate
 from rr_actors.wire.name_service import Presence
 
 
+def _unnoted(text: str) -> None:
+    """Take no note: no system makes the manager."""
+
+
 class Beginning(msgspec.Struct, frozen=True):
     """The facts of a start of a manager.
 
@@ -32,12 +37,14 @@ class Beginning(msgspec.Struct, frozen=True):
         directory: the private directory of its catalog, which may not exist yet.
         run: identifies the run of the system.
         by_hand: start_child or restart_child asks for this start, and not the supervisor.
+        note: has the console show a text beside the manager, until another is given; "": none.
     """
 
     name: str
     directory: Path
     run: str
     by_hand: bool
+    note: Callable[[str], None] = _unnoted
 
 
 class _NotYet:
@@ -122,7 +129,8 @@ class Manager(Actor):
             return None
         node: Node = place.node
         directory = node.config.registrar(place.id).catalog_path(node.info.state_dir).parent
-        return Beginning(place.id, directory, node.info.run_dir, place.by_hand)
+        note = functools.partial(node.directory.put_note, place.id)
+        return Beginning(place.id, directory, node.info.run_dir, place.by_hand, note)
 
     async def _before_start(self, place: Any) -> None:
         node: Node = place.node

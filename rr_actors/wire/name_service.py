@@ -53,6 +53,7 @@ _log = Log(__name__)
 _REGISTRAR = "r."  # the prefix of a registrar's entry
 _CLASSES = "c."  # the prefix of an entry with the classes of a manager
 _LABELS = "l."  # the prefix of an entry with what a server provides
+_NOTES = "n."  # the prefix of an entry with what an operator should know of a manager
 _BELOW = "~"  # stands for "/" in the name of an actor's entry
 _LOCK = "system.lock"
 _KEY_BYTES = 32
@@ -306,9 +307,24 @@ class Directory:
 
     def put_labels(self, registrar: str, server: str, labels: str) -> None:
         """Write what a server provides, or remove that if it is ""."""
-        name = f"{_LABELS}{check_name(registrar, 'registrar name')}{_BELOW}{server}"
-        if labels:
-            self._put(name, labels)
+        self._put_or_remove(f"{_LABELS}{check_name(registrar, 'registrar name')}{_BELOW}{server}", labels)
+
+    def put_note(self, registrar: str, text: str) -> None:
+        """Write what an operator should know of a manager, of which 900 bytes are kept; remove it if it is ""."""
+        self._put_or_remove(_NOTES + check_name(registrar, "registrar name"), _fitting(text))
+
+    def notes(self) -> dict[str, str]:
+        """Return what an operator should know of managers, by the names of their registrars."""
+        found: dict[str, str] = {}
+        for name in self.names():
+            if name.startswith(_NOTES):
+                with contextlib.suppress(OSError):  # it was removed just now
+                    found[name.removeprefix(_NOTES)] = os.readlink(name, dir_fd=self._names.fd)
+        return found
+
+    def _put_or_remove(self, name: str, text: str) -> None:
+        if text:
+            self._put(name, text)
             return
         self._written.pop(name, None)
         with contextlib.suppress(OSError):  # there is none

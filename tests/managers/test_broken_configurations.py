@@ -13,6 +13,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.managers import Actions, Budgets, Choices, Components, Keeper, Pipes, Robots
 from support import kill, wait_respawned
+from support_cli import run_cli
 
 POOLS = '[[pool]]\nname = "watts"\ncapacity = 100\n'
 CHOICES = '[[alternative]]\nkind = "range"\nserver = "cameras/camera"\n'
@@ -111,3 +112,28 @@ def test_a_configuration_that_is_wrong_at_the_moment_of_a_sigkill_ends_nothing(
         system.supervisor().restart_child("planner")
     restore(file, text)
     system.supervisor().restart_child("planner")
+
+
+def test_a_manager_that_goes_on_with_its_last_good_configuration_is_shown(
+    start: Callable[..., rr.System], tmp_path: Path
+) -> None:
+    file = tmp_path / "pools.toml"
+    file.write_text(POOLS)
+    system = start(rr.Supervisor([rr.ChildSpec(Budgets, id="budgets", args=(os.fspath(file),))]))
+
+    def shown(*verb: str) -> str:
+        ran = run_cli(*verb, "--state", system.state_dir)
+        assert ran.returncode == 0, ran.stderr
+        return " ".join(ran.stdout.split())
+
+    said = f"goes on with its last good configuration: {file}"
+    assert "last good" not in shown("ps")
+    file.write_text(POOLS.replace("100", '"much"'))
+    wait_respawned(system, "budgets", kill(system, "budgets"))
+    assert said in shown("ps")
+    assert said in shown("ps", "--json")
+    assert said in shown("status", "budgets")
+    restore(file, POOLS)
+    system.supervisor().terminate_child("budgets")
+    system.supervisor().restart_child("budgets")
+    assert "last good" not in shown("ps")

@@ -3,7 +3,8 @@
 A file is read when somebody asks for it: at the start of the system, at a start by hand (start_child, restart_child),
 and by a message such as Keeper.apply(). A wrong file is an error then. When the supervisor restarts the manager, nobody
 has asked: the manager goes on with the texts of its last good configuration, which are on disk beside its catalog. If
-the file is wrong, missing, or another one by then, the log has a WARNING.
+the file is wrong, missing, or another one by then, the log has a WARNING, and `ps`, `status`, `top` and the web page
+say so beside the manager.
 """
 
 from __future__ import annotations
@@ -72,15 +73,19 @@ class LastGood(Generic[C]):
             except (ConfigError, GraphError) as error:  # the code is another one by now
                 logger.warning("%s: its last good configuration does not hold any more: %s", beginning.name, error)
             else:
-                self._go_on(beginning.name, read, kept.given)
+                beginning.note(self._go_on(beginning.name, read, kept.given))
                 return
+        beginning.note("")
         self._begin(beginning, read, kept)
 
-    def _go_on(self, name: str, read: Callable[[], Sources], given: Mapping[str, str]) -> None:
+    def _go_on(self, name: str, read: Callable[[], Sources], given: Mapping[str, str]) -> str:
+        """Return what an operator should know."""
         self.problem = self._difference(read, given)
         if self.problem:
-            text = "%s goes on with its last good configuration: %s. A change takes effect at the next start."
-            logger.warning(text, name, self.problem)
+            said = f"goes on with its last good configuration: {self.problem}"
+            logger.warning("%s %s. A change takes effect at the next start.", name, said)
+            return said
+        return ""
 
     def _begin(self, beginning: Beginning, read: Callable[[], Sources], kept: _Record) -> None:
         sources = read()

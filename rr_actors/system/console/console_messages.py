@@ -110,6 +110,7 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
         up_s: for how many seconds it has been ready.
         strategy: of a supervisor: its strategy and restart intensity.
         max_restarts, recent_restarts: of a supervisor: how many restarts its window allows, and how many are in it.
+        note: what an operator should know of a manager: that its configuration file is wrong, for instance.
     """
 
     path: str
@@ -123,6 +124,7 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
     error: str = ""
     max_restarts: int = 0
     recent_restarts: int = 0
+    note: str = ""
 
     @property
     def id(self) -> str:

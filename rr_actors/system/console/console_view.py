@@ -112,10 +112,14 @@ class View:
 
     def _walk(self) -> Iterator[c.ChildRow]:
         if (ended := self.system.ended) is not None:  # what has ended is not asked: that would make a dead letter
-            return _last_seen(self._log.of_this_run(), self.system.supervisor().path, readable(ended.detail))
+            yield from _last_seen(self._log.of_this_run(), self.system.supervisor().path, readable(ended.detail))
+            return
         state = {"state": "running", "pid": os.getpid()}
         root = describe_supervisor(SupervisorRef(self.system.supervisor().path, timeout_s=_LOOK_S), text_of)
-        return _rows(root | state | {"up_s": time.monotonic() - self._began})
+        notes = self.node.directory.notes()
+        for row in _rows(root | state | {"up_s": time.monotonic() - self._began}):
+            said = "" if row.type == "supervisor" else notes.get(row.id, "")
+            yield msgspec.structs.replace(row, note=readable(said)) if said else row
 
     def history(self, path: str) -> list[Record]:
         """Return the records of the child at `path` and of all below it, oldest first."""

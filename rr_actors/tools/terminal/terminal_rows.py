@@ -340,6 +340,7 @@ def _as_it_is(row: c.ChildRow) -> str:
         "" if usage is None else f"{usage.cpu_percent:.1f} % CPU, {usage.memory_bytes / 2**20:.0f} MiB",
         row.strategy,
         row.error,
+        row.note,
     )
     return ", ".join(filter(None, parts))
 

@@ -180,7 +180,7 @@ def _child(of: _Figures, as_path: bool, columns: Sequence[_Column[_Figures]]) ->
     name = row.path if as_path else "  " * row.depth + row.id
     restarts = f"{row.restarts}x" if row.restarts and not columns else ""
     note = " ".join(filter(None, (row.state if row.state != "running" else "", restarts)))
-    style = _CHILD_STYLES.get(row.state, "")
+    style = _CHILD_STYLES.get(row.state, "") or ("yellow" if row.note else "")
     return Row(f"child {row.path}", name, note, style, child=row, columns=_cells(columns, of))
 
 

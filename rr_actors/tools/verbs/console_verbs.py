@@ -182,7 +182,7 @@ def _show_children(state: Path | None, sort_by: str | None, output: str | None, 
             str(row.restarts),
             "" if usage is None else f"{usage.cpu_percent:.1f} %",
             "" if usage is None else f"{usage.memory_bytes / 2**20:.0f} MiB",
-            row.error or row.strategy,
+            row.error or row.note or row.strategy,
         )
         table.append(cells)
     say_table(heads, table, gives_way=("",), right=("pid", "up", "restarts", "cpu"))
@@ -891,8 +891,8 @@ def _child_lines(row: c.ChildRow, facts: dict[str, Any], served: list[c.Registra
         yield f"    process {row.pid}{up}, {row.restarts} restart{'' if row.restarts == 1 else 's'}"
     if facts["memory_bytes"] is not None:
         yield f"    {facts['cpu_percent']:.1f} % of a core, {facts['memory_bytes'] / 2**20:.0f} MiB"
-    if row.strategy:
-        yield f"    {row.strategy}"
+    for text in filter(None, (row.strategy, row.note)):
+        yield f"    {text}"
     for one in served:
         counts = ", ".join(f"{count} {name}" for name, count in one.counts.items() if count)
         yield f"    registrar {one.name}: {one.status}, serves {', '.join(one.servers) or 'nothing'}"

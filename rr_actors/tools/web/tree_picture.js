@@ -9,10 +9,11 @@ const Branch = {
     <li role="none">
       <button type="button" role="treeitem" class="rr-node" :class="[unknown ? 'rr-unknown' : 'rr-' + node.state, { 'rr-chosen': node.path === chosen }]"
         :data-path="node.path" :aria-selected="node.path === chosen" :aria-label="label"
-        :tabindex="node.path === focus ? 0 : -1" :title="node.error || node.type" @click="$emit('pick', node.path)">
+        :tabindex="node.path === focus ? 0 : -1" :title="node.error || node.note || node.type" @click="$emit('pick', node.path)">
         <span class="rr-id"><span class="rr-sign" aria-hidden="true">{{ sign }}</span> {{ node.id }}</span>
         <span v-if="node.restarts" class="rr-count" :key="node.restarts">↻{{ node.restarts }}</span>
         <span class="rr-fact">{{ unknown || node.state }}{{ node.pid && !unknown ? ' · ' + node.pid : '' }}</span>
+        <span v-if="node.note && !unknown" class="rr-fact">⚠ see below</span>
         <span v-if="node.strategy" class="rr-fact">{{ node.strategy }}</span>
         <span v-if="node.type === 'supervisor'" class="rr-window" :title="windowText">
           <i v-for="n in slots" :key="n" :class="{ full: n <= node.recent, over: n > node.most }"></i>
@@ -31,7 +32,8 @@ const Branch = {
     label() {
       const restarts = this.node.restarts ? `, restarted ${this.node.restarts} times` : "";
       const window = this.node.type === "supervisor" ? `, ${this.windowText}` : "";
-      return `${this.node.path}, ${this.unknown || this.node.state}${restarts}${window}`;
+      const note = this.node.note ? `, ${this.node.note}` : "";
+      return `${this.node.path}, ${this.unknown || this.node.state}${restarts}${window}${note}`;
     },
   },
 };

@@ -91,4 +91,4 @@ class TreePicture(ui.element, component="tree_picture.js"):
 def _node(row: ChildRow) -> dict[str, Any]:
     node: dict[str, Any] = {"path": row.path, "id": row.id, "type": row.type, "state": row.state}
     node |= {"pid": row.pid, "restarts": row.restarts, "error": row.error, "strategy": row.strategy}
-    return node | {"most": row.max_restarts, "recent": row.recent_restarts}
+    return node | {"most": row.max_restarts, "recent": row.recent_restarts, "note": row.note}
