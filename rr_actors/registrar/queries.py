@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import itertools
 import threading
 import time
@@ -113,6 +114,7 @@ class Query(Generic[Response]):
 
     __slots__ = (
         "_codec",
+        "_has_all_streams",
         "_holder",
         "_is_released",
         "_request",
@@ -139,6 +141,7 @@ class Query(Generic[Response]):
         origin: str,
         holder: Holder | None,
         types: Callable[[str], tuple[Codec, Codec]],
+        has_all_streams: Callable[[Query[Any]], bool],
     ) -> None:
         self.id = id
         self.resource_id = ""
@@ -153,6 +156,7 @@ class Query(Generic[Response]):
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
+        self._has_all_streams = has_all_streams
         self._waiters: dict[Flag | Wake | _Over, None] | None = None  # made for the first
         self._statuses: _Statuses | None = None  # made for the first: most queries hear of none
 
@@ -292,8 +296,8 @@ class Query(Generic[Response]):
         Raises:
             UnknownQuery: the query is released, or another process holds it.
             InvalidName, UsageError: an argument is something else, or there are several streams that are meant.
-            NotFound: the resource has no stream of this name. If it has none at all, the iteration raises this after
-                thirty seconds. `.id`, `.known`
+            NotFound: the resource has no stream of this name. If it has none at all, this is known at once; or the
+                iteration raises it after thirty seconds, if the manager has crashed since the load. `.id`, `.known`
             ResourceLost: by the iteration: the resource was lost.
             Unavailable: by the iteration: the manager has ended, and its server opens the stream in no callback that
                 runs then. Or a frame cannot be read now; the next call goes on.
@@ -303,7 +307,15 @@ class Query(Generic[Response]):
         self._at_holder()
         if self._is_released:
             raise UnknownQuery(f"{self.server_id}: query {self.id} is released: it has no streams", query_id=self.id)
-        source = Source(self.resource_id, self.origin, self._is_over, self._named_streams, self._watch, self._unwatch)
+        source = Source(
+            self.resource_id,
+            self.origin,
+            self._is_over,
+            self._named_streams,
+            self._watch,
+            self._unwatch,
+            functools.partial(self._has_all_streams, self),
+        )
         checked = name if name is None or isinstance(name, Stream) else check_name(name, "stream")
         return StreamReader(source, checked, keep, depth, limit_s)
 
@@ -396,7 +408,7 @@ class Query(Generic[Response]):
             setattr(self, name, value)
         self._holder = self._codec = self._waiters = self._statuses = None
         self._is_released = False
-        self._types = _no_types
+        self._types, self._has_all_streams = _no_types, not_known
 
     def _read_as(self, codec: Codec) -> Self:
         """Decode the response with this codec, and not with that of the server's response type."""
@@ -529,6 +541,11 @@ class _Over:
                 self._calls.pop()()
 
 
+def not_known(_query: Query[Any]) -> bool:
+    """Return False: nobody here knows whether the manager runs that has answered the load."""
+    return False
+
+
 def _no_types(server_id: str) -> tuple[Codec, Codec]:
     raise UnknownQuery(f"{server_id}: a query of another process has no types here")
 
@@ -593,7 +610,7 @@ class Views:
         self._on_query: dict[str, StatusCallback] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
-        self._codecs_of = self.codecs_of  # one bound method for all queries
+        self._of_all = self.codecs_of, self._has_all_streams  # the same bound methods for all queries
         self._left: set[tuple[str, str]] = set()  # servers where something was held, and released
         self._silent: set[str] = set()  # servers whose types were asked for, and did not come in time
 
@@ -603,7 +620,7 @@ class Views:
         Args:
             codec: decodes the response; None: that of the server's response type.
         """
-        query = Query(id, place, request, parent, self._actor.name, self.holder, self._codecs_of)
+        query = Query(id, place, request, parent, self._actor.name, self.holder, *self._of_all)
         return query if codec is None else read_as(query, codec)
 
     def seen(self, held: Held) -> Query:
@@ -735,6 +752,15 @@ class Views:
             return callback(status) if self.hears(query_id) else None
 
         return begin_async if is_async(callback) else begin
+
+    def _has_all_streams(self, query: Query[Any]) -> bool:
+        """Return whether the callbacks that open streams of the resource have ended: its provider runs, and ran then.
+
+        They end before a load is answered. After a crash of the provider this is not known.
+        """
+        catalog = self._actor.catalog
+        held, client = catalog.held.get(query.id), self._actor.clients.get(query.registrar)
+        return held is not None and held.seq > catalog.since and client is not None and client.has_run_since(held.id)
 
     def codecs_of(self, server_id: str) -> tuple[Codec, Codec]:
         """Return the codecs of a server's requests and responses, made of the types that it sent. Not on the loop."""

@@ -33,6 +33,7 @@ class Source(NamedTuple):
         named: returns the streams that the response names, with their places.
         watch: has a Wake set for each status, and at the end.
         unwatch: ends that.
+        has_all: whether nobody will open another stream of the resource.
     """
 
     resource_id: str
@@ -41,6 +42,7 @@ class Source(NamedTuple):
     named: Callable[[], Iterable[tuple[Place, Stream]]]
     watch: Callable[[Wake], None]
     unwatch: Callable[[Wake], None]
+    has_all: Callable[[], bool]
 
 
 class _Wait(NamedTuple):
@@ -323,16 +325,18 @@ class StreamReader:
         return chosen
 
     def _check_known(self, now: float | None = None) -> None:
-        """Raise an error if there is no hope: others are open and not this one, or nobody has opened it for long."""
+        """Raise an error if there is no hope: nobody opens it any more, or nobody has opened it for long."""
         apart_s = 0.0 if now is None or self._apart_at is None else now - self._apart_at
         if self._publisher:
             if self._is_once and apart_s > _OPENS_S:
                 self._is_over_with(Unavailable(f"{self._what}: its publisher has ended, and {OPENED_ONCE}"))
             return
-        resource_id = self._source.resource_id if self._stream is None else self._stream.resource_id
+        own = self._source.resource_id
+        resource_id = own if self._stream is None else self._stream.resource_id
+        has_all = apart_s > _OPENS_S or (resource_id == own and self._source.has_all())  # before it looks
         known = known_streams(resource_id)
         name = None if self._stream is None else self._stream.name
-        if name not in known and (any(known.values()) or apart_s > _OPENS_S):
+        if name not in known and (any(known.values()) or has_all):
             names = few(map(repr, sorted(known))) or "none"
             text = f"resource {resource_id} has no {self._what}; there are: {names}"
             self._is_over_with(NotFound(text + did_you_mean(name, known), id=name or "", known=tuple(sorted(known))))

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import eventually
+from support import eventually, kill, wait_respawned
 from support_interrupts import interrupted
 
 Start = Callable[..., rr.System]
@@ -610,3 +610,33 @@ def test_next_that_is_interrupted_anywhere_loses_no_frame(start: Start, size: in
             assert (frames[0].number, frames[0].missed, frames[0].value[0]) == (number, 0, number % 256)
         assert point > 20
     gc.collect()  # errors refer to frames
+
+
+def asked(query: rr.Query[Any], name: str | None) -> None:
+    """Ask for a stream that the resource does not have. Reading waits a minute for a frame, or for the stream."""
+    with query.stream(name, timeout_s=60) as reader:
+        next(reader)
+
+
+@pytest.mark.parametrize("name", ["images", None])
+@pytest.mark.parametrize("placement", ["process", "thread"])
+def test_a_resource_without_a_stream_says_so_at_once(start: Start, placement: Any, name: str | None) -> None:
+    app = start(rr.ChildSpec(Boards, id="boards", placement=placement)).open_registrar("app")
+    with app.load("boards/board", []) as board:
+        began = time.monotonic()
+        with pytest.raises(rr.NotFound, match=r"there are: none"):
+            asked(board, name)
+    assert time.monotonic() - began < 15
+
+
+def test_a_stream_of_a_manager_that_has_crashed_since_the_load_is_waited_for(start: Start) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards"))
+    app = system.open_registrar("app")
+    with app.load("boards/board", []) as before:
+        wait_respawned(system, "boards", kill(system, "boards"))
+        with app.load("boards/board", [], priority=1) as joined:
+            assert joined.resource_id == before.resource_id
+            with pytest.raises(rr.NotFound):  # this load began after the crash
+                asked(joined, None)
+        with before.stream(timeout_s=1.0) as reader, pytest.raises(TimeoutError):
+            next(reader)

@@ -25,7 +25,7 @@ from rr_actors.registrar.arguments import LoadOptions, Parent, checked_callback,
 from rr_actors.registrar.declarations import Declared, declaring
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries, note_request
 from rr_actors.registrar.pages import QueryRow
-from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, read_as, was_given
+from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, not_known, read_as, was_given
 from rr_actors.registrar.registrar import Consumer
 from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, RemoteLoads, RemoteUnloads
 from rr_actors.runtime.time_limits import time_limit
@@ -186,7 +186,9 @@ class _ClientLoads(RemoteLoads):
             # If the connection ends before keep(), the system releases the query.
             with client.views.loading(), client.connections.lent() as connection:
                 held = connection.ask(command, limit_s + _GRACE_S)
-                query = ClientQuery(held.query_id, target, request, "", client.name, self.holder, _shown_types)
+                query = ClientQuery(
+                    held.query_id, target, request, "", client.name, self.holder, _shown_types, not_known
+                )
                 if options.codec is not None:
                     read_as(query, options.codec)
                 loaded_directly(query, held.resource_id, held.response, held.state)

@@ -30,7 +30,7 @@ def frames_of(stream: Stream, is_over: Callable[[], bool], timeout_s: float) -> 
         Unavailable: no frame came in time.
         RrError: a frame cannot be read here.
     """
-    source = Source(stream.resource_id, _READER, is_over, list, _unwatched, _unwatched)
+    source = Source(stream.resource_id, _READER, is_over, list, _unwatched, _unwatched, lambda: False)
     with StreamReader(source, stream.name, "latest", 1, timeout_s) as reader:
         while True:
             try:
