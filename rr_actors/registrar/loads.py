@@ -505,7 +505,7 @@ class Loads:
         with contextlib.suppress(TimeoutError):
             if (error := loading.exception(GRACE_S)) is not None:
                 raise error
-        raise error_of(command.failure)  # the disk is full: the loop withdraws the load later
+        raise error_of(command.failure)  # the loop does not answer: it withdraws the load later
 
 
 def _rank(options: LoadOptions) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any, get_args
 
 import pytest
@@ -53,6 +54,7 @@ ROWS = (
     ServedQuery("served", "r", "app", "", 0, 1),
     held("mine", Hold.HELD),
     held("owed", Hold.OWED),
+    held("asked", Hold.PENDING),
 )
 
 
@@ -152,6 +154,15 @@ def test_who_waits_for_a_load_of_ones_own_is_told() -> None:
     assert "new" not in decision.catalog.held
 
 
+@pytest.mark.parametrize(("id", "unheard"), [("asked", False), ("asked", True), ("mine", True), ("unknown", False)])
+def test_who_tires_of_a_load_hears_so_at_once_and_the_load_is_withdrawn_again_even_if_it_is_held_by_then(
+    id: str, unheard: bool
+) -> None:
+    (effect,), again, _ = refused(c.GiveUp(id, LATE, unheard))
+    assert (effect.held.id, effect.failure) == (id, LATE)
+    assert again == [(c.GiveUp(id, LATE, unheard=True), None)]
+
+
 @pytest.mark.parametrize("item", AGAIN, ids=lambda item: type(item).__name__)
 def test_what_nobody_can_be_refused_is_done_again(item: Any) -> None:
     effects, again, _ = refused(item)
@@ -204,8 +215,9 @@ def test_who_tires_of_an_unload_while_the_disk_is_full_hears_that_it_is_owed(
     served.unloads.wait()
 
 
-def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_in_his_own_terms(
-    app: rr.Registrar, provider: rr.Registrar, gate: Gate, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("directly", [True, False])
+def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_in_his_time_and_in_his_own_terms(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate, monkeypatch: pytest.MonkeyPatch, directly: bool
 ) -> None:
     served = serve(provider, "thing", load=lambda request: request and gate())
     app.load("provider/thing", None)  # from now on there are lines
@@ -220,9 +232,17 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
             withdrawn(len(decision.changes))
 
     monkeypatch.setattr(actor_of(app).commits, "commit", full)
-    monkeypatch.setattr(loads, "GRACE_S", 0.1)
+    monkeypatch.setattr(loads, "GRACE_S", 60)
+
+    def load() -> object:
+        if directly:
+            return app.load("provider/thing", "x", timeout_s=0.3)
+        return app.load("provider/thing", "x", timeout_s=0.3, block=False).get(timeout=60)
+
+    began = time.monotonic()
     with pytest.raises(rr.LoadTimeout, match=r"not loaded within 0\.3 s") as caught:
-        app.load("provider/thing", "x", timeout_s=0.3)
+        load()
+    assert time.monotonic() - began < 20
     assert (caught.value.timeout_s, len(withdrawn)) == (0.3, 0)
     is_full.clear()
     withdrawn.wait()

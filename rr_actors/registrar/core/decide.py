@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from msgspec.structs import replace
+
 from rr_actors.base.errors import shown
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
@@ -173,6 +175,9 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure
                 decision.cause(refuse(decision, item.origin, item.query_id, failure))
             case c.AskProvider():
                 decision.cause(LoadResolved(holding.pending(item), failure))
+            case c.GiveUp() if (ended := holding.given_up(catalog, item)) is not None:
+                decision.cause(ended)  # its caller's time is over; the load is withdrawn when there is room
+                again.append((replace(item, unheard=True), sender))
             case c.Release():
                 decision.cause(UnloadResolved(item.query_id, failure))
             case c.ReleaseOverdue():

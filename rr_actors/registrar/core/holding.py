@@ -190,6 +190,14 @@ def end_direct(decision: Decision, query_id: str) -> None:
         decision.note(decision.catalog.direct, query_id, False)
 
 
+def given_up(catalog: Catalog, command: GiveUp) -> LoadResolved | None:
+    """Return what ends the wait of a load's caller while GiveUp cannot be written; None if the load has ended."""
+    held = catalog.held.get(command.query_id) or catalog.in_flight.get(command.query_id)
+    if held is not None and held.hold is not PENDING and not (command.unheard and held.hold is HELD):
+        return None
+    return LoadResolved(held or _unknown(command.query_id), command.failure)
+
+
 def give_up(decision: Decision, command: GiveUp) -> None:
     """Withdraw a load that is not answered yet, or whose answer nobody has heard."""
     add_in_flight(decision, command.query_id)
