@@ -36,6 +36,7 @@ class Ledger:
         self.request_of: dict[tuple[str, str], tuple[str, str, bytes]] = {}
         self.open: dict[tuple[str, str, str], int] = {}  # (registrar, kind, resource) -> callbacks that run now
         self.deaths: dict[tuple[str, str, str], int] = {}  # the same -> processes in a row that died in its runs
+        self.early: set[str] = set()  # queries whose loads have ended for those who asked, and not on disk
         self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
         self.given_up: set[tuple[str, str]] = set()  # loads that died, and are not run again: what is left is unloaded
         self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
@@ -181,6 +182,18 @@ class Ledger:
     def failed(self, query_id: str) -> None:
         """Whoever asked was told that it failed."""
         self.fate[query_id] = "failed"
+
+    def told_early(self, query_ids: Iterable[str]) -> None:
+        """Those who asked were told in their time, and the disk was full: a crash forgets that they were."""
+        early = [id for id in query_ids if self.fate.get(id) == "failed"]
+        self.early.update(early)
+        self.fate.update(dict.fromkeys(early, "unanswered"))
+
+    def withdrawn(self, query_ids: Iterable[str]) -> None:
+        """The disk has by now that these loads were given up."""
+        for id in self.early.intersection(query_ids):
+            self.early.discard(id)
+            self.fate[id] = "failed"
 
     def letting(self, query_id: str) -> None:
         """Somebody lets the query go, and is not answered yet."""

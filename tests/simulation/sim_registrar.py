@@ -89,6 +89,8 @@ class SimRegistrar(SimShell):
             self.finish(decision, fault)
         except CatalogError:
             self.not_committed(inbox)
+        else:
+            self.world.ledger.withdrawn(item.query_id for item, _ in inbox if type(item) is c.GiveUp)
 
     def finish(self, decision: Decision, fault: str) -> None:
         """Commit, then act; nothing has happened if the commit fails."""
@@ -298,6 +300,7 @@ class SimRegistrar(SimShell):
         """Refuse what can be refused; the rest stays first in line."""
         decision, again = refuse_uncommitted(self.catalog, inbox, DISK_FULL)
         self.finish(decision, "")
+        self.world.ledger.told_early(item.query_id for item, _ in again if type(item) is c.GiveUp)
         if again:
             self.inbox.extendleft(reversed(again))
             self.world.todo.add(("wake", self.name))
