@@ -191,6 +191,8 @@ class Script:
                 pass
             case e.Acquitted():
                 self.say(name, "says that no callback has ended its last process")
+            case e.RingBroken(why):
+                self.say(name, f"says: {why}")
             case e.Died(runs, given_up):
                 self.say(name, f"says that its last process died in {'; '.join(runs)}")
                 for text in given_up:
@@ -284,7 +286,8 @@ def message_text(message: Any) -> str:
         case m.NoticesHandled():
             return f"{name} {' '.join(message.ids)}"
         case m.Probe():
-            return f"{name} {message.query_id}: does it wait for {message.waiter}?"
+            verb = "hold" if message.holds else "wait for"
+            return f"{name} {message.query_id}: does it {verb} {message.waiter}?"
         case m.Gone():
             return f"{name} {message.origin}"
         case m.Reprioritise() | m.Reprioritised():

@@ -176,6 +176,10 @@ def _acquitted(shell: SimShell, _effect: e.Acquitted) -> None:
     shell.world.note(f"{shell.name}: its last process has not died in a callback")
 
 
+def _ring_broken(shell: SimShell, effect: e.RingBroken) -> None:
+    shell.world.note(f"{shell.name}: {effect.why}")
+
+
 ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.SendReply: _reply,
     e.SendRequest: _request,
@@ -197,4 +201,5 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.Happened: _happened,
     e.Died: _died,
     e.Acquitted: _acquitted,
+    e.RingBroken: _ring_broken,
 }

@@ -17,8 +17,17 @@ from rr_actors.registrar.core.releasing import add_in_flight, look_there, releas
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
 from rr_actors.registrar.model.commands import AskProvider, GiveUp, Got, Release, ReleaseOverdue, SendAgain
-from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
-from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Noticed, Unload, Unloaded, UnloadRefused
+from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, RingBroken, UnloadResolved
+from rr_actors.registrar.model.messages import (
+    Load,
+    Loaded,
+    LoadRefused,
+    Noticed,
+    Probe,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
 from rr_actors.registrar.model.rows import HELD, OK, OWED, PENDING, Held, Notice, Phase, State
 
 # -- load ----------------------------------------------------------------------------------------------------------
@@ -64,7 +73,7 @@ def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
     if asked is None or asked.registrar not in catalog.up:
         return False
     parent = asked.parent
-    if parent and not asked.own and catalog.inherited(parent) != asked.priority:
+    if parent and ((not asked.own and catalog.inherited(parent) != asked.priority) or _may_close_ring(catalog, parent)):
         return False
     place = (asked.id, asked.registrar, asked.server, asked.request, answer.response, answer.resource_id)
     row = Held(*place, parent, asked.attempt, asked.seq, HELD, answer.state, asked.priority, asked.own)
@@ -157,6 +166,33 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
         decision.cause(LoadResolved(held, None))
         if held.parent:
             follow(decision, held)
+            if _may_close_ring(decision.catalog, held.parent):
+                decision.request(provider, Probe(held.id, held.parent, held.id, [], holds=True))
+
+
+# Rings of holds: a resource that is its own part would never be released.
+#
+# What a load callback loads is held before its own resource is. So a ring has a part that a loaded resource has loaded,
+# in a status callback or a thread. Of these, take the one that was answered last: all other parts of the ring are held
+# by then. So a probe that starts at its answer finds the ring. Where the resource is no part of any other, none starts.
+
+
+def _may_close_ring(catalog: Catalog, parent: str) -> bool:
+    """Return whether a new part of this resource may hold it: it is loaded, and itself a part."""
+    resource = catalog.resources.get(parent)
+    is_loaded = resource is not None and resource.phase is not Phase.LOADING
+    return is_loaded and any(query.parent for query in catalog.queries_of(parent))
+
+
+def break_ring(decision: Decision, query_id: str, ring: list[str]) -> None:
+    """Release the part that closes a ring of holds. Its holder hears FATAL, as of any part that is taken away."""
+    held = decision.catalog.held.get(query_id)
+    if held is None or held.hold is not HELD or held.id in decision.catalog.ending:
+        return
+    why = failures.ring_of_holds(ring, held)
+    decision.cause(RingBroken(why))
+    lose(decision, held, f"ring:{held.id}", why)
+    decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def asked_anew(held: Held) -> Held:

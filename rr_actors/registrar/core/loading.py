@@ -28,6 +28,7 @@ from rr_actors.registrar.core.callback_runs import (
     running,
     start_load,
 )
+from rr_actors.registrar.core.holding import break_ring
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, withdraw
@@ -153,7 +154,8 @@ def join(catalog: Catalog, message: Load) -> ServedQuery | None:
 def _ring_of_holds(catalog: Catalog, message: Load, resource_id: str) -> list[str]:
     """Return the resources from one that is loaded to the parent of a Load that would make it its own part, or [].
 
-    Such a ring of holds would never be released. Only rings within this registrar are seen here.
+    Such a ring of holds would never be released. Only rings within this registrar are seen here; those over several are
+    found when they have closed (core/holding.py).
     """
     if message.origin != catalog.name or not message.parent or catalog.resources[resource_id].phase is not LOADED:
         return []
@@ -292,7 +294,21 @@ def probe(decision: Decision, message: Probe) -> None:
     query = decision.catalog.queries.get(message.query_id)
     resource_id = query.resource_id if query is not None else parked_on(decision.catalog, message.query_id)
     if resource_id is not None:
-        chase(decision, decision.catalog.resources[resource_id], message)
+        go_on = _chase_holds if message.holds else chase
+        go_on(decision, decision.catalog.resources[resource_id], message)
+
+
+def _chase_holds(decision: Decision, resource: Resource, message: Probe) -> None:
+    """Pass a probe on from this resource to all its parts, once. Back at the waiter, it has found a ring of holds."""
+    catalog = decision.catalog
+    ring = [*message.ring, catalog.origin_of(resource)]
+    if resource.id == message.waiter:
+        break_ring(decision, message.blocked, ring)
+    elif len(ring) <= _RING_LIMIT and catalog.chased.get(resource.id) != message.blocked:
+        decision.note(catalog.chased, resource.id, message.blocked)
+        for held_id in parts_of(decision, resource.id):
+            held = catalog.held[held_id]
+            decision.request(held.registrar, replace(message, query_id=held.id, ring=ring))
 
 
 def chase(decision: Decision, resource: Resource, message: Probe) -> None:

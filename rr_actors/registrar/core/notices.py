@@ -122,6 +122,8 @@ def drop_resource(decision: Decision, resource: Resource) -> None:
         if not is_own(start.notice):
             dealt_with(decision, ("resource", resource.id, start.notice.event))
     forget_runs(decision, resource.id)
+    if decision.catalog.chased:
+        decision.forget(decision.catalog.chased, resource.id)
     end_revocation(decision, resource.id)
     decision.drop(resource)
 

@@ -62,6 +62,7 @@ class EffectRunner:
             e.Happened: self._happened,
             e.Died: self._died,
             e.Acquitted: self._acquitted,
+            e.RingBroken: self._ring_broken,
         }
 
     def do(self, effects: Sequence[Effect]) -> None:
@@ -280,6 +281,9 @@ class EffectRunner:
         node.accused.discard(self._registrar.name)
         if not node.accused:
             node.on_acquitted()
+
+    def _ring_broken(self, effect: e.RingBroken) -> None:
+        logger.error("%s: %s", self._registrar.name, effect.why)
 
 
 def _nothing() -> None:

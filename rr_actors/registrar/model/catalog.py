@@ -153,6 +153,7 @@ class Catalog:
       `unsent`: queries whose priority has changed while the provider's link was not reconciled.
       `listed`: by provider, the epoch of its run that made the last list.
     - `deserted`: resources that were loading when their last query ended, until the engine has looked at them.
+    - `chased`: by resource, the query whose probe for rings of holds has passed it last.
     - `shut`: why this registrar loads nothing any more for others (False), or for itself (True): it is being closed.
 
     Args:
@@ -203,6 +204,7 @@ class Catalog:
         self.closings: dict[str, Closing] = {}
         self.unread: dict[str, str] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}
+        self.chased: dict[str, str] = {}
         self.told: dict[str, bool] = dict.fromkeys(self.notices, False)
         self.behind: dict[str, int] = {}
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}

@@ -161,6 +161,12 @@ class Acquitted(Effect, frozen=True):
     """Say that none of the callbacks that ran when the process before died ends the process: the death counts."""
 
 
+class RingBroken(Effect, frozen=True):
+    """Say that a part was released that held its own whole."""
+
+    why: str
+
+
 Happening = Literal[
     "loaded",
     "load_failed",

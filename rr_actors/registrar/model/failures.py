@@ -178,6 +178,12 @@ def circular(ring: list[str], blocked: Held) -> Failure:
     return Failure("CircularDependency", text, {"ring": ring})
 
 
+def ring_of_holds(ring: Sequence[str], held: Held) -> str:
+    """Return why a resource loses a part that holds it, directly or through its own parts."""
+    names = " -> ".join([ring[-1], *ring])
+    return f"resource {held.parent} was its own part: {names}; released is its query {held.id} on {ring[0]}"
+
+
 LET_GO = Failure("LoadError", "released before its load arrived")
 """The failure of a Load that arrives after the Unload of the same query."""
 

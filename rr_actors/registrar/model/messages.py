@@ -152,12 +152,15 @@ class Probe(msgspec.Struct, frozen=True, array_like=True, tag=13):
 
     `waiter` is a resource that is being loaded, and `blocked` the query on which it waits. `ring` holds the
     "registrar/server" names passed so far. A probe that comes to the waiter has found a ring.
+
+    `holds`: does it hold `waiter`, directly or not? That one is loaded, and holds `blocked` as a part.
     """
 
     query_id: str
     waiter: str
     blocked: str
     ring: list[str]
+    holds: bool = False
 
 
 class Gone(msgspec.Struct, frozen=True, array_like=True, tag=14):
