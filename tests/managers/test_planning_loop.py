@@ -101,6 +101,24 @@ def test_a_step_is_in_flight_until_its_end_is_handled(
     assert watched.looks.get(timeout=60) == {}
 
 
+def test_a_step_is_withdrawn_at_its_limit_and_the_loop_does_not_look_meanwhile(watched: Watched) -> None:
+    watched.quiet()
+    reply: Reply[str] = Reply()
+    reply.withdraw = _nothing
+    watched.loop.tell(lambda: watched.loop.begin("a", "loads a", lambda: reply, watched.ended.put, limit_s=0.1))
+    assert watched.ended.get(timeout=60) == Ended(is_withdrawn=True)
+    assert reply.cancelled()
+    assert [watched.looks.get(timeout=60) for _ in range(2)] == [{"a": "loads a"}, {}]
+    assert watched.looks.empty()
+
+
+def test_a_step_that_ends_within_its_limit_is_not_withdrawn(watched: Watched) -> None:
+    reply: Reply[str] = Reply()
+    watched.loop.tell(lambda: watched.loop.begin("a", "loads a", lambda: reply, watched.ended.put, limit_s=60))
+    reply.set("on")
+    assert watched.ended.get(timeout=60) == Ended("on")
+
+
 def test_a_step_that_cannot_begin_ends_with_the_error(watched: Watched) -> None:
     def start() -> Any:
         raise rr.LoadFailed("too many")

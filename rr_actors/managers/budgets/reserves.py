@@ -191,13 +191,14 @@ class Reserves:
         reserve = self._all[key]
         request = NO_FIELDS if reserve.request is None else reserve.request
         priority = min(priority, self._registrar.config.max_priority)
-        load = functools.partial(self._registrar.load, reserve.server, request, timeout_s=_RESERVE_S)
+        load = functools.partial(self._registrar.load, reserve.server, request, timeout_s=None)
         start = functools.partial(load, priority=priority, block=False)
-        self._planning.begin(("start", key), key, start, functools.partial(self._started, key, reserve, priority))
+        started = functools.partial(self._started, key, reserve, priority)
+        self._planning.begin(("start", key), key, start, started, limit_s=_RESERVE_S)
 
     def _started(self, key: str, reserve: Reserve, priority: int, ended: Ended) -> None:
         if ended.value is None:
-            self._note_failure(key, text_of(ended.error) if ended.error is not None else "withdrawn")
+            self._note_failure(key, text_of(ended.error) if ended.error is not None else f"not within {_RESERVE_S:g} s")
             return
         one = self._on[key] = _On(ended.value, time.monotonic(), priority)
         self._failed.forget(key)

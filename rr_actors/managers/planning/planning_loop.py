@@ -26,6 +26,7 @@ import msgspec
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import RegistrarDown, RrError, text_of
 from rr_actors.base.reporting.log import Log
+from rr_actors.runtime.time_limits import RunningLimit
 
 logger = Log("rr_actors.managers")
 
@@ -44,12 +45,16 @@ class Ended(msgspec.Struct, frozen=True):
 
 
 class Step(msgspec.Struct, Generic[W]):
-    """A step in flight: what it is about, when it began by the monotonic clock, and the reply that ends it."""
+    """A step in flight: what it is about, when it began by the monotonic clock, and the reply that ends it.
+
+    `limit`: what is left of its time; None: it has no limit.
+    """
 
     what: W
     since: float
     reply: Reply[Any] | None = None
     is_withdrawn: bool = False
+    limit: RunningLimit | None = None
 
 
 class PlanningLoop(Generic[K, W]):
@@ -114,7 +119,9 @@ class PlanningLoop(Generic[K, W]):
 
     # -- steps, on the thread --------------------------------------------------------------------------------------
 
-    def begin(self, key: K, what: W, start: Callable[[], Any], ended: Callable[[Ended], object]) -> None:
+    def begin(
+        self, key: K, what: W, start: Callable[[], Any], ended: Callable[[Ended], object], limit_s: float | None = None
+    ) -> None:
         """Begin a step. It is in flight until `ended` is called on the thread, and then the loop looks.
 
         Args:
@@ -122,6 +129,7 @@ class PlanningLoop(Generic[K, W]):
             start: begins it without waiting, and returns its Reply: ``registrar.load(..., block=False)``. If it raises
                 an RrError, the step ends with that.
             ended: called with the outcome when the step is not in flight any more.
+            limit_s: seconds after which the step is withdrawn, without the time in which this process stood still.
 
         Raises:
             RuntimeError: a step of this key is in flight: a defect of the caller.
@@ -132,7 +140,7 @@ class PlanningLoop(Generic[K, W]):
         except RrError as error:
             self._happened.put(functools.partial(self._end, key, ended, Ended(error=error)))
             return
-        step.reply = reply
+        step.reply, step.limit = reply, None if limit_s is None else RunningLimit(limit_s)
 
         def done(reply: Reply[Any]) -> None:  # on another thread
             self._happened.put(lambda: self._end(key, ended, _outcome(reply)))
@@ -208,14 +216,32 @@ class PlanningLoop(Generic[K, W]):
 
     def _take_all(self, until: float | None) -> bool:
         """Wait until something happens or is due, and handle all that has happened. Return False at the end."""
-        timeout_s = None if until is None else min(max(0.0, until - time.monotonic()), _LONGEST_S)
         with contextlib.suppress(queue.Empty):
-            happened = self._happened.get(timeout=timeout_s)
+            happened = self._next(until)
             while happened is not None:
                 happened()
                 happened = self._happened.get_nowait()
             return False
         return True
+
+    def _next(self, until: float | None) -> Callable[[], object] | None:
+        """Wait, and return what happens next; raise queue.Empty when it is time to look. Withdraw what is overdue."""
+        while True:
+            limited = [
+                (key, step.limit) for key, step in self._in_flight.items() if step.limit and not step.is_withdrawn
+            ]
+            for key, limit in limited:
+                if limit.is_over():
+                    self.withdraw(key)
+            waits = [
+                _LONGEST_S if until is None else until - time.monotonic(),
+                *(limit.slice_s for _, limit in limited),
+            ]
+            try:
+                return self._happened.get(timeout=max(0.0, min(waits)))
+            except queue.Empty:
+                if min(waits) >= waits[0]:
+                    raise
 
     def _close(self, error: BaseException | None) -> None:
         """End what waits for the loop, and make the manager fail if there is an error."""
