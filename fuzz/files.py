@@ -10,7 +10,7 @@ from rr_actors.actors.actor import Actor
 from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import ConfigError
 from rr_actors.managers.components import read_registry
-from rr_actors.managers.reliability import FALL, Reliabilities
+from rr_actors.managers.planning.reliability import FALL, Reliabilities
 from rr_actors.managers.robots import read_robots
 from rr_actors.supervision.core.specs import Supervisor
 

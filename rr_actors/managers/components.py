@@ -32,10 +32,10 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
 from rr_actors.managers.planning.last_good import last_good_file, path_of
+from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import GIVEN_UP, Retries
 from rr_actors.managers.program_checks import parameter_faults, program_faults
 from rr_actors.managers.programs import RunProgram
-from rr_actors.managers.reliability import Reliabilities
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current

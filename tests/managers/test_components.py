@@ -12,7 +12,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.managers import Components, LoadComponent, Programs
 from rr_actors.managers.components import read_registry
-from rr_actors.managers.reliability import FALL, LEAST, RISE_S, Reliabilities
+from rr_actors.managers.planning.reliability import FALL, LEAST, RISE_S, Reliabilities
 from rr_actors.managers.templates import fill
 from support import Calls, child, eventually, kill, wait_respawned
 from support_programs import running_programs

@@ -35,8 +35,8 @@ from rr_actors.managers.choices.trials import FAILED, Trials
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
 from rr_actors.managers.planning.hedging import HEDGE_S, first_of
 from rr_actors.managers.planning.kept_record import KeptRecord
+from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import GIVEN_UP, SOON_S
-from rr_actors.managers.reliability import Reliabilities
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status

@@ -11,7 +11,7 @@ from rr_actors.managers.choices.alternatives import Alternative
 from rr_actors.managers.choices.chosen import Choose
 from rr_actors.managers.choices.labelled import Labelled
 from rr_actors.managers.choices.matching import ranked, why_none
-from rr_actors.managers.reliability import Reliabilities
+from rr_actors.managers.planning.reliability import Reliabilities
 
 
 class Offers:
