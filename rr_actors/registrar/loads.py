@@ -36,9 +36,9 @@ from rr_actors.registrar.model.rows import STANDBY, Held, Hold, Resource
 from rr_actors.registrar.progress_hearers import Hearing, HearsHere, HearsInWorkers, HearsOnThisLoop, hearer_of
 from rr_actors.registrar.queries import Query, Views, loaded, loaded_directly
 from rr_actors.runtime.callback_errors import described
-from rr_actors.runtime.gates import LettingIn
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until
+from rr_actors.runtime.workers import LettingIn
 from rr_actors.wire.name_service import Presence
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Exchange

@@ -26,11 +26,10 @@ from rr_actors.registrar.engine.status import Status, state_of, status_of
 from rr_actors.registrar.model.rows import OK, Held, Notice, Phase, ServerType, State
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.event_loop import check_asyncio, check_may_block
-from rr_actors.runtime.gates import LettingIn
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.user_loop import CallersLoop
-from rr_actors.runtime.workers import is_async
+from rr_actors.runtime.workers import LettingIn, is_async
 from rr_actors.streams.stream import Keep, Place, Stream, streams_in
 from rr_actors.streams.stream_reader import Source, StreamReader
 from rr_actors.streams.wake import Wake

@@ -27,9 +27,9 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import traceback_of
 from rr_actors.runtime import event_loop
 from rr_actors.runtime.callback_errors import log_raised, raised_by
-from rr_actors.runtime.gates import LettingIn, letting_in
 from rr_actors.runtime.shielding import is_interruptible, shielded
 from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.workers import LettingIn, letting_in
 
 if TYPE_CHECKING:
     from types import TracebackType

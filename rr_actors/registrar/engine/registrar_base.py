@@ -35,8 +35,8 @@ from rr_actors.registrar.model.effects import AnswerCall, Effect
 from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, Message, Noticed
 from rr_actors.registrar.model.rows import Change, Held, Notice
 from rr_actors.registrar.model.store import Store
-from rr_actors.runtime.gates import Gate
 from rr_actors.runtime.thread_rules import on_loop, with_lock
+from rr_actors.runtime.workers import Gate
 from rr_actors.streams.publishers import Publishers
 from rr_actors.wire.transport import Exchange, Hello
 

@@ -72,11 +72,10 @@ from rr_actors.registrar.model.rows import (
     State,
 )
 from rr_actors.runtime.callback_errors import Raised, described, log_raised, traceback_of
-from rr_actors.runtime.gates import Gate
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.time_limits import Probes
 from rr_actors.runtime.user_loop import COROUTINE, Done, closing
-from rr_actors.runtime.workers import is_async
+from rr_actors.runtime.workers import Gate, is_async
 from rr_actors.streams.publisher import Publisher
 from rr_actors.streams.stream import StreamNews
 from rr_actors.wire.frames import ADVICE
