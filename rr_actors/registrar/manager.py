@@ -70,9 +70,9 @@ class Manager(Actor):
 
     Then one of them runs at a time, as the messages of every other actor do: load, unload, status, recover, usage,
     health, pause and resume callbacks, status callbacks of what it holds, on_receive, and methods that are called by a
-    proxy. One that waits for a load, an unload or a reply lets another in meanwhile, so what `self` has may have
-    changed when it goes on. on_start and on_stop may run beside them, so that on_stop can end one that hangs. Where
-    one server alone needs it, ``@rr.server(..., at_once=1)`` does the same for that.
+    proxy. One that waits for a load, an unload or a reply lets another in meanwhile. What `self` has may differ after
+    that. on_start and on_stop may run beside them, so that on_stop can end one that hangs. Where one server alone
+    needs it, ``@rr.server(..., at_once=1)`` does the same for that.
 
     A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers: their
     recover callbacks begin, and the manager waits for them, though not for long. ``on_start`` runs, with
