@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from rr_actors.base.checks import check_number, examined
 from rr_actors.base.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
 from rr_actors.base.names import check_name
-from rr_actors.base.redefined import warn_of_redefined
+from rr_actors.base.notebook import warn_of_redefined
 from rr_actors.registrar.engine.server import (
     RECOVER_S,
     ROLES,

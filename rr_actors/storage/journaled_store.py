@@ -25,8 +25,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Put, apply
 from rr_actors.storage.damage import Damage
-from rr_actors.storage.journal_rows import check_lengths, check_numbers, decoded
-from rr_actors.storage.sql_tables import Meta, net_of
+from rr_actors.storage.sql_tables import Meta, check_lengths, check_numbers, decoded, net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segments_among
 from rr_actors.storage.witness import segment_prefix
 

@@ -94,7 +94,7 @@ class Spare:
         """Return how many frames of the new copy SQLite takes when it reads all of it."""
         self._write(self._copy, _empty())
         try:
-            with _reading(self._path.with_name(self._copy)) as connection:
+            with _reading(self._path.with_name(self._copy), "mode=ro") as connection:
                 connection.execute("PRAGMA schema_version").fetchall()
                 return _committed(self._folder.read(f"{self._copy}-shm"))
         except sqlite3.DatabaseError as error:  # without its -wal, one page is no database
@@ -231,16 +231,14 @@ def _empty() -> bytes:
 
 def _meta(path: Path, how: str) -> sql_tables.Meta | None:
     try:
-        with contextlib.closing(
-            sqlite3.connect(f"{path.as_uri()}?{how}", uri=True, isolation_level=None)
-        ) as connection:
+        with _reading(path, how) as connection:
             return sql_tables.read_meta(connection)
     except (sqlite3.Error, Damage):  # the reading of the whole catalog says what is wrong
         return None
 
 
-def _reading(path: Path) -> contextlib.closing[sqlite3.Connection]:
-    return contextlib.closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True, isolation_level=None))
+def _reading(path: Path, how: str) -> contextlib.closing[sqlite3.Connection]:
+    return contextlib.closing(sqlite3.connect(f"{path.as_uri()}?{how}", uri=True, isolation_level=None))
 
 
 def _committed(shm: bytes) -> int:

@@ -32,7 +32,7 @@ from rr_actors.base.errors import (
     shown,
     text_of,
 )
-from rr_actors.base.redefined import note_started
+from rr_actors.base.notebook import note_started
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import trace_of
 from rr_actors.registrar.engine.server import check_not_own, serving

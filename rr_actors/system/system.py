@@ -36,7 +36,7 @@ from rr_actors.base.errors import (
     shown,
 )
 from rr_actors.base.names import CLIENTS, check_name
-from rr_actors.base.redefined import note_started, warn_of_redefined
+from rr_actors.base.notebook import note_started, warn_of_redefined
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps

@@ -19,10 +19,10 @@ import msgspec
 
 from rr_actors.base import __version__
 from rr_actors.base.config import SystemConfig
+from rr_actors.base.scarcity import group_limit
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import interpreter
-from rr_actors.runtime.group_limits import group_limit
 from rr_actors.runtime.processes.control_groups import CONTROLLERS, ControlGroups
 from rr_actors.supervision.core.specs import ChildSpec
 from rr_actors.system.system import System

@@ -34,8 +34,7 @@ import msgspec
 
 from rr_actors.base.errors import MailboxFull, Unavailable, few, text_of
 from rr_actors.base.pickling import Bytes, Large
-from rr_actors.base.scarcity import wanted_by
-from rr_actors.runtime.group_limits import memory_bytes
+from rr_actors.base.scarcity import memory_bytes, wanted_by
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES
 from rr_actors.wire.segment_slots import PAGE_BYTES, USED, Head, Slot, Slots
 from rr_actors.wire.shared_values import Claim

@@ -37,10 +37,10 @@ SELDOM = {
 }  # fmt: skip
 """What only some programs need, or only the command line, the managers for external programs, a file to be read."""
 
-MOST_MODULES = 347
+MOST_MODULES = 344
 """Each takes a quarter of a millisecond. Ten are the console's, which each system has by default; one is the web
-page's, five are for notebooks, two verify SQLite's write-ahead file, and ten are the two ends of streams. 128 of them
-come with asyncio, sqlite3, msgspec, pykka and cloudpickle; with Python 3.12, 129."""
+page's, four draw pictures for notebooks, and ten are the two ends of streams. 128 of them come with asyncio, sqlite3,
+msgspec, pykka and cloudpickle."""
 
 BARE_MODULES = 12
 """Of the import alone: what decides which module a name is in, and leaves the garbage collector alone meanwhile."""

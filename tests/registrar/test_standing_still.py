@@ -79,7 +79,7 @@ class Limited(rr.Manager):
 
 
 class Standing:
-    """A system with one manager, which the test stops at a step of a callback and lets go on."""
+    """A system with one manager, which the test stops at a step of a callback and then resumes."""
 
     def __init__(self, system: rr.System, workshop: Workshop) -> None:
         self.system, self.workshop = system, workshop
