@@ -138,6 +138,42 @@ GIVEN_UP_WITH_A_FULL_DISK: list[Step] = [
 ]
 
 
+# A thread gave its load up when the link had brought the list in which the load is held: that came first, and then the
+# load was let go.
+GIVEN_UP_BEHIND_A_LIST: list[Step] = [
+    ("serve", "r0"),
+    ("register", "r0", "s1"),
+    ("load", "q1", "app", "r0", "s1", b"q", True),
+    ("wake", "app", 1000000),
+    ("dial", "app", "r0"),
+    ("net", "app", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("net", "app", "r0", 1),
+    ("load", "q2", "app", "r0", "s1", b"p", False),
+    ("wake", "app", 1000000),
+    ("net", "app", "r0", 0),
+    ("net", "app", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("call", "r0", "load", "q2", 1, "ok"),
+    ("load", "q4", "r0", "r0", "s0", b"q", True),
+    ("wake", "r0", 1000000),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r0", 1),
+    ("wake", "r0", 1000000),
+    ("load", "q9", "r0", "r0", "s1", b"p", True),
+    ("line", "q9", 0, "", None, None),
+    ("cut", "r0", "r0", 2, 0),
+    ("net", "r0", "r0", 1),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r0", 1),
+    ("tire", "r0", "q9", ""),
+]
+
+
 # Somebody tired of an unload that was owed, in a wake-up whose commit failed.
 OVERDUE_WITH_A_FULL_DISK: list[Step] = [
     ("register", "r0", "s0"),
@@ -613,7 +649,8 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
         6044783824402,
         DECIDED_FOR_A_LINK_TO_THE_SAME_RUN,
     ),
-    "a load told to be held that was given up": (1384620891981, GIVEN_UP_WITH_A_FULL_DISK),
+    "a load told to be held that was given up": (1384620896695, GIVEN_UP_BEHIND_A_LIST),
+    "a load given up with a full disk": (1384620891981, GIVEN_UP_WITH_A_FULL_DISK),
     "a release that is owed said to be refused": (1099511627785, OVERDUE_WITH_A_FULL_DISK),
     "what came by both ways answered by one": (1099511628097, ASKED_BY_BOTH_WAYS),
     "no dedupe of query ids": (322, LOADED_BY_TWO_LINKS),

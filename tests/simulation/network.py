@@ -157,6 +157,7 @@ class Network(WorldState):
         self.ledger.cut_short.update((run.id, run.number) for run in registrar.runs.values() if run.kind == "reload")
         registrar.fresh()
         self.ledger.crashed(name)
+        self.ledger.forget_ends(id for id, asker in self.asker.items() if asker == name)
         if becomes != "gone":
             self.todo.add(("up", name))
         return True

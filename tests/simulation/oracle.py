@@ -185,15 +185,17 @@ class Ledger:
 
     def told_early(self, query_ids: Iterable[str]) -> None:
         """Those who asked were told in their time, and the disk was full: a crash forgets that they were."""
-        early = [id for id in query_ids if self.fate.get(id) == "failed"]
-        self.early.update(early)
-        self.fate.update(dict.fromkeys(early, "unanswered"))
+        self.early.update(id for id in query_ids if self.fate.get(id) == "failed")
 
     def withdrawn(self, query_ids: Iterable[str]) -> None:
         """The disk has by now that these loads were given up."""
+        self.early.difference_update(query_ids)
+
+    def forget_ends(self, query_ids: Iterable[str]) -> None:
+        """The process of those who asked has died. Of loads that the disk has not, they are not told again."""
         for id in self.early.intersection(query_ids):
             self.early.discard(id)
-            self.fate[id] = "failed"
+            self.fate[id] = "unanswered"
 
     def letting(self, query_id: str) -> None:
         """Somebody lets the query go, and is not answered yet."""
