@@ -759,7 +759,7 @@ class Views:
         """
         catalog = self._actor.catalog
         held, client = catalog.held.get(query.id), self._actor.clients.get(query.registrar)
-        return held is not None and held.seq > catalog.since and client is not None and client.has_run_since(held.id)
+        return held is not None and held.seq > catalog.since and client is not None and client.has_run_since(held.seq)
 
     def codecs_of(self, server_id: str) -> tuple[Codec, Codec]:
         """Return the codecs of a server's requests and responses, made of the types that it sent. Not on the loop."""

@@ -129,8 +129,9 @@ class GraphEngine:
 
     @property
     def run(self) -> GraphRun:
-        """The run as it is on disk."""
-        return self._run
+        """The run as it is on disk. It waits while a transition is written: who has heard of that finds it here."""
+        with self._changing:
+            return self._run
 
     def begin(
         self, event: Begin, loaded: threading.Event | None = None, word: Callable[[], Word] = lambda: "run"

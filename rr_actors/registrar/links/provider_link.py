@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import time
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,7 +24,7 @@ import msgspec
 
 from rr_actors.actors.turns import CLOSED, Delivery, TurnActor
 from rr_actors.base.errors import CatalogError, RegistrarDown, RrError, Unavailable, UnknownRegistrar
-from rr_actors.base.names import PROVIDERS, ServerId, made_at, new_id
+from rr_actors.base.names import PROVIDERS, ServerId, new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.failure import failure_of
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
@@ -110,7 +109,7 @@ class ProviderLink(TurnActor):
         self._known: digests.HeldRows | None = None  # the rows held there, and their digests, when last looked at
         self._number = registrar.epoch << 32  # the number of the last Fetch
         self._linked = False  # whether there was ever a link
-        self._lost_at = 0.0  # when the last link ended, by the clock that ids have
+        self._lost_seq = 0  # the running number at which the last link ended (RegistrarState.sequence)
         self._gone = False  # whether the registrar knows that the provider is gone for good
         self._described: set[str] = set()
         self.undescribed: set[str] = set()
@@ -175,13 +174,13 @@ class ProviderLink(TurnActor):
     # -- for threads ---------------------------------------------------------------------------------------------
 
     @any_thread
-    def has_run_since(self, query_id: str) -> bool:
-        """Return whether the provider is up, and no link to it has ended since the load of this id began.
+    def has_run_since(self, seq: int) -> bool:
+        """Return whether the provider is up, and no link to it has ended since the query of this number was asked for.
 
         Then the process that has answered the load runs.
         """
         is_up = self.link is not None and self._registrar.catalog.up.get(self.provider) == self.opened
-        return is_up and made_at(query_id) > self._lost_at
+        return is_up and seq > self._lost_seq
 
     @any_thread
     def _dial_for_thread(self, timeout_s: float) -> Exchange | None:
@@ -217,7 +216,7 @@ class ProviderLink(TurnActor):
         self._want()
 
     def _drop_link(self) -> None:
-        link, self.link, self._lost_at = self.link, None, time.time()
+        link, self.link, self._lost_seq = self.link, None, next(self._registrar.sequence)
         self.connections.close()
         if link is not None:
             link.close()
@@ -438,7 +437,7 @@ class ProviderLink(TurnActor):
             logger.info("%s: link to %s lost: %s", self._registrar.name, self.provider, reason)
         if self.link is not link and self.link is not None:
             return
-        self.link, self._lost_at = None, time.time()
+        self.link, self._lost_seq = None, next(self._registrar.sequence)
         self.connections.close()
         if closed:
             return
