@@ -40,9 +40,9 @@ _LABELS = 60  # up to so many nodes always have labels; of more nodes, a label a
 _TEXT = 34
 _LABEL_LAYOUT = """() => ({
   hideOverlap: true,
-  width: Math.max(24, 0.85 * (document.querySelector(".rr-graph").clientWidth - 16) / %s - 22),
+  width: Math.max(24, 0.75 * (document.querySelector(".rr-graph").clientWidth - 16) / %s - 14),
 })"""
-"""A label has the room of one column: it ends with dots before the next one, or before the picture's edge."""
+"""A label ends with dots at the edge of its box: a node of a box's last column is 0.75 columns left of that edge."""
 _OPENED = 40  # resources of a server
 _NEIGHBOURS = 100
 _LOOK_S = 20.0
