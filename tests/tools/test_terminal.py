@@ -492,6 +492,15 @@ def test_a_thread_that_follows_ends_when_the_link_is_closed(start: Start, state_
         link.ask(questions.ListChildren())
 
 
+def test_following_ends_when_the_link_is_closed_as_soon_as_it_has_reached_the_system(
+    start: Start, state_dir: Path
+) -> None:
+    start()
+    link = ConsoleLink(state_dir)
+
+    assert "has stopped" in link.follow(lambda _welcome: link.close(), lambda _part: None)
+
+
 class Crowd(ConsoleLink):
     """A system of 500 children and 100,000 resources that notes what it is asked for."""
 

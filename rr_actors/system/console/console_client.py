@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import socket
 import sys
 import threading
@@ -170,19 +169,14 @@ class ConsoleClient:
         return self._fed(tick_s)
 
     def _fed(self, tick_s: float | None) -> Iterator[Any]:
-        poll = select.poll()
-        poll.register(self, select.POLLIN)
         while True:
-            if tick_s is not None and not self._answers and not poll.poll(tick_s * 1000):
-                yield c.Events([])
-                continue
             try:
-                answer = self._receive(None)
+                answer = self._next(tick_s)
             except NotRunning:
                 return
             if isinstance(answer, c.Refused):
                 raise error_of(answer.failure)
-            yield answer
+            yield c.Events([]) if answer is None else answer
 
     def is_open(self) -> bool:
         """Return whether neither side has closed the connection; the thread that waits for answers asks between two."""
@@ -192,10 +186,6 @@ class ConsoleClient:
             return True
         except OSError:  # closed here
             return False
-
-    def fileno(self) -> int:
-        """Return the descriptor of the connection, which is readable when an answer is there."""
-        return self._socket.fileno()
 
     def close(self) -> None:
         """Close the connection; a call that waits in another thread raises NotRunning. A second close does nothing."""
@@ -224,13 +214,20 @@ class ConsoleClient:
             return  # the console has refused the connection: its answer is read next
 
     def _receive(self, timeout_s: float | None) -> c.Message:
+        answer = self._next(timeout_s)
+        if answer is None:
+            raise Unavailable(f"{self._who()} has not answered within {timeout_s:g} s")
+        return answer
+
+    def _next(self, timeout_s: float | None) -> c.Message | None:
+        """Return the next answer, or None if none has come within `timeout_s`. Another thread may close the socket."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while not self._answers:
             try:
                 self._socket.settimeout(None if deadline is None else max(0.001, deadline - time.monotonic()))
                 data = self._socket.recv(2**18)
-            except TimeoutError as error:
-                raise Unavailable(f"{self._who()} has not answered within {timeout_s:g} s") from error
+            except TimeoutError:
+                return None
             except OSError as error:
                 raise NotRunning(f"{self._who()} has ended: {error.strerror}") from error
             if not data:
