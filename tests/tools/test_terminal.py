@@ -498,7 +498,9 @@ def test_following_ends_when_the_link_is_closed_as_soon_as_it_has_reached_the_sy
     start()
     link = ConsoleLink(state_dir)
 
-    assert "has stopped" in link.follow(lambda _welcome: link.close(), lambda _part: None)
+    ended = link.follow(lambda _welcome: link.close(), lambda _part: None)
+
+    assert ended == "the connection to the system is closed"
 
 
 class Crowd(ConsoleLink):

@@ -12,6 +12,7 @@ from rr_actors.system.console.console_messages import Events, Follow, Missed, We
 from rr_actors.system.console.console_view import Verb
 
 _A = TypeVar("_A")
+_CLOSED = "the connection to the system is closed"
 _LONGEST_S = 100.0  # for a command: longer than any of them may take
 
 
@@ -48,17 +49,18 @@ class ConsoleLink:
 
         It ends when the system does, or when the link is closed; at once if no system runs, or if it refuses.
         """
+        ended = f"the system in {self.state_dir} has stopped"
         try:
             with self._connections.open() as client:
                 found(client.welcome)
                 for part in client.follow(Follow()):
                     hear(part)
         except NotRunning:
-            return f"no system runs in {self.state_dir}"
+            ended = f"no system runs in {self.state_dir}"
         except RrError as error:
-            return str(error)
-        return f"the system in {self.state_dir} has stopped"
+            ended = str(error)
+        return _CLOSED if self._connections.is_closed else ended
 
     def close(self) -> None:
         """Close all connections. Calls that wait in other threads raise NotRunning. A second call does nothing."""
-        self._connections.close("the connection to the system is closed")
+        self._connections.close(_CLOSED)
