@@ -187,6 +187,10 @@ class ConsoleClient:
         except OSError:  # closed here
             return False
 
+    def fileno(self) -> int:
+        """Return the descriptor of the connection, which is readable when an answer is there."""
+        return self._socket.fileno()
+
     def close(self) -> None:
         """Close the connection; a call that waits in another thread raises NotRunning. A second close does nothing."""
         with contextlib.suppress(OSError):  # the connection is closed already, or the other side has gone
