@@ -265,8 +265,9 @@ class Loading(InFlight[Query]):
             self._loads.views.forget(self.query.id)
         if self.hearing is not None:
             self._loads.actor.listeners.forget(self.query.id)
-            self.hearing.ended()
         self.end(error, self.query)
+        if self.hearing is not None:
+            self.hearing.ended()  # last: the thread that it wakes reads at once how the load has ended
 
     def unawaited(self) -> None:
         """Withdraw the load, or release the query, which nobody has got."""

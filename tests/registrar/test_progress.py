@@ -403,6 +403,20 @@ def test_a_callable_that_raises_is_logged_once_and_harms_nothing(
     assert app.stats()["callback_failures"] == 1
 
 
+def test_a_thread_that_is_woken_by_the_end_of_its_load_finds_how_it_has_ended(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wake = HearsHere.ended
+
+    def wake_and_pause(self: HearsHere) -> None:
+        wake(self)
+        time.sleep(0.1)  # the thread goes on before the loop does
+
+    monkeypatch.setattr(HearsHere, "ended", wake_and_pause)
+    serve(provider, "camera")
+    assert app.load("provider/camera", "front", progress=lambda _: None).request == "front"
+
+
 def test_an_interrupt_in_the_callable_interrupts_the_load(app: rr.Registrar, provider: rr.Registrar) -> None:
     unloaded = serve(provider, "camera", lambda _: rr.current().progress(0.5))
 
