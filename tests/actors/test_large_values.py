@@ -155,11 +155,13 @@ def test_proxies_carry_large_values(keeper: Any) -> None:
 
 
 def test_any_number_of_values_takes_few_descriptors(keeper: Any) -> None:
+    gc.collect()
+    before = memfds()  # a test before this one may have left some to the collector
     held = [keeper.ask(("make", 100_000)) for _ in range(200)]
     for each in held:
         keeper.tell(("keep", each))
     assert keeper.ask(("fds", None)) <= 6
-    assert memfds() <= 6
+    assert memfds() <= before + 6
 
 
 def test_numpy_arrays_arrive_writable(keeper: Any) -> None:

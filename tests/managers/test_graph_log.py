@@ -104,6 +104,7 @@ def test_a_graph_with_a_damaged_log_is_lost_by_name_and_one_without_leaves_none(
     graph = chain(25, place=str(tmp_path), waits=20)
     with app.load("actions/graph", RunGraph(graph)) as query:
         eventually(lambda: query.response["actions"][20]["state"] == "RUNNING", LIMIT_S, "the response")
+        eventually(lambda: logged(directory) == set(), LIMIT_S, "no log: the response has all")
         (directory / f"graph-{query.resource_id}.log").write_bytes(b"x" * 100)
         (directory / "graph-gone.log").write_bytes(b"x" * 100)
         wait_respawned(system, "actions", kill(system, "actions"))

@@ -157,11 +157,13 @@ def test_a_slot_is_used_again_when_its_value_is_dropped_and_not_before() -> None
 
 
 def test_thousands_of_values_take_one_descriptor_and_bounded_memory() -> None:
+    gc.collect()
+    before = len(memfds())  # a test before this one may have left some to the collector
     ends = Ends(limit=2**22)
     for number in range(3_000):
         assert ends.send(box(LARGE, number % 100 + 1)).bytes == box(LARGE, number % 100 + 1).bytes
     assert ends.resident <= 3 * LARGE
-    assert len(memfds()) <= 3
+    assert len(memfds()) <= before + 3
     ends.close()
 
 
