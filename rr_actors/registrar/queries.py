@@ -95,6 +95,10 @@ class _Statuses(deque[Status]):
         self.append(status)
 
 
+AllStreams = Callable[["Query[Any]"], Callable[[], bool]]
+"""For each reader of a query, it returns a function: whether nobody will open another stream of the resource."""
+
+
 class Query(Generic[Response]):
     """A registrar's hold on one resource. Registrar.load() makes it. As a context manager it unloads at the end.
 
@@ -112,8 +116,8 @@ class Query(Generic[Response]):
     """
 
     __slots__ = (
+        "_all_streams",
         "_codec",
-        "_has_all_streams",
         "_holder",
         "_is_released",
         "_request",
@@ -140,7 +144,7 @@ class Query(Generic[Response]):
         origin: str,
         holder: Holder | None,
         types: Callable[[str], tuple[Codec, Codec]],
-        has_all_streams: Callable[[Query[Any]], bool],
+        all_streams: AllStreams,
     ) -> None:
         self.id = id
         self.resource_id = ""
@@ -155,7 +159,7 @@ class Query(Generic[Response]):
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
-        self._has_all_streams = has_all_streams
+        self._all_streams = all_streams
         self._waiters: dict[Flag | Wake | _Over, None] | None = None  # made for the first
         self._statuses: _Statuses | None = None  # made for the first: most queries hear of none
 
@@ -295,8 +299,9 @@ class Query(Generic[Response]):
         Raises:
             UnknownQuery: the query is released, or another process holds it.
             InvalidName, UsageError: an argument is something else, or there are several streams that are meant.
-            NotFound: the resource has no stream of this name. If it has none at all, this is known at once; or the
-                iteration raises it after thirty seconds, if the manager has crashed since the load. `.id`, `.known`
+            NotFound: the resource has no stream of this name. If it has none at all, this is known at once, to a
+                client a moment later, by the iteration; or, if the manager has crashed since the load, the iteration
+                raises it after thirty seconds. `.id`, `.known`
             ResourceLost: by the iteration: the resource was lost.
             Unavailable: by the iteration: the manager has ended, and its server opens the stream in no callback that
                 runs then. Or a frame cannot be read now; the next call goes on.
@@ -313,7 +318,7 @@ class Query(Generic[Response]):
             self._named_streams,
             self._watch,
             self._unwatch,
-            functools.partial(self._has_all_streams, self),
+            self._all_streams(self),
         )
         checked = name if name is None or isinstance(name, Stream) else check_name(name, "stream")
         return StreamReader(source, checked, keep, depth, limit_s)
@@ -407,7 +412,7 @@ class Query(Generic[Response]):
             setattr(self, name, value)
         self._holder = self._codec = self._waiters = self._statuses = None
         self._is_released = False
-        self._types, self._has_all_streams = _no_types, not_known
+        self._types, self._all_streams = _no_types, _not_known
 
     def _read_as(self, codec: Codec) -> Self:
         """Decode the response with this codec, and not with that of the server's response type."""
@@ -540,9 +545,9 @@ class _Over:
                 self._calls.pop()()
 
 
-def not_known(_query: Query[Any]) -> bool:
-    """Return False: nobody here knows whether the manager runs that has answered the load."""
-    return False
+def _not_known(_query: Query[Any]) -> Callable[[], bool]:
+    """Return a function that returns False: nobody here knows whether the manager runs that has answered the load."""
+    return lambda: False
 
 
 def _no_types(server_id: str) -> tuple[Codec, Codec]:
@@ -609,7 +614,7 @@ class Views:
         self._on_query: dict[str, StatusCallback] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
-        self._of_all = self.codecs_of, self._has_all_streams  # the same bound methods for all queries
+        self._of_all = self.codecs_of, self._all_streams  # the same bound methods for all queries
         self._left: set[tuple[str, str]] = set()  # servers where something was held, and released
         self._silent: set[str] = set()  # servers whose types were asked for, and did not come in time
 
@@ -752,7 +757,10 @@ class Views:
 
         return begin_async if is_async(callback) else begin
 
-    def _has_all_streams(self, query: Query[Any]) -> bool:
+    def _all_streams(self, query: Query[Any]) -> Callable[[], bool]:
+        return functools.partial(self.has_all_streams, query)
+
+    def has_all_streams(self, query: Query[Any]) -> bool:
         """Return whether the callbacks that open streams of the resource have ended: its provider runs, and ran then.
 
         They end before a load is answered. After a crash of the provider this is not known.

@@ -1206,6 +1206,13 @@ def news(registrar: Registrar, query_id: str) -> tuple[bytes | None, bool]:
     return (None, True) if query is None else (response_bytes(query), query.released)
 
 
+def has_all_streams(registrar: Registrar, query_id: str) -> bool:
+    """Return whether nobody will open another stream of the resource of a query, as far as the registrar knows."""
+    views = registrar._views  # pyright: ignore[reportPrivateUsage]  # same file
+    query = views.known(query_id)
+    return query is not None and views.has_all_streams(query)
+
+
 def page(registrar: Registrar, wanted: Wanted) -> Page:
     """Return a page of what a registrar, of this process or another, serves or holds.
 

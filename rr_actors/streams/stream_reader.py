@@ -33,7 +33,8 @@ class Source(NamedTuple):
         named: returns the streams that the response names, with their places.
         watch: has a Wake set for each status, and at the end.
         unwatch: ends that.
-        has_all: whether nobody will open another stream of the resource.
+        has_all: whether nobody would open another stream of the resource when it was first called, or later. It is
+            called after a look at the streams that there are, and does not wait: it returns False until it knows.
     """
 
     resource_id: str
@@ -333,10 +334,12 @@ class StreamReader:
             return
         own = self._source.resource_id
         resource_id = own if self._stream is None else self._stream.resource_id
-        has_all = apart_s > _OPENS_S or (resource_id == own and self._source.has_all())  # before it looks
         known = known_streams(resource_id)
         name = None if self._stream is None else self._stream.name
-        if name not in known and (any(known.values()) or has_all):
+        if name in known:
+            return
+        # It asks after it has looked: a manager that runs then, and has run since the load, ran at the look, too.
+        if any(known.values()) or apart_s > _OPENS_S or (resource_id == own and self._source.has_all()):
             names = few(map(repr, sorted(known))) or "none"
             text = f"resource {resource_id} has no {self._what}; there are: {names}"
             self._is_over_with(NotFound(text + did_you_mean(name, known), id=name or "", known=tuple(sorted(known))))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from rr_actors.base.errors import UnknownQuery, UnknownRegistrar
 from rr_actors.registrar.engine.status import Status
 from rr_actors.system.console.client_queries import status_heard
 from rr_actors.system.console.console_messages import Heard
-from support import LIMIT_S, Calls, eventually
+from support import LIMIT_S, Calls, eventually, kill, wait_respawned
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
 
@@ -88,6 +89,36 @@ def test_a_stream_ends_when_the_query_is_released_from_outside(
     release_from_outside(system, query)
 
     assert reading.ended().error is None
+
+
+@pytest.mark.parametrize("read", [frames, lambda query: asyncio.run(frames_async(query))], ids=["for", "async for"])
+def test_a_resource_without_a_stream_says_so_to_a_client_at_once(
+    system: rr.System, client: rr.Client, read: Callable[[rr.Query[Any]], Any]
+) -> None:
+    system.start_child(rr.ChildSpec(Unused, id="things"))
+    query = client.open_registrar("w").load("things/thing", "one")
+    began = time.monotonic()
+
+    with pytest.raises(rr.NotFound, match=r"has no stream 'images'; there are: none"):
+        read(query)
+
+    assert time.monotonic() - began < 15
+
+
+def test_a_stream_of_a_manager_that_has_crashed_since_a_clients_load_is_waited_for(
+    system: rr.System, client: rr.Client
+) -> None:
+    system.start_child(rr.ChildSpec(Unused, id="things"))
+    worker = client.open_registrar("w")
+    before = worker.load("things/thing", "one")
+    wait_respawned(system, "things", kill(system, "things"))
+    later = worker.load("things/thing", "one")
+
+    assert later.resource_id == before.resource_id
+    with pytest.raises(rr.NotFound):  # this load began after the crash
+        frames(later)
+    with before.stream("images", timeout_s=1.0) as reader, pytest.raises(TimeoutError):
+        next(reader)
 
 
 def test_a_wait_for_a_status_ends_when_the_query_is_released_from_outside(system: rr.System, client: rr.Client) -> None:

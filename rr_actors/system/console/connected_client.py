@@ -25,15 +25,16 @@ from rr_actors.registrar.arguments import LoadOptions, Parent, checked_callback,
 from rr_actors.registrar.declarations import Declared, declaring
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries, note_request
 from rr_actors.registrar.pages import QueryRow
-from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, not_known, read_as, was_given
+from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, read_as, was_given
 from rr_actors.registrar.registrar import Consumer
 from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, RemoteLoads, RemoteUnloads
 from rr_actors.runtime.time_limits import time_limit
+from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_queries import ClientQuery, ClientViews, SystemConnections, listen
 from rr_actors.system.console.console_client import find_console
 from rr_actors.system.console.console_commands import AskActor, GivePriority, Hold, OpenRegistrar, Release
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
-from rr_actors.system.console.console_questions import Find, FindServer
+from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
 
 T = TypeVar("T")
 
@@ -149,6 +150,21 @@ class _ClientCalls(RemoteCalls):
         self.connections.ask(Release(self.name, query_id, server, limit_s), limit_s + _GRACE_S)
         self.views.forget(query_id, server)
 
+    def all_streams(self, query: Query[Any]) -> Callable[[], bool]:
+        """Return a function for one reader, which has a thread ask the system once, and returns False until it knows.
+
+        What a crash of the manager has made uncertain stays so.
+        """
+        asked: list[Reply[c.AllStreams]] = []
+
+        def has_all() -> bool:
+            if not asked:
+                asked.append(Reply())
+                in_thread(asked[0], lambda: self.connections.ask(HasAllStreams(self.name, query.id)))
+            return asked[0].done() and asked[0].exception() is None and asked[0].get().are_open
+
+        return has_all
+
 
 class _ClientLoads(RemoteLoads):
     """The loads of a client's registrar. Each call in flight has a thread and a connection."""
@@ -186,9 +202,8 @@ class _ClientLoads(RemoteLoads):
             # If the connection ends before keep(), the system releases the query.
             with client.views.loading(), client.connections.lent() as connection:
                 held = connection.ask(command, limit_s + _GRACE_S)
-                query = ClientQuery(
-                    held.query_id, target, request, "", client.name, self.holder, _shown_types, not_known
-                )
+                place = held.query_id, target, request, "", client.name, self.holder
+                query = ClientQuery(*place, _shown_types, client.all_streams)
                 if options.codec is not None:
                     read_as(query, options.codec)
                 loaded_directly(query, held.resource_id, held.response, held.state)

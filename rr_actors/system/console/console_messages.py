@@ -288,6 +288,12 @@ class ServerFound(Message, frozen=True):
     id: str
 
 
+class AllStreams(Message, frozen=True):
+    """The answer to HasAllStreams."""
+
+    are_open: bool
+
+
 class Done(Message, frozen=True):
     """The answer to a command that was carried out: a sentence that says what was done, and the same as plain data."""
 

@@ -8,6 +8,7 @@ import msgspec
 
 from rr_actors.base.errors import NotSerializable
 from rr_actors.registrar.declarations import Declaring
+from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_view import Caller, Verb, View, room_for
 from rr_actors.system.snapshots import ask_each
@@ -129,6 +130,19 @@ class FindServer(Verb[c.ServerFound], frozen=True):
 
     def _carry_out(self, view: View, caller: Caller) -> c.ServerFound:
         return c.ServerFound(Declaring(self.owner, self.method, self.server).id_in(view.node.directory))
+
+
+class HasAllStreams(Verb[c.AllStreams], frozen=True):
+    """Whether nobody will open another stream of the resource of a client's query: its manager has run since the load.
+
+    The client asks after it has looked at the streams that there are.
+    """
+
+    registrar: c.Text
+    query_id: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.AllStreams:
+        return c.AllStreams(has_all_streams(view.clients.named(self.registrar).registrar, self.query_id))
 
 
 class ReadResponse(Verb[c.Response], frozen=True):
