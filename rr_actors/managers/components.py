@@ -18,11 +18,15 @@ The registry is a TOML file::
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, TypeVar
+from weakref import WeakValueDictionary
 
 import msgspec
 
@@ -43,6 +47,7 @@ from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
+from rr_actors.system.registrar_lookup import registrar_in
 
 logger = Log("rr_actors.managers.components")
 
@@ -100,6 +105,20 @@ Run = Callable[[RunProgram, Made, float], Component]
 """Runs a program within a time limit in seconds, and returns the component that it is."""
 
 
+class _Turn(AbstractContextManager["_Turn"]):
+    """A lock that a WeakValueDictionary can have."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> _Turn:
+        self._lock.acquire()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
 class NoComponent(LoadFailed):
     """The registry has no component of the type, or none of them could be loaded."""
 
@@ -107,6 +126,7 @@ class NoComponent(LoadFailed):
 class Components(Manager):
     """Serves `component`: runs the most reliable component of a type, and the next best when that one fails.
 
+    A holder that finds one silent says so: `system.registrar("components").send_status(query, FATAL)` has it replaced.
     The holders of a replaced component hear UPDATE. They hear FATAL only if no other component could replace it. One
     that fails again and again waits longer each time, with a WARNING, and is given up after ten failures in a row.
     """
@@ -124,6 +144,8 @@ class Components(Manager):
         self._programs = programs
         self._replace = replace
         self._retries = Retries[tuple[str, str]]()  # of components, by the id of the resource that has them and by name
+        self._replacing = WeakValueDictionary[str, _Turn]()  # by resource: two statuses never replace one part twice
+        self._lock = threading.Lock()
 
     def on_stop(self) -> None:
         """Wait for no component that has failed any more."""
@@ -139,17 +161,25 @@ class Components(Manager):
 
     @load_component.status
     def component_status(self, request: LoadComponent, status: Status) -> None:
-        """Put the next best component in the place of one whose program has ended. Only its own fault lowers it.
+        """Put the next best component in the place of one that has failed: its program ends, or a holder says FATAL.
 
-        A crash may repeat this. The failure counts once, so the same component is chosen again.
+        Only its own fault lowers it. A crash may repeat this. The failure counts once, so the same component is chosen
+        again.
         """
-        part = self._failed_part(status)
-        if part is None:
-            return
+        with self._turn(current().resource_id):
+            part = self._failed_part(status)
+            if part is None and status.resource_id == current().resource_id:
+                part = self._part_called_lost(status)
+            if part is not None:
+                self._replace_component(request, status, part)
+
+    # -- replacing -------------------------------------------------------------------------------------------------
+
+    def _replace_component(self, request: LoadComponent, status: Status, part: Query) -> None:
         failed = self._component_of(request, part.request)
-        run, why = functools.partial(self._swap, status), list[str]()
+        run, why = functools.partial(self._swap, status, part), list[str]()
         try:
-            in_turn = self._after(failed, status, lambda: self.candidates(request.type), why)
+            in_turn = self._after(failed, status, part, lambda: self.candidates(request.type), why)
             component = self._run_best(request, run, in_turn, why)
         except UnknownQuery:
             status.handled()  # it is being unloaded
@@ -160,7 +190,28 @@ class Components(Manager):
                 "%s: %s takes the place of one that failed: %s", request.type, component.name, status.message
             )
 
-    # -- replacing -------------------------------------------------------------------------------------------------
+    def _turn(self, id: str) -> _Turn:
+        """Return what one status callback of a resource holds at a time."""
+        with self._lock:
+            return self._replacing.setdefault(id, _Turn())
+
+    def _part_called_lost(self, status: Status) -> Query | None:
+        """Return the program of a component that a holder has called lost; None if there is nothing to replace.
+
+        The program is called lost, too: else the same component would get the same program again.
+        """
+        me = current()
+        if status.state is not State.FATAL or not self._replace:
+            return None
+        if not any(info.id == me.resource_id and info.state == State.FATAL for info in self.registrar.resources()):
+            status.handled()  # another status, or a run before a crash, has had it replaced
+            return None
+        part = next(iter(self.registrar.children(me.resource_id)), None)
+        if part is not None and part.state is not State.FATAL:
+            programs = registrar_in(self._node, part.registrar, patient=True, owner=self)
+            with contextlib.suppress(UnknownQuery):  # it is gone
+                programs.send_status(part.resource_id, Status(State.FATAL, status.message))
+        return part
 
     def _failed_part(self, status: Status) -> Query | None:
         """Return the part of which a status says that it has failed; None if there is nothing to replace."""
@@ -175,6 +226,7 @@ class Components(Manager):
         self,
         failed: ComponentDescription | None,
         status: Status,
+        part: Query,
         candidates: Callable[[], Sequence[ComponentDescription]],
         why: list[str],
     ) -> Iterator[ComponentDescription]:
@@ -184,7 +236,7 @@ class Components(Manager):
         """
         id = current().resource_id
         if failed is not None and is_own_failure(status):
-            self._lower(failed, status.resource_id)
+            self._lower(failed, part.resource_id)  # the same for all statuses of this failure
 
         def is_resting(one: ComponentDescription) -> bool:
             return not self._retries.is_ready((id, one.name))
@@ -239,8 +291,11 @@ class Components(Manager):
     def _load(self, program: RunProgram, made: Made, timeout_s: float) -> Component:
         return made(self.registrar.load(self._programs, program, timeout_s=timeout_s))
 
-    def _swap(self, status: Status, program: RunProgram, made: Made, timeout_s: float) -> Component:
-        return made(self.registrar.replace_part(status, program, self._programs, response=made, timeout_s=timeout_s))
+    def _swap(self, status: Status, part: Query, program: RunProgram, made: Made, timeout_s: float) -> Component:
+        spare = self.registrar.replace_part(
+            status, program, self._programs, part=part, response=made, timeout_s=timeout_s
+        )
+        return made(spare)
 
     def _run_best(
         self, request: LoadComponent, run: Run, candidates: Iterable[ComponentDescription], why: list[str]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -59,6 +61,7 @@ def begin(start: Start, registry: Path) -> Callable[..., tuple[rr.System, rr.Reg
 
 Begin = Callable[..., tuple[rr.System, rr.Registrar]]
 LIDAR = LoadComponent("lidar", {"place": "roof"})
+LOST = rr.Status(rr.State.FATAL, "no scans")
 
 
 def test_the_most_reliable_component_of_the_type_is_loaded_with_its_parameters_filled(begin: Begin) -> None:
@@ -95,6 +98,80 @@ def test_a_component_that_fails_is_replaced_by_the_next_best_and_its_holders_hea
         eventually(lambda: list(running_programs()) == [lidar.response.pid])
     assert len(heard) == 1
     assert not running_programs()
+
+
+def test_a_component_that_its_holder_calls_lost_is_replaced_and_its_holders_hear_update(begin: Begin) -> None:
+    system, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8))
+    heard = Calls()
+    with app.load("components/component", LIDAR, on_status=heard) as lidar:
+        system.registrar("components").send_status(lidar, LOST)
+        (status,) = heard.wait()
+        assert (status.state, lidar.response.name) == (rr.State.UPDATE, "old")
+        eventually(lambda: list(running_programs()) == [lidar.response.pid])
+        assert system.registrar("components").resources()[0].state == "UPDATE"
+        with system.open_registrar("other").load("components/component", LIDAR) as same:
+            assert same.response == lidar.response
+    assert len(heard) == 1
+    assert not running_programs()
+
+
+def test_what_two_holders_call_lost_at_once_is_replaced_once_and_trusted_less_once(begin: Begin) -> None:
+    system, app = begin(entry("good"), entry("old", reliability=0.6), entry("oldest", reliability=0.55))
+    components, lidar = system.registrar("components"), app.load("components/component", LIDAR)
+    with ThreadPoolExecutor() as holders:
+        list(holders.map(lambda _: components.send_status(lidar, LOST), range(4)))
+    lidar.wait_status(rr.State.UPDATE, timeout_s=10)
+    eventually(lambda: list(running_programs()) == [lidar.response.pid])
+    assert lidar.response.name == "old"
+    kept = json.loads((components.directory / "reliability.json").read_text())["reliability"]
+    assert {name: round(value, 2) for name, value in kept.items()} == {"good": 0.5}
+    assert lidar.state is rr.State.UPDATE
+
+
+def test_a_component_whose_program_ends_while_it_is_called_lost_is_replaced_once(begin: Begin) -> None:
+    system, app = begin(entry("good"), entry("old", reliability=0.6), entry("oldest", reliability=0.55))
+    with app.load("components/component", LIDAR) as lidar:
+        os.kill(lidar.response.pid, signal.SIGKILL)
+        system.registrar("components").send_status(lidar, LOST)
+        lidar.wait_status(rr.State.UPDATE, timeout_s=10)
+        eventually(lambda: list(running_programs()) == [lidar.response.pid])
+        assert lidar.response.name == "old"
+
+
+def test_a_component_is_called_lost_and_replaced_whatever_moment_its_manager_is_killed_at(begin: Begin) -> None:
+    system, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8))
+    with app.load("components/component", LIDAR) as lidar:
+        for _ in range(3):
+            before, manager = lidar.response.pid, child(system, "components").pid
+            assert manager is not None
+            system.registrar("components").send_status(lidar, LOST)
+            kill(system, "components")
+            wait_respawned(system, "components", manager)
+            eventually(lambda: list(running_programs()) == [lidar.response.pid] != [before])  # noqa: B023
+            assert lidar.state is rr.State.UPDATE
+
+
+def test_the_only_component_of_a_type_is_started_anew_when_it_is_called_lost(begin: Begin) -> None:
+    system, app = begin(entry("driver", type="driver"))
+    with app.load("components/component", LoadComponent("driver", {"place": "base"})) as driver:
+        for _ in range(3):
+            pid = driver.response.pid
+            system.registrar("components").send_status(driver, LOST)
+            driver.wait_status(rr.State.UPDATE, timeout_s=10)
+            assert driver.response.pid != pid
+            eventually(lambda: list(running_programs()) == [driver.response.pid])
+
+
+@pytest.mark.parametrize("replace", [True, False])
+def test_when_what_is_called_lost_cannot_be_replaced_its_holders_hear_that(
+    begin: Begin, tmp_path: Path, replace: bool
+) -> None:
+    code = f"import time; open('{tmp_path / 'once'}', 'x').close(); print('ready'); time.sleep(600)"
+    system, app = begin(entry("fragile", code=code), replace=replace)
+    with app.load("components/component", LIDAR) as lidar:
+        system.registrar("components").send_status(lidar, LOST)
+        assert lidar.wait_status(rr.State.FATAL, timeout_s=10).message == "no scans"
+        assert system.registrar("components").resources()[0].state == "FATAL"
 
 
 def test_the_only_component_of_a_type_takes_its_own_place(begin: Begin) -> None:

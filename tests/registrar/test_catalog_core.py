@@ -1716,6 +1716,44 @@ def test_a_swap_is_one_commit_and_the_holders_hear_the_new_response_from_it() ->
     assert registrar.effects[-1] == e.AnswerCall("ticket", None)
 
 
+def called_lost() -> Registrar:
+    registrar = with_spares()
+    registrar.obey(c.SetStatus("q", "lost", State.FATAL, "silent", None))
+    return registrar
+
+
+def own_fatal(registrar: Registrar) -> Notice:
+    (notice,) = [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    return notice
+
+
+def test_a_resource_whose_part_is_swapped_while_its_callback_hears_its_fatal_is_given_to_others_again() -> None:
+    registrar = called_lost()
+    notice = own_fatal(registrar)
+    assert registrar.catalog.joinable("cam", b"front") is None
+    registrar.obey(SWAP)
+    registrar.obey(c.StatusDone("q", notice, handled=True))
+    assert registrar.catalog.resources["q"].state is State.UPDATE
+    assert registrar.catalog.joinable("cam", b"front") == "q"
+    assert told(registrar) == []
+
+
+def test_a_fatal_that_its_callback_does_not_handle_after_a_swap_is_final() -> None:
+    registrar = called_lost()
+    notice = own_fatal(registrar)
+    registrar.obey(SWAP)
+    registrar.obey(c.StatusDone("q", notice, handled=False))
+    assert registrar.catalog.resources["q"].state is State.FATAL
+    assert told(registrar) == [("q", State.FATAL)]
+
+
+def test_a_resource_whose_holders_have_heard_fatal_stays_fatal_when_its_part_is_swapped() -> None:
+    registrar = called_lost()
+    registrar.obey(c.StatusDone("q", own_fatal(registrar), handled=False))
+    registrar.obey(SWAP)
+    assert registrar.catalog.resources["q"].state is State.FATAL
+
+
 def test_a_swap_without_a_response_is_heard_by_nobody() -> None:
     registrar = with_spares()
     registrar.obey(msgspec.structs.replace(SWAP, response=None))

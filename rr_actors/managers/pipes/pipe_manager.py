@@ -178,7 +178,7 @@ class Pipes(Components):
             self._put(request, status, segments, place, one.name)
             return one.name
 
-        found = self._first_of(self._after(self._described.get(failed), status, fitting, why), put, why)
+        found = self._first_of(self._after(self._described.get(failed), status, part, fitting, why), put, why)
         if found is None:
             raise NoPipe("\n".join([f"no component can take the place of {failed}:", *(why or ["none fits there"])]))
         logger.warning("%s: %s takes the place of %s: %s", request.of_type, found, failed, status.message)

@@ -235,6 +235,8 @@ def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
     if handled and notice.response is None:
         _end_if_unwanted(decision, resource)
     else:
+        if notice.state is State.FATAL and resource.state is not State.FATAL:  # a swap has revived it meanwhile
+            resource = _note(decision, resource, notice)
         newest = None if notice.response is None else resource.response
         _tell_holders(decision, resource, replace(notice, response=newest))
 
@@ -276,10 +278,28 @@ def swap(decision: Decision, command: Swap) -> None:
         return
     decision.put(spare)  # the disk may not have it yet
     _release(decision, resource.id, (command.part, *command.others))
+    resource = _revived(decision, resource)
     if command.response is not None:
         said = SetResponse(resource.id, command.event, command.response, command.message, None, resource.id)
         _say(decision, resource, said, State.UPDATE, command.response)
     decision.cause(AnswerCall(command.ticket, None))
+
+
+def _revived(decision: Decision, resource: Resource) -> Resource:
+    """Return the resource as it is with its spare: not lost any more, if its status callback still hears the FATAL.
+
+    If a new request has got another resource meanwhile, it stays FATAL: of each request, one resource is given away.
+    """
+    catalog = decision.catalog
+    own = (catalog.notices[id].state for id in catalog.own_notices.get(resource.id, ()))
+    if resource.state is not State.FATAL or State.FATAL not in own or resource.id in catalog.revocations:
+        return resource
+    if resource.phase is not LOADED or catalog.joinable(resource.server, resource.request) is not None:
+        return resource
+    touch(decision, resource.id)  # it needs its parts again
+    resource = replace(resource, state=State.UPDATE)
+    decision.put(resource)
+    return resource
 
 
 def _part(catalog: Catalog, resource_id: str, query_id: str) -> Held | None:
