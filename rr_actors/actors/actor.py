@@ -21,7 +21,7 @@ from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
 from rr_actors.actors.messaging import dead_letters, death_watch, exit_reports
-from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity
+from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity, here
 from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.actors.messaging.mailbox import (
@@ -44,7 +44,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.runtime.callback_errors import log_raised, raised_by
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import shielded
-from rr_actors.runtime.user_loop import is_coroutine
+from rr_actors.runtime.user_loop import closing, is_coroutine
 
 __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit"]
 
@@ -298,7 +298,10 @@ class BaseActor(pykka.Actor):
         try:
             await self._hook(BaseActor._before_start, self._place)
             self._begun = True
-            answer = await self._user(self.on_start)
+            doing.starts_in = here()
+            answer = self.on_start()
+            if is_coroutine(answer):
+                answer = await Await(closing(answer, _start(answer, doing)))
             if answer is not IGNORE:
                 await self._hook(BaseActor._after_start)
         except BaseException as error:
@@ -456,6 +459,12 @@ class BaseActor(pykka.Actor):
         mine = getattr(type(self), hook.__name__)
         if mine is not hook:  # go to the loop only if a subclass has overridden the hook
             await Await(mine(self, *args), on_loop=True)
+
+
+async def _start(on_start: Coroutine[Any, Any, Any], doing: Activity) -> Any:
+    """Run an `async def` on_start, whose task becomes known to `doing`."""
+    doing.starts_in = here()
+    return await on_start
 
 
 class LoopActor(BaseActor):

@@ -387,7 +387,7 @@ class RegistrarDown(Unavailable):
 
 
 class ActorUnavailable(Unavailable):
-    """The actor is being respawned: the same reference will work again. `.id`"""
+    """The actor is not up yet, or is being respawned: the same reference will work then. `.id`"""
 
     id: str
 

@@ -186,6 +186,7 @@ class Group:
         Raises:
             RrError: the error of the first load that failed; nothing is held.
         """
+        self._check_order()
         self._loads.calls.dispatcher.check_may_block(f"{self._loads.actor.name}.load_all()")
         try:
             return self.begin().get()
@@ -197,6 +198,7 @@ class Group:
 
     async def awaited(self) -> Queries:
         """Load all requests as wait() does, awaited on any event loop. If it is cancelled, nothing stays held."""
+        self._check_order()
         loop = asyncio.get_running_loop()
         try:
             reply = self.begin()
@@ -207,6 +209,10 @@ class Group:
         except BaseException:
             self._withdraw()
             raise
+
+    def _check_order(self) -> None:
+        for server, _, _ in self._requests:
+            self._loads.check_order(server)
 
     def _withdraw(self) -> None:
         """Release and withdraw all, as no caller waits any more."""

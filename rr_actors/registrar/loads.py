@@ -20,6 +20,7 @@ from typing import Any, Protocol, TypeVar
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.actors.remote.start_order import why_registrar_too_early
 from rr_actors.actors.turns import has_a_turn
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
 from rr_actors.base.names import ServerId, new_id
@@ -317,6 +318,7 @@ class Loads:
         Raises:
             RrError: how the load ended.
         """
+        self.check_order(target)
         dispatcher = self.calls.dispatcher
         if has_a_turn() or asyncio._get_running_loop() is not None:  # else this thread is no loop's
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
@@ -343,6 +345,7 @@ class Loads:
         Raises:
             RrError: how the load ended.
         """
+        self.check_order(target)
         hearer = hearer_of(options.progress, self.actor)
         query = self.views.new(new_id(), target, request, parent, options.codec)
         try:
@@ -356,6 +359,14 @@ class Loads:
         finally:
             if hearer is not None:
                 hearer.close()
+
+    def check_order(self, target: ServerId) -> None:
+        """Raise UsageError if on_start runs this code, and the provider starts only after it."""
+        client = self.actor.clients.get(target.registrar)
+        if client is not None and client.link is not None:  # the provider is up
+            return
+        if why := why_registrar_too_early(self.actor.node.directory, target.registrar):
+            raise UsageError(f"{target}: {why}", registrar=target.registrar)
 
     def _listen(self, query: Query, options: LoadOptions) -> None:
         self.calls.check_open()

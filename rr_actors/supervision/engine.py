@@ -43,7 +43,7 @@ from rr_actors.supervision.core.state import (
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.supervision.given_up import give_up
 from rr_actors.supervision.name_entries import Entries, manager_of, registrars_of
-from rr_actors.wire.name_service import Presence
+from rr_actors.wire.name_service import Presence, Turn
 
 logger = Log("rr_actors.supervision")
 
@@ -159,7 +159,8 @@ class Supervision:
                 life = Life(action, self.path_of(action.id))
                 self._lives[action.run] = life
                 self._specs[action.id] = action.spec
-                self.entries.mark(life.spec, life.path, Presence.STARTING, self._deaths(life))
+                turn = Turn.NOW if self.tree.awaited(action.why) else None
+                self.entries.mark(life.spec, life.path, Presence.STARTING, self._deaths(life), turn)
                 self._task(self._start(life, action.delay_s))
             case StopChild():
                 life = self._lives.get(action.run)
@@ -343,7 +344,9 @@ class Supervision:
         if status is Presence.STOPPED and self._ends_with_supervisor(report.id):
             status = Presence.GONE
         closed = {name for name in registrars_of(spec, path) if self._node.status_of(name) is Presence.GONE}
-        self._retire(self.entries.mark(spec, path, status, _why(record)), closed)
+        child = self.tree.children.get(report.id)
+        is_due = status is Presence.STARTING and child is not None and child.phase is ChildPhase.DUE
+        self._retire(self.entries.mark(spec, path, status, _why(record), Turn.DUE if is_due else None), closed)
 
     def _deaths(self, life: Life) -> str:
         """Say how earlier runs died. The child's registrar names that in the errors of loads that they interrupted."""

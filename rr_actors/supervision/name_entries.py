@@ -12,7 +12,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.declarations import class_names
 from rr_actors.registrar.manager import Manager
 from rr_actors.supervision.core.specs import ChildSpec, starting_with
-from rr_actors.wire.name_service import Directory, Presence, actor_key, registrar_key
+from rr_actors.wire.name_service import Directory, Presence, Turn, actor_key, registrar_key
 from rr_actors.wire.unix_sockets import pid_of
 
 logger = Log("rr_actors.supervision")
@@ -24,14 +24,16 @@ class Entries:
     def __init__(self, directory: Directory) -> None:
         self._directory = directory
 
-    def mark(self, spec: ChildSpec, path: str, status: Presence, why: str = "") -> list[str]:
+    def mark(self, spec: ChildSpec, path: str, status: Presence, why: str = "", turn: Turn | None = None) -> list[str]:
         """Mark a child, its registrar and all below it with a status. Return the registrars if the status is GONE.
 
+        `turn` is the child's. All below a child that is STARTING are due: it starts them one after another.
         An error is logged: the directory may be gone, with the system.
         """
         try:
             for where, child in starting_with(spec, path):
-                self._mark_one(child, where, status, why)
+                self._mark_one(child, where, status, why, turn)
+                turn = Turn.DUE if status is Presence.STARTING else None
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
         return registrars_of(spec, path) if status is Presence.GONE else []
@@ -39,10 +41,10 @@ class Entries:
     def announce(self, spec: ChildSpec, path: str) -> None:
         """Mark the top of a tree, which has no supervisor, and all below it as STARTING, or raise ConfigError."""
         for where, child in starting_with(spec, path):
-            self._mark_one(child, where, Presence.STARTING)
+            self._mark_one(child, where, Presence.STARTING, turn=Turn.DUE)
 
-    def _mark_one(self, spec: ChildSpec, path: str, status: Presence, why: str = "") -> None:
-        self._directory.mark(actor_key(path), status, why)
+    def _mark_one(self, spec: ChildSpec, path: str, status: Presence, why: str = "", turn: Turn | None = None) -> None:
+        self._directory.mark(actor_key(path), status, why, turn)
         if (manager := manager_of(spec)) is not None:
             name = path.rpartition("/")[2]
             if status is Presence.STARTING:  # others find it by its classes: `load(Cameras.open_camera, ...)`

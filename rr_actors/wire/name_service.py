@@ -82,18 +82,28 @@ class Presence(enum.StrEnum):
     DORMANT = "dormant"
 
 
+class Turn(enum.StrEnum):
+    """The place of a STARTING actor among its siblings, which start one after another: DUE ones start when the NOW one
+    is up."""
+
+    NOW = "now"
+    DUE = "due"
+
+
 class NameEntry(msgspec.Struct, frozen=True):
     """The entry of one name; the address is "" unless the status is UP, or STARTING with a running process.
 
     `why` is a text for people: the reason for STOPPED or GONE, or how the last processes died while STARTING; "" if
     the reason is not known.
     `once`: the actor is UP, and will not be started again when it ends.
+    `turn`: the actor is STARTING in its turn; None if it starts whatever its siblings do.
     """
 
     status: Presence
     address: str
     why: str = ""
     once: bool = False
+    turn: Turn | None = None
 
     @property
     def because(self) -> str:
@@ -102,7 +112,10 @@ class NameEntry(msgspec.Struct, frozen=True):
 
 
 _AWAY = (Presence.GONE, Presence.DORMANT)
-_MARKS = {status.value: NameEntry(status, "") for status in Presence if status is not Presence.UP}
+_MARKS = {
+    **{status.value: NameEntry(status, "") for status in Presence if status is not Presence.UP},
+    **{f"{Presence.STARTING.value} {turn.value}": NameEntry(Presence.STARTING, "", turn=turn) for turn in Turn},
+}
 _UP = Presence.UP.value + ":"
 _UP_ONCE = Presence.UP.value + " once:"
 _OPENING = Presence.STARTING.value + ":"
@@ -215,11 +228,12 @@ class Directory:
         """Write that `name` is STARTING and will be UP at `address`: its process runs."""
         self._put(name, _OPENING + address)
 
-    def mark(self, name: str, status: Presence, why: str = "") -> None:
+    def mark(self, name: str, status: Presence, why: str = "", turn: Turn | None = None) -> None:
         """Write a status in which `name` has no address, and `why`, of which at most 900 bytes are kept."""
         if status is Presence.UP:
             raise UsageError(f"{name}: UP needs an address; use publish")
-        self._put(name, f"{status.value}{_WHY}{_fitting(why)}" if why else status.value)
+        mark = f"{status.value} {turn.value}" if turn else status.value
+        self._put(name, f"{mark}{_WHY}{_fitting(why)}" if why else mark)
 
     def _put(self, name: str, content: str) -> None:
         if not name or name[0] == "." or "/" in name:
@@ -268,7 +282,7 @@ class Directory:
             return NameEntry(Presence.UP, content[len(_UP_ONCE) :], once=True)
         mark, _, why = content.partition(_WHY)
         entry = _MARKS.get(mark)
-        return entry if entry is None or not why else NameEntry(entry.status, "", why)
+        return entry if entry is None or not why else NameEntry(entry.status, "", why, turn=entry.turn)
 
     def actor(self, path: str) -> NameEntry | None:
         """Return the entry of an actor; of a part, such as a manager's registrar, the entry of that of which it is one.

@@ -8,6 +8,7 @@ The error is a UsageError. Its `.ring` has the names of the actors.
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from contextvars import ContextVar
 from typing import NamedTuple, Protocol
@@ -29,11 +30,15 @@ Chain = tuple[Target, ...]
 
 
 class Activity(msgspec.Struct, eq=False):
-    """One run of a handler. It is not `active` once the handler has returned: a task left behind blocks no actor."""
+    """One run of a handler. It is not `active` once the handler has returned: a task left behind blocks no actor.
+
+    `starts_in`: of a run of on_start the task that runs it, or the number of its thread; else None.
+    """
 
     target: Target
     chain: Chain
     active: bool = True
+    starts_in: object = None
 
 
 class Awaited(Protocol):
@@ -58,6 +63,21 @@ def chain() -> Chain:
     """Return the chain that a blocking ask of the current handler must carry."""
     me = activity.get()
     return () if me is None or not me.active else (*me.chain, me.target)
+
+
+def here() -> object:
+    """Return the task that runs the current code, or the number of the thread if no task does."""
+    return threading.get_ident() if asyncio._get_running_loop() is None else asyncio.current_task()
+
+
+def starting() -> Target | None:
+    """Return the actor whose on_start runs the current code, and waits while it waits.
+
+    None in a thread or a task that on_start has begun: on_start may return before that.
+    """
+    me = activity.get()
+    starts = me is not None and me.active and me.starts_in is not None and me.starts_in == here()
+    return me.target if me is not None and starts else None
 
 
 def check_ring(target: Target) -> None:

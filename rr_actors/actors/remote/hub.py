@@ -20,6 +20,7 @@ from rr_actors.actors.messaging.mailbox import Mailbox, refuse_all
 from rr_actors.actors.remote.inbound import Asker, Visitor
 from rr_actors.actors.remote.peer import Cut, Line, PendingCall, Whereabouts
 from rr_actors.actors.remote.protocol import ASKS, KIND, PATH_URN, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
+from rr_actors.actors.remote.start_order import why_too_early
 from rr_actors.base import pickling
 from rr_actors.base.errors import ActorUnavailable, Unavailable, UsageError
 from rr_actors.base.steps import Steps
@@ -332,6 +333,10 @@ class ActorHub:
                     f"{name} is being started again, or is stopping; this reference works again if it comes back",
                     id=where.path,
                 )
+            case Presence.STARTING if where.path and (why := why_too_early(self._directory, where.path, "ask")):
+                return ActorUnavailable(why, id=where.path)
+            case Presence.STARTING if entry.turn and not entry.why:
+                return ActorUnavailable(f"{name} is not up yet; this reference works when it is", id=where.path)
             case Presence.STARTING:
                 return ActorUnavailable(
                     f"{name} is being started again; this reference works again when it is up", id=where.path

@@ -204,6 +204,10 @@ class SupervisorState(Struct, frozen=True):
         """The specification from which all dynamic children are made."""
         return as_child_spec(self.spec.children[0])
 
+    def awaited(self, why: Why) -> bool:
+        """Return whether the children that are due start only when a child is up that starts for this purpose."""
+        return self.grouped or why is Why.INIT
+
     def dynamic_id(self, number: str) -> str:
         """Return the id of the dynamic child with that number, within the length limit of ids."""
         return f"{self.template.id[:40]}-{self.generation}{'.' if self.generation else ''}{number}"
