@@ -75,10 +75,10 @@ figures: $(STAMP)
 	$(BIN)/python tests/project/package_figures.py $(ARGS)
 
 chaos: $(STAMP)
-	$(BIN)/python -m rr_actors.testing $(ARGS)
+	PYTHONPATH=tests $(BIN)/python -m chaos $(ARGS)
 
 breakages: $(STAMP)
-	RR_ACTORS_BREAKAGES=all $(BIN)/python -m pytest tests/testing/test_breakages.py $(ARGS)
+	RR_ACTORS_BREAKAGES=all $(BIN)/python -m pytest tests/chaos/test_breakages.py $(ARGS)
 
 simulate: $(STAMP)
 	cd tests && ../$(BIN)/python -m simulation $(ARGS)
@@ -98,7 +98,7 @@ fuzz-quick: $(STAMP)
 	$(BIN)/python -m fuzz.damage --times 60
 	$(BIN)/python tests/support_interrupts.py --most 40 --together 20 --only "load here" "ask far" queries
 	$(BIN)/python tests/support_interrupts.py --most 40 --together 20 --raising Exception --only "load here" "tell near"
-	$(BIN)/python -m rr_actors.testing --kills 3 --seconds 4
+	PYTHONPATH=tests $(BIN)/python -m chaos --kills 3 --seconds 4
 	cd tests && ../$(BIN)/python -m simulation 300 --seed 4503599627375496
 
 bench: $(STAMP)

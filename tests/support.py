@@ -27,7 +27,8 @@ from rr_actors.wire.thread_connections import BlockingLink
 REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = REPOSITORY / "tests"
 # What a program that a test starts needs in its PYTHONPATH to import the tests' own modules.
-TEST_PATHS = os.pathsep.join(map(str, [REPOSITORY, TESTS, *sorted(path for path in TESTS.iterdir() if path.is_dir())]))
+_FOLDERS = sorted(path for path in TESTS.iterdir() if path.is_dir() and not (path / "__init__.py").exists())
+TEST_PATHS = os.pathsep.join(map(str, [REPOSITORY, TESTS, *_FOLDERS]))
 T = TypeVar("T")
 BROWSERS: set[int] = set()
 """Browsers that serve all tests of a module. They start and end processes of their own as they like."""

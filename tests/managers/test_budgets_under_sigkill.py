@@ -17,12 +17,12 @@ import psutil
 import pytest
 
 import rr_actors as rr
+from chaos.invariants import check_house, used_by
+from chaos.load_threads import Resident
+from chaos.process_census import stands
+from chaos.report import Tally
+from chaos.victim_managers import LESS, RESERVE, WATTS, House
 from rr_actors.managers import Budgets, Programs
-from rr_actors.testing.invariants import check_house, used_by
-from rr_actors.testing.load_threads import Resident
-from rr_actors.testing.process_census import stands
-from rr_actors.testing.report import Tally
-from rr_actors.testing.victim_managers import LESS, RESERVE, WATTS, House
 from support import eventually, kill
 from support_programs import group_of_program
 

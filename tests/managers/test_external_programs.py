@@ -21,13 +21,13 @@ import msgspec
 import psutil
 import pytest
 
+from chaos.process_census import stands
 from rr_actors.managers import external_programs, shim
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
 from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
 from rr_actors.runtime.processes.control_groups import ControlGroup, ControlGroups
-from rr_actors.testing.process_census import stands
 from support import NoDescriptors, hang
 from support_programs import group_of_program
 from support_slow import few_now

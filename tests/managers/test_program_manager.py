@@ -17,8 +17,8 @@ import psutil
 import pytest
 
 import rr_actors as rr
+from chaos.process_census import stands
 from rr_actors.managers import Program, Programs, Ready, RunProgram
-from rr_actors.testing.process_census import stands
 from support import Calls, eventually, kill, pid_of, wait_respawned
 from support_programs import running_programs
 

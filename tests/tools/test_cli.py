@@ -245,18 +245,6 @@ def test_a_missing_extra_is_an_error_of_one_line_that_says_what_to_install(tmp_p
     assert_one_line_error(ran, "pip install 'rr-actors[cli]'")
 
 
-def test_chaos_gives_its_options_to_a_program_of_its_own() -> None:
-    command = [sys.executable, "-m", "rr_actors", "chaos"]
-    helped = subprocess.run([*command, "--help"], capture_output=True, text=True)
-    refused = subprocess.run([*command, "--kills", "0"], capture_output=True, text=True)
-
-    assert helped.stdout.startswith("usage: rr-actors chaos")
-    for option in ("kills", "seconds", "seed", "state-dir", "json", "soak", "churn", "pace", "patience"):
-        assert f"--{option}" in helped.stdout
-    assert refused.returncode == 2
-    assert "rr-actors chaos: error: chaos: kills: expected a number above 0, got 0" in refused.stderr
-
-
 def test_an_unknown_command_is_refused() -> None:
     ran = run("dance")
 

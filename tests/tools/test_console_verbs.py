@@ -906,7 +906,7 @@ NAMES = [name for modules in VERBS.values() for verbs in modules.values() for na
 
 
 def test_each_command_has_an_example_in_its_help() -> None:
-    older = {"version", "inspect", "tree", "check", "chaos"}
+    older = {"version", "inspect", "tree", "check"}
     for name in NAMES:
         assert name in older or (whole(name).epilog or "").startswith(f"Example: rr-actors {name}"), name
     assert "Example: rr-actors kill" in said("kill", "--help")

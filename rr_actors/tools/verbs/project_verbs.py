@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import keyword
-import os
 import re
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -64,10 +62,3 @@ def import_temoto(
         from rr_actors.managers.pipes import temoto_files
 
     say_lines(temoto_files.import_temoto(files))
-
-
-@app.command(add_help_option=False, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-def chaos(context: typer.Context) -> None:
-    """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
-    sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-P", "-m", "rr_actors.testing", *context.args])

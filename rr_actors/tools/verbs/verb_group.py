@@ -179,9 +179,6 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
                 "unit, a Dockerfile"
             ),
             "import-temoto": "Print the files of a temoto_component_manager as one TOML file for the manager Pipes",
-            "chaos": (
-                "Run a system of its own, kill and harm its processes at random, and check every promise in the end"
-            ),
         },
     },
 }

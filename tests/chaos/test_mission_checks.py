@@ -6,6 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from chaos.callback_log import Line
+from chaos.mission.mission_checks import (
+    allowed,
+    check_acts,
+    check_choices,
+    check_graphs,
+    check_kept,
+    check_replicas,
+    wrong_fatal,
+)
+from chaos.mission.mission_managers import CHOICES, DESIRED, GRAPH, STEPS, graphs_folder, write_files
 from rr_actors.base.values.canonical import encode
 from rr_actors.managers import Choose, Kept, RunAction
 from rr_actors.managers.actions.graph_documents import read_graph
@@ -15,17 +26,6 @@ from rr_actors.managers.choices.chosen import Chosen
 from rr_actors.managers.keeper.desired import Replica, parse_desired
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Resource, Row, State
 from rr_actors.registrar.queries import ResourceInfo
-from rr_actors.testing.callback_log import Line
-from rr_actors.testing.mission.mission_checks import (
-    allowed,
-    check_acts,
-    check_choices,
-    check_graphs,
-    check_kept,
-    check_replicas,
-    wrong_fatal,
-)
-from rr_actors.testing.mission.mission_managers import CHOICES, DESIRED, GRAPH, STEPS, graphs_folder, write_files
 from rr_actors.tools.inspection import Contents
 
 

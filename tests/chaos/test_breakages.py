@@ -18,9 +18,9 @@ from typing import Any
 
 import pytest
 
+from chaos.breakages import BREAKAGES
 from rr_actors.managers.process_marks import find_processes
 from support import REPOSITORY
-from support_breakages import BREAKAGES
 
 LIMIT_S = 60.0
 SEEDS = (1, 2, 3)
@@ -42,7 +42,7 @@ def _run(name: str, seed: int, directory: Path, limit_s: float) -> dict[str, Any
     """Return the report of one run; None if it has not ended in time."""
     report = directory / f"{seed}.json"
     state = directory / str(seed)
-    command = [sys.executable, "support_breakages.py", name, str(seed), str(state), str(report)]
+    command = [sys.executable, "-m", "chaos.breakages", name, str(seed), str(state), str(report)]
     mark = uuid.uuid4().hex
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), _RUN: mark}
     try:
@@ -65,7 +65,7 @@ def _run(name: str, seed: int, directory: Path, limit_s: float) -> dict[str, Any
 
 
 def test_what_each_of_them_breaks_is_there() -> None:
-    program = "from support_breakages import BREAKAGES\nfor breakage in BREAKAGES.values():\n    breakage.apply()"
+    program = "from chaos.breakages import BREAKAGES\nfor breakage in BREAKAGES.values():\n    breakage.apply()"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY / "tests", env=environment, check=True)
 

@@ -12,14 +12,14 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
+from chaos.report import Tally
+from chaos.victim_managers import PATIENCE_S, Want
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.system.system import System
-from rr_actors.testing.report import Tally
-from rr_actors.testing.victim_managers import PATIENCE_S, Want
 
 _STATES = (State.OK, State.UPDATE, State.WARNING, State.ERROR, State.FATAL)
 _AFTER_FATAL = (State.FATAL, State.UPDATE)

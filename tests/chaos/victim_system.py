@@ -22,20 +22,20 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from chaos.callback_log import check_journal, read_journal
+from chaos.invariants import check_at_rest, check_empty, check_house, check_told, settled, used_by
+from chaos.load_threads import Consumer, Resident
+from chaos.mission.mission_managers import PLANNERS, SENSORS
+from chaos.mission.mission_part import APP_NAMES, Mission
+from chaos.mission.mission_threads import Operator
+from chaos.process_census import Census, Mark, stands
+from chaos.report import Tally
+from chaos.victim_managers import LESS, RESERVE, WATTS, Crew, House, Maker
+from chaos.watchdog import Watch
 from rr_actors.base.errors import RrError
 from rr_actors.managers import Budgets, Programs
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
-from rr_actors.testing.callback_log import check_journal, read_journal
-from rr_actors.testing.invariants import check_at_rest, check_empty, check_house, check_told, settled, used_by
-from rr_actors.testing.load_threads import Consumer, Resident
-from rr_actors.testing.mission.mission_managers import PLANNERS, SENSORS
-from rr_actors.testing.mission.mission_part import APP_NAMES, Mission
-from rr_actors.testing.mission.mission_threads import Operator
-from rr_actors.testing.process_census import Census, Mark, stands
-from rr_actors.testing.report import Tally
-from rr_actors.testing.victim_managers import LESS, RESERVE, WATTS, Crew, House, Maker
-from rr_actors.testing.watchdog import Watch
 from rr_actors.tools.inspection import Contents, check_state, read_state
 
 ROOT_MAKERS = {

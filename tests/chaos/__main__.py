@@ -1,4 +1,4 @@
-"""`python -m rr_actors.testing`, which `rr-actors chaos` runs: a system of its own that is harmed and checked."""
+"""`make chaos`: run a system of its own, harm it, and check it. `PYTHONPATH=tests python -m chaos` is the same."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from chaos.run import Options, run
 from rr_actors.base.errors import UsageError
-from rr_actors.testing.run import Options, run
 
 _WHAT = "Run a system of its own, kill and harm its processes at random, and check every promise in the end."
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="rr-actors chaos", description=_WHAT, argument_default=argparse.SUPPRESS)
+    parser = argparse.ArgumentParser(prog="python -m chaos", description=_WHAT, argument_default=argparse.SUPPRESS)
 
     def option(name: str, kind: Callable[[str], object], what: str, field: str | None = None) -> None:
         parser.add_argument(f"--{name}", type=kind, dest=field or name, metavar=name.upper(), help=what)

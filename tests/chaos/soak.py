@@ -14,11 +14,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from chaos.report import Tally
+from chaos.victim_managers import PATIENCE_S, Maker, Want
+from chaos.victim_system import MANAGERS, ROOT_MAKERS, Plant
 from rr_actors.base.errors import RrError
 from rr_actors.supervision.core.specs import ChildSpec
-from rr_actors.testing.report import Tally
-from rr_actors.testing.victim_managers import PATIENCE_S, Maker, Want
-from rr_actors.testing.victim_system import MANAGERS, ROOT_MAKERS, Plant
 
 _WARM_UP = 0.25  # the part of the samples that is left out
 _FEWEST_POINTS = 4  # that a line is laid through

@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from chaos.mission.mission_managers import PLANNERS
+from chaos.report import KILLS, Tally
+from chaos.victim_managers import LESS, WATTS, cut_links
+from chaos.victim_system import CREWS, HOUSE, MAKERS, ROOT_MAKERS, Plant
 from rr_actors.base.errors import CatalogDamaged, CatalogError, RrError
 from rr_actors.storage.opening import read_rows
-from rr_actors.testing.mission.mission_managers import PLANNERS
-from rr_actors.testing.report import KILLS, Tally
-from rr_actors.testing.victim_managers import LESS, WATTS, cut_links
-from rr_actors.testing.victim_system import CREWS, HOUSE, MAKERS, ROOT_MAKERS, Plant
 from rr_actors.wire.handshake import PROTOCOL
 
 _FULL_BYTES = 16 * 1024

@@ -1,6 +1,6 @@
 """The product, broken on purpose in one place each: chaos must notice every one of them within a minute.
 
-`python support_breakages.py NAME SEED STATE_DIR REPORT` runs chaos on a system that is broken so; an empty NAME: as it
+`python -m chaos.breakages NAME SEED STATE_DIR REPORT` runs chaos on a system that is broken so; an empty NAME: as it
 is. Each process of the system is broken: its fork server imports this module, which reads the name in the environment.
 """
 
@@ -11,11 +11,15 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from chaos import __main__ as program
+from chaos import load_threads, monkey, victim_managers, victim_system
+from chaos import run as runs
+from chaos.mission import mission_managers, mission_threads
+from chaos.monkey import Monkey
 from rr_actors.base.config import SystemConfig
 from rr_actors.managers import Choices, Keeper
 from rr_actors.managers.actions.graph_engine import GraphEngine
@@ -35,11 +39,6 @@ from rr_actors.supervision.child_main import ChildProcess
 from rr_actors.supervision.child_runs import ProcessRun
 from rr_actors.supervision.core import restarts
 from rr_actors.system.system import System
-from rr_actors.testing import __main__ as chaos
-from rr_actors.testing import load_threads, monkey, victim_managers, victim_system
-from rr_actors.testing import run as runs
-from rr_actors.testing.mission import mission_managers, mission_threads
-from rr_actors.testing.monkey import Monkey
 
 VARIABLE = "RR_ACTORS_TEST_BREAKAGE"
 
@@ -61,10 +60,10 @@ class Breakage(msgspec.Struct, frozen=True):
 
 
 def replace(function: Any, by: Any) -> None:
-    """Put a function in the place of another, wherever a module of the product, or a table of one, has it."""
+    """Put a function in the place of another in each module of the product and of chaos, and in their tables."""
     found = 0
     for name, module in list(sys.modules.items()):
-        if name.startswith("rr_actors"):
+        if name.partition(".")[0] in ("rr_actors", "chaos"):
             tables = [value for value in vars(module).values() if type(value) is dict]
             for table in (vars(module), *tables):
                 for key in [key for key, value in table.items() if value is function]:
@@ -463,15 +462,14 @@ def main(name: str, seed: str, state_dir: str, report: str) -> int:
     load_threads.PATIENCE_S = victim_managers.PATIENCE_S = mission_threads.LIMIT_S = 6.0
     victim_system.SETTLE_S = 5.0
     victim_system.ABANDON_S = runs.STALLED_S = 7.0
-    config = SystemConfig(preload=("support_breakages",))
+    config = SystemConfig(preload=("chaos.breakages",))
     victim_system.System = functools.partial(System, config=config)
     options = ["--kills", "25", "--seconds", "12", "--seed", seed, "--pace", "0.08", "--patience", "12"]
     sys.argv[1:] = [*options, "--state-dir", state_dir, "--json", report]
-    return chaos.main()
+    return program.main()
 
 
 if __name__ == "__main__":
-    sys.path.append(str(Path(__file__).parent.parent))
     code = main(*sys.argv[1:])
     sys.stdout.flush()
     os._exit(code)

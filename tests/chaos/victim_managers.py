@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from chaos.callback_log import Journal
 from rr_actors.base.errors import RrError
 from rr_actors.managers import Pool, Reserve, RunProgram, Share, Supply
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.server import Current, current
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.queries import Query
-from rr_actors.testing.callback_log import Journal
 
 PATIENCE_S = 25.0
 """The limit of a load that does not give up early."""

@@ -6,15 +6,10 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from rr_actors.base.errors import RrError
-from rr_actors.registrar.engine.status import Status
-from rr_actors.registrar.model.rows import State
-from rr_actors.supervision.core.specs import Backoff, ChildSpec
-from rr_actors.system.system import System
-from rr_actors.testing.callback_log import Journal, read_journal
-from rr_actors.testing.invariants import settled
-from rr_actors.testing.mission.mission_checks import check_acts, check_choices, check_graphs, check_kept, check_replicas
-from rr_actors.testing.mission.mission_managers import (
+from chaos.callback_log import Journal, read_journal
+from chaos.invariants import settled
+from chaos.mission.mission_checks import check_acts, check_choices, check_graphs, check_kept, check_replicas
+from chaos.mission.mission_managers import (
     ALTERNATIVES,
     SENSORS,
     SETTLE_S,
@@ -27,8 +22,13 @@ from rr_actors.testing.mission.mission_managers import (
     graphs_folder,
     write_files,
 )
-from rr_actors.testing.mission.mission_threads import LIMIT_S, Operator
-from rr_actors.testing.report import Tally
+from chaos.mission.mission_threads import LIMIT_S, Operator
+from chaos.report import Tally
+from rr_actors.base.errors import RrError
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.model.rows import State
+from rr_actors.supervision.core.specs import Backoff, ChildSpec
+from rr_actors.system.system import System
 from rr_actors.tools.inspection import Contents
 
 _OPERATORS = 2

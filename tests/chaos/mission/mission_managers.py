@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 
 import msgspec
 
+from chaos.callback_log import Journal
+from chaos.victim_managers import LOG_TO, Recorded, cut_links
 from rr_actors.managers import Action, Actions, Alternative, Choices, Choose, Keeper
 from rr_actors.registrar.declarations import server
-from rr_actors.testing.callback_log import Journal
-from rr_actors.testing.victim_managers import LOG_TO, Recorded, cut_links
 
 SENSORS = ("sensors-1", "sensors-2")
 PLANNERS = ("choices", "keeper", "actions")

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from chaos.victim_managers import LOG_TO, OWNER
 from rr_actors.runtime.processes.control_groups import ControlGroup, group_of
 from rr_actors.runtime.processes.lifeline import signal_if
-from rr_actors.testing.victim_managers import LOG_TO, OWNER
 
 _VARIABLE = "RR_ACTORS_CHAOS"
 

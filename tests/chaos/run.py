@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from traceback import format_exception
 
+from chaos.callback_log import Line, read_journal
+from chaos.monkey import Monkey
+from chaos.report import Report, Tally
+from chaos.soak import ENOUGH_SAMPLES, Churn, Soak
+from chaos.victim_managers import CREW, SUCCEEDED, UNEXPECTED, log_to
+from chaos.victim_system import Plant
+from chaos.watchdog import Standstill, Watch
 from rr_actors.base.errors import UsageError
-from rr_actors.testing.callback_log import Line, read_journal
-from rr_actors.testing.monkey import Monkey
-from rr_actors.testing.report import Report, Tally
-from rr_actors.testing.soak import ENOUGH_SAMPLES, Churn, Soak
-from rr_actors.testing.victim_managers import CREW, SUCCEEDED, UNEXPECTED, log_to
-from rr_actors.testing.victim_system import Plant
-from rr_actors.testing.watchdog import Standstill, Watch
 from rr_actors.tools.inspection import read_state
 
 _SHOW_S = 1.0

@@ -20,18 +20,18 @@ from typing import Any, cast
 import pytest
 
 import rr_actors as rr
+from chaos.callback_log import Journal, Line, check_journal, read_journal
+from chaos.invariants import check_at_rest, check_empty, check_told
+from chaos.load_threads import Consumer, Sent
+from chaos.monkey import Monkey
+from chaos.report import KILLS, Report, Tally
+from chaos.run import Options, _harm, run  # pyright: ignore[reportPrivateUsage]
+from chaos.soak import slope
+from chaos.victim_managers import Want
+from chaos.watchdog import Interrupted, Watch
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, Row, ServedQuery, State
-from rr_actors.testing.callback_log import Journal, Line, check_journal, read_journal
-from rr_actors.testing.invariants import check_at_rest, check_empty, check_told
-from rr_actors.testing.load_threads import Consumer, Sent
-from rr_actors.testing.monkey import Monkey
-from rr_actors.testing.report import KILLS, Report, Tally
-from rr_actors.testing.run import Options, _harm, run  # pyright: ignore[reportPrivateUsage]
-from rr_actors.testing.soak import slope
-from rr_actors.testing.victim_managers import Want
-from rr_actors.testing.watchdog import Interrupted, Watch
 from rr_actors.tools.inspection import Contents
-from support import REPOSITORY, eventually
+from support import TESTS, eventually
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_a_soak_says_how_much_each_figure_grew(tmp_path: Path) -> None:
     options = ["--soak", "4", "--churn", "0.5", "--state-dir", str(tmp_path / "state"), "--json", str(result)]
 
     ran = subprocess.run(
-        [sys.executable, "-m", "rr_actors.testing", *options], capture_output=True, text=True, timeout=50
+        [sys.executable, "-m", "chaos", *options], cwd=TESTS, capture_output=True, text=True, timeout=50
     )
 
     report = json.loads(result.read_text())
@@ -134,7 +134,7 @@ def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
 
 def test_on_the_command_line_they_are_refused_in_words() -> None:
     ran = subprocess.run(
-        [sys.executable, "-m", "rr_actors.testing", "--pace", "0"], capture_output=True, text=True, timeout=30
+        [sys.executable, "-m", "chaos", "--pace", "0"], cwd=TESTS, capture_output=True, text=True, timeout=30
     )
 
     assert ran.returncode == 2
@@ -178,9 +178,9 @@ def test_a_slow_monkey_is_interrupted_before_its_next_deed() -> None:
 
 @pytest.mark.slow
 def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "rr_actors.testing", "--kills", "1000"]
+    command = [sys.executable, "-m", "chaos", "--kills", "1000"]
     environment = dict(os.environ, TMPDIR=str(tmp_path))
-    chaos = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    chaos = subprocess.Popen(command, cwd=TESTS, env=environment, stderr=subprocess.PIPE, text=True)
     try:
         assert chaos.stderr is not None
         said = chaos.stderr.readline() + chaos.stderr.readline()  # the second: it harms
@@ -238,7 +238,7 @@ def test_an_interrupted_run_has_ended_before_its_watch_says_so() -> None:
 STANDSTILL = """
     import sys
     sys.path[:0] = {paths!r}
-    from rr_actors.testing import __main__, monkey, victim_system
+    from chaos import __main__, monkey, victim_system
     import time
     {breakage}
     sys.argv[1:] = ["--kills", "3", "--pace", "0.1", "--patience", "{patience}"]
@@ -261,7 +261,7 @@ STANDING = {
 @pytest.mark.parametrize("what", STANDING)
 def test_a_standstill_ends_in_its_time_is_named_and_is_a_failure(what: str, tmp_path: Path) -> None:
     breakage, phase, patience_s = STANDING[what]
-    paths = [str(REPOSITORY)]
+    paths = [str(TESTS)]
     report = tmp_path / "report.json"
     program = textwrap.dedent(STANDSTILL).format(
         breakage=breakage, paths=paths, patience=patience_s, state=str(tmp_path / "state"), report=str(report)
@@ -352,13 +352,13 @@ def test_a_line_that_a_kill_has_torn_is_no_line(tmp_path: Path) -> None:
 
 def test_a_killed_process_leaves_whole_lines_and_a_long_journal_several_files(tmp_path: Path) -> None:
     code = (
-        "import sys; from rr_actors.testing.callback_log import Journal\n"
+        "import sys; from chaos.callback_log import Journal\n"
         "journal = Journal(sys.argv[1])\n"
         "for n in range(1000): journal.note('maker', 'load', f'r{n}', n)\n"
         "print('done', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", code, str(tmp_path)], cwd=TESTS, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"done\n"

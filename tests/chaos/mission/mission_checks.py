@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import msgspec
 
+from chaos.callback_log import Line
+from chaos.mission.mission_managers import ACT, ACTED, ALTERNATIVES, RELEASED, SEEN, STEPS
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.managers import Choose, Kept
 from rr_actors.managers.actions.graph_runs import LIVE, MOST_ATTEMPTS, run_in
@@ -14,8 +16,6 @@ from rr_actors.managers.choices.alternatives import key_of
 from rr_actors.managers.choices.matching import ranked
 from rr_actors.registrar.model.rows import Held, Phase, Resource, State
 from rr_actors.registrar.queries import ResourceInfo
-from rr_actors.testing.callback_log import Line
-from rr_actors.testing.mission.mission_managers import ACT, ACTED, ALTERNATIVES, RELEASED, SEEN, STEPS
 from rr_actors.tools.inspection import Contents
 
 _PLACES = {step.__name__: place for place, step in enumerate(STEPS)}

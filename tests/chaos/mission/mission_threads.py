@@ -7,6 +7,11 @@ import uuid
 from collections.abc import Callable
 from typing import NamedTuple
 
+from chaos.callback_log import Journal
+from chaos.load_threads import LoadThread
+from chaos.mission.mission_checks import wrong_fatal
+from chaos.mission.mission_managers import CHOICES, DESIRED, GRAPH, RELEASED, SEEN, SENSORS
+from chaos.report import Tally
 from rr_actors.base.errors import RrError
 from rr_actors.managers import Choose, RunGraph
 from rr_actors.managers.actions.graph_runs import ENDED, OVER, run_in
@@ -15,11 +20,6 @@ from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.system.system import System
-from rr_actors.testing.callback_log import Journal
-from rr_actors.testing.load_threads import LoadThread
-from rr_actors.testing.mission.mission_checks import wrong_fatal
-from rr_actors.testing.mission.mission_managers import CHOICES, DESIRED, GRAPH, RELEASED, SEEN, SENSORS
-from rr_actors.testing.report import Tally
 
 LIMIT_S = 10.0
 """How long a call of an operator may take."""
