@@ -126,9 +126,9 @@ def _dumps_parts(value: object, what: str) -> bytes | Large:
     try:
         parts: list[Bytes] = []
         pickle.Pickler(_Parts(parts.append), _PROTOCOL, buffer_callback=keep).dump(value)
-        _were_large = sum(map(len, parts)) >= LARGE_BYTES
+        is_large = _were_large = sum(map(len, parts)) >= LARGE_BYTES
         if all(_is_plain(part) for part in parts if len(part) < LARGE_BYTES or part[:1] in (_PROTO, _FRAME)):
-            return Large(value, what, parts, buffers) if _were_large or buffers else b"".join(parts)
+            return Large(value, what, parts, buffers) if is_large or buffers else b"".join(parts)
     except Exception:
         pass  # as above
     buffers.clear()

@@ -18,6 +18,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import cloudpickle
@@ -26,7 +27,7 @@ import pytest
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import InvalidRequest, NotSerializable
-from rr_actors.base.pickling import dumps, loads
+from rr_actors.base.pickling import LARGE_BYTES, Large, dumps, dumps_large, loads
 from rr_actors.base.values.canonical import Codec, encode
 
 ROOT = Path(__file__).parents[2]
@@ -626,3 +627,22 @@ def test_a_global_variable_of_main_that_cannot_travel_is_named() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("load callback: global variable 'lock'\n", "")
+
+
+def test_a_value_is_large_whatever_another_thread_pickles_meanwhile() -> None:
+    value = b"x" * LARGE_BYTES
+    steps: list[int] = []
+
+    def small_one_after_each_step(_frame: FrameType, _event: str, _arg: object) -> Any:
+        dumps_large("small", "value")
+        steps.append(1)
+        return small_one_after_each_step
+
+    before = sys.gettrace()
+    sys.settrace(small_one_after_each_step)
+    try:
+        packed = dumps_large(value, "value")
+    finally:
+        sys.settrace(before)
+    assert len(steps) > 5
+    assert type(packed) is Large
