@@ -1,7 +1,8 @@
 """Replacements: a status callback puts a spare in the place of a part that failed.
 
 A crash may come at any instruction. If the swap is not on disk by then, the status arrives and its callback runs again.
-The callback finds the spare by its id, which is made of the ids of the part and of the status. After the swap, the
+The callback finds the spare by its id, which is made of the ids of the part and of the status. A spare whose load had
+not been answered is released, and loaded again under another id. After the swap, the
 resource does not hold the part any more: its release is owed, and its statuses concern nobody.
 """
 
@@ -12,7 +13,7 @@ import hashlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from rr_actors.base.errors import UnknownQuery, UsageError
+from rr_actors.base.errors import LoadError, UnknownQuery, UsageError
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.arguments import LoadOptions
@@ -20,6 +21,7 @@ from rr_actors.registrar.engine.server import ServerActor, status_callback_of
 from rr_actors.registrar.engine.status import Status, next_spare
 from rr_actors.registrar.loads import Loads, Unloads
 from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.failures import is_released
 from rr_actors.registrar.model.rows import Held, Hold, Resource, priority_of
 from rr_actors.registrar.queries import Query
 
@@ -68,12 +70,23 @@ class Replacements:
         if row is not None:  # an interrupted run of the callback has loaded the spare
             spare = self._calls.call(self._views.of, row)
         else:
-            id = _spare_id(family, place, raw, next_spare(status))
             options = LoadOptions(timeout_s=timeout_s, priority=priority_of(found.part.priority), own=found.part.own)
-            spare = self._loads.wait(place, raw, resource_id, options, query_id=id)
+            spare = self._load(status, family, place, raw, resource_id, options)
         self._swap(found, found.part, status, spare, family, response)
         status.handled()
         return spare
+
+    def _load(
+        self, status: Status, family: str, place: ServerId, request: bytes, resource_id: str, options: LoadOptions
+    ) -> Query:
+        """Load the spare by the next query whose load was not interrupted by a crash: such a query is released."""
+        while True:
+            id = _spare_id(family, place, request, next_spare(status))
+            try:
+                return self._loads.wait(place, request, resource_id, options, query_id=id)
+            except LoadError as error:
+                if not is_released(error):
+                    raise
 
     def _find(self, resource_id: str, part_id: str, family: str) -> _Found:
         with self._actor.enter():

@@ -20,10 +20,14 @@ ROUNDS = 25
 
 
 class Lidars(rr.Manager):
-    """Serves "lidar"; a lidar is at once there."""
+    """Serves "lidar"; a lidar is at once there, unless the test has shut its step."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
 
     @rr.server("lidar")
     def load_lidar(self, request: str) -> str:
+        self.work.step(f"lidar {request}")
         return f"/scan/{request}"
 
     @load_lidar.unload
@@ -68,7 +72,8 @@ class World:
     """A robot that the application holds, and its lidars."""
 
     def __init__(self, start: Start, workshop: Workshop) -> None:
-        children = [rr.ChildSpec(Lidars, id="lidars"), rr.ChildSpec(Robots, id="robots", args=(str(workshop.root),))]
+        args = (str(workshop.root),)
+        children = [rr.ChildSpec(Lidars, id="lidars", args=args), rr.ChildSpec(Robots, id="robots", args=args)]
         self.system = start(rr.Supervisor(children, id="root", max_restarts=10_000, max_seconds=1.0))
         self.lidars = self.system.registrar("lidars")
         self.robots = self.system.registrar("robots")
@@ -123,6 +128,22 @@ def test_a_manager_that_dies_at_a_point_of_the_call_has_replaced_the_part_when_i
     assert len(workshop.lines("replace 0")) == (1 if point == "the end" else 2)
     assert set(world.heard) == {rr.State.UPDATE}  # what is replaced concerns nobody above
     assert len(world.heard) == 1
+
+
+@pytest.mark.parametrize("victims", [("robots",), ("robots", "lidars"), ("lidars", "robots")])
+def test_a_manager_that_dies_while_the_spare_is_being_loaded_loads_it_again(
+    start: Start, workshop: Workshop, victims: tuple[str, ...]
+) -> None:
+    world = World(start, workshop)
+    workshop.shut("lidar 1")
+    world.fail(0)
+    workshop.wait("lidar 1")
+    for victim in victims:
+        wait_respawned(world.system, victim, kill(world.system, victim))
+    workshop.wait("replace 0", 2)
+    workshop.open("lidar 1")
+    world.settled_with(1)
+    assert world.heard == [rr.State.UPDATE]
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def ask(decision: Decision, command: AskProvider) -> None:
             if known.hold is HELD:
                 decision.cause(LoadResolved(known, None))
             elif known.hold is OWED:
-                decision.cause(LoadResolved(known, failures.withdrawn(known, "it is being released")))
+                decision.cause(LoadResolved(known, failures.being_released(known)))
             return
     held = pending(command, attempt, priority)
     look_there(decision, command.registrar)

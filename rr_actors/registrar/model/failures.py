@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rr_actors.base.errors import did_you_mean, shortened, shown
+from rr_actors.base.errors import LoadError, did_you_mean, shortened, shown
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.catalog import Catalog
@@ -184,8 +184,19 @@ def ring_of_holds(ring: Sequence[str], held: Held) -> str:
     return f"resource {held.parent} was its own part: {names}; released is its query {held.id} on {ring[0]}"
 
 
-LET_GO = Failure("LoadError", "released before its load arrived")
+_RELEASED = {"released": True}
+LET_GO = Failure("LoadError", "released before its load arrived", _RELEASED)
 """The failure of a Load that arrives after the Unload of the same query."""
+
+
+def being_released(held: Held) -> Failure:
+    """Return the failure of a load by a query that is being released."""
+    return Failure("LoadError", f"{held.registrar}/{held.server}: it is being released", _RELEASED)
+
+
+def is_released(error: LoadError) -> bool:
+    """Return whether a load has failed because its query had been released: another query may ask for the same."""
+    return "released" in error.details
 
 
 def taken_before_heard(query_id: str) -> Failure:
