@@ -79,7 +79,6 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.base.values.codecs import codec
         from rr_actors.registrar.declarations import Declared, server
         from rr_actors.registrar.engine.progress import Progress
-        from rr_actors.registrar.engine.server import Current, current
         from rr_actors.registrar.engine.status import Status
         from rr_actors.registrar.load_groups import Queries
         from rr_actors.registrar.manager import Manager, ref
@@ -87,6 +86,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.registrar.model.rows import State
         from rr_actors.registrar.queries import Query, ResourceInfo
         from rr_actors.registrar.registrar import Registrar
+        from rr_actors.registrar.servers.callback_context import Current, current
         from rr_actors.streams.publisher import Publisher
         from rr_actors.streams.stream import Stream, StreamFrame, StreamInfo
         from rr_actors.streams.stream_reader import StreamReader
@@ -238,7 +238,7 @@ if not TYPE_CHECKING:
         "rr_actors.managers": "Action GraphResult run_graph",
         "rr_actors.registrar.declarations": "Declared server",
         "rr_actors.registrar.engine.progress": "Progress",
-        "rr_actors.registrar.engine.server": "Current current",
+        "rr_actors.registrar.servers.callback_context": "Current current",
         "rr_actors.registrar.engine.status": "Status",
         "rr_actors.registrar.load_groups": "Queries",
         "rr_actors.registrar.manager": "Manager ref",

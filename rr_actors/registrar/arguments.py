@@ -30,10 +30,10 @@ from rr_actors.base.names import ServerId, check_name, parse_server
 from rr_actors.base.values.canonical import Codec
 from rr_actors.registrar.declarations import Declared, declaring
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.engine.server import Current, current_or_none
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.progress_hearers import ProgressWanted
 from rr_actors.registrar.queries import Query, ResourceInfo, StatusCallback
+from rr_actors.registrar.servers.callback_context import Current, current_or_none
 from rr_actors.runtime.callback_errors import described
 from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import time_limit

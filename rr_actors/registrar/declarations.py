@@ -16,15 +16,15 @@ from rr_actors.base.names import check_name
 from rr_actors.base.notebook import warn_of_redefined
 from rr_actors.registrar.engine.server import (
     RECOVER_S,
-    ROLES,
     Labels,
     ServerSpec,
     checked_callback,
     checked_spec,
     checked_whole,
-    current,
 )
 from rr_actors.registrar.model.health import Health
+from rr_actors.registrar.model.roles import ROLES
+from rr_actors.registrar.servers.callback_context import current
 from rr_actors.runtime.workers import is_async
 from rr_actors.wire.name_service import Directory, Presence, registrar_key
 

@@ -28,7 +28,6 @@ from rr_actors.base.values.failure import Failure, error_of, failure_of
 from rr_actors.registrar.arguments import LoadOptions, check_allowed
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
-from rr_actors.registrar.engine.server import Current, check_not_own, serving
 from rr_actors.registrar.links.provider_link import ProviderLink
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
@@ -36,6 +35,7 @@ from rr_actors.registrar.model.messages import Loaded, LoadRefused, Message, Unl
 from rr_actors.registrar.model.rows import STANDBY, Held, Hold, Resource
 from rr_actors.registrar.progress_hearers import Hearing, HearsHere, HearsInWorkers, HearsOnThisLoop, hearer_of
 from rr_actors.registrar.queries import Query, Views, loaded, loaded_directly
+from rr_actors.registrar.servers.callback_context import Current, check_not_own, serving
 from rr_actors.runtime.callback_errors import described
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until

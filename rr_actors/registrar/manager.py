@@ -19,8 +19,9 @@ from rr_actors.registrar.arguments import check_text
 from rr_actors.registrar.declarations import Declared, spec_for
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
-from rr_actors.registrar.engine.server import ServerSpec, current, serving
+from rr_actors.registrar.engine.server import ServerSpec
 from rr_actors.registrar.registrar import Registrar, register_spec
+from rr_actors.registrar.servers.callback_context import current, serving
 from rr_actors.runtime.workers import Gate
 from rr_actors.wire.name_service import Presence
 

@@ -48,22 +48,7 @@ from rr_actors.registrar.declarations import Declared
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
-from rr_actors.registrar.engine.server import (
-    RECOVER_S,
-    Current,
-    Measured,
-    ServerActor,
-    ServerSpec,
-    Usages,
-    check_not_measuring,
-    check_not_own,
-    checked_spec,
-    checked_whole,
-    current_or_none,
-    log_unread_types,
-    serving,
-    status_callback_of,
-)
+from rr_actors.registrar.engine.server import RECOVER_S, ServerSpec, checked_spec, checked_whole, log_unread_types
 from rr_actors.registrar.engine.status import Status, message_text
 from rr_actors.registrar.links.provider_link import ListQueries
 from rr_actors.registrar.links.remote_calls import for_handles
@@ -89,6 +74,17 @@ from rr_actors.registrar.model.rows import ServedQuery as QueryRow
 from rr_actors.registrar.pages import Page, Wanted, counted_loads, load_rows, page_of
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, response_bytes
 from rr_actors.registrar.replacements import Replacements, encoded_response
+from rr_actors.registrar.servers import stored_values
+from rr_actors.registrar.servers.callback_context import (
+    Current,
+    check_not_measuring,
+    check_not_own,
+    current_or_none,
+    serving,
+    status_callback_of,
+)
+from rr_actors.registrar.servers.server_actor import ServerActor
+from rr_actors.registrar.servers.usage_callbacks import Measured, Usages
 from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import RunningLimit, finite_time, time_limit
 from rr_actors.streams.stream import StreamInfo
@@ -638,7 +634,7 @@ class Registrar(Consumer):
             catalog = self._actor.whole()
             resources = [catalog.resources[id] for id in catalog.by_server.get(spec.name, ())]
             known = catalog.server_types.get(types_id(spec.name))
-        reread = server.reread(resources, b"" if known is None else known.blob)
+        reread = stored_values.reread(server, resources, b"" if known is None else known.blob)
         kept = self._calls.call(self._register, server, stored, reread)
         if kept and is_declared_here and spec.recovery is None and spec.recover is None:
             logger.warning(_KEPT, self.name, spec.name, kept)
@@ -1183,7 +1179,7 @@ class Registrar(Consumer):
 
 
 def _begun(some: list[tuple[Resource, ServerActor]]) -> dict[str, Future[Measured]]:
-    return {row.id: server.measure(row) for row, server in some}
+    return {row.id: server.usage.measure(row) for row, server in some}
 
 
 def _wanted_ids(of: object) -> frozenset[str] | None:

@@ -25,9 +25,10 @@ from rr_actors.base.names import ServerId
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.engine.server import ROLES, ServerSpec, log_unread_types
+from rr_actors.registrar.engine.server import ServerSpec, log_unread_types
 from rr_actors.registrar.links.remote_calls import HandleLine, is_for_handles
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries
+from rr_actors.registrar.model.roles import ROLES
 from rr_actors.registrar.queries import Holder, Query, held_by, read_as
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.runtime.time_limits import time_limit

@@ -35,7 +35,7 @@ from rr_actors.base.errors import (
 from rr_actors.base.notebook import note_started
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import trace_of
-from rr_actors.registrar.engine.server import check_not_own, serving
+from rr_actors.registrar.servers.callback_context import check_not_own, serving
 from rr_actors.runtime.processes.process import check_descriptors
 from rr_actors.supervision.child_runs import Target
 from rr_actors.supervision.core import child_calls

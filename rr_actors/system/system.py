@@ -45,10 +45,10 @@ from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.hosting.process_node import SystemInfo
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.engine.server import check_not_own, serving
 from rr_actors.registrar.pages import LoadRow, Wanted
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.registrar.registrar import page as page_in
+from rr_actors.registrar.servers.callback_context import check_not_own, serving
 from rr_actors.runtime.backlogs import Backlog
 from rr_actors.runtime.event_loop import (
     FORKED,

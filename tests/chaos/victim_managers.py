@@ -21,9 +21,9 @@ from chaos.callback_log import Journal
 from rr_actors.base.errors import RrError
 from rr_actors.managers import Pool, Reserve, RunProgram, Share, Supply
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.server import Current, current
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.queries import Query
+from rr_actors.registrar.servers.callback_context import Current, current
 
 PATIENCE_S = 25.0
 """The limit of a load that does not give up early."""

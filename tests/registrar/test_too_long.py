@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.engine.server import ServerActor
+from rr_actors.registrar.servers.server_actor import ServerActor
 from support import Workshop, eventually, serve
 from support_inside import actor_of, on_loop
 from support_managers import Shop

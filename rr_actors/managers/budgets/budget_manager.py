@@ -34,10 +34,10 @@ from rr_actors.managers.planning.last_good import still_standing
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
 from rr_actors.managers.planning.setbacks import Setbacks
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.server import Current, current
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import Phase
 from rr_actors.registrar.registrar import begin_revocation, on_happened, served
+from rr_actors.registrar.servers.callback_context import Current, current
 from rr_actors.runtime.processes.control_groups import CONTROLLERS, ControlGroups
 from rr_actors.runtime.time_limits import LONGEST_GRACE_S
 

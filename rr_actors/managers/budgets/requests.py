@@ -7,7 +7,7 @@ import msgspec
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import UsageError, shown
 from rr_actors.base.names import new_id
-from rr_actors.registrar.engine.server import current_or_none
+from rr_actors.registrar.servers.callback_context import current_or_none
 
 
 def _whose() -> str:

@@ -10,13 +10,13 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import text_of_value
 from rr_actors.base.values.failure import error_of
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
-from rr_actors.registrar.engine.server import Servers
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.links.provider_link import ProviderLink, ProviderLinks
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.rows import OWED, Resource, is_revocation
+from rr_actors.registrar.servers.registered_servers import Servers
 from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
 from rr_actors.runtime.time_limits import RunningTimers
 
@@ -157,9 +157,9 @@ class EffectRunner:
         if server is None:
             self._registrar.post(c.RunEnded(effect.role, effect.resource_id))
         elif effect.role == "usage":
-            server.start_usage(effect.resource_id)
+            server.usage.start(effect.resource_id)
         else:
-            server.start_probe(effect.resource_id)
+            server.health.start(effect.resource_id)
 
     def _start_pause(self, effect: e.StartPause) -> None:
         server = self._servers.get(effect.resource.server)

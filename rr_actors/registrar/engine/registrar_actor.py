@@ -18,7 +18,6 @@ from rr_actors.registrar.engine.effect_runner import EffectRunner
 from rr_actors.registrar.engine.progress import ProgressReports
 from rr_actors.registrar.engine.registrar_base import Opening, RegistrarBase
 from rr_actors.registrar.engine.registrar_state import LoadWaiter, UnloadWaiter, answered_by_line
-from rr_actors.registrar.engine.server import Servers
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.links.provider_link import THREADS, ProviderLink, ProviderLinks, ServerTypes
@@ -26,6 +25,9 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import Loaded, LoadRefused
 from rr_actors.registrar.model.rows import Held, Hold
+from rr_actors.registrar.servers.callback_failures import load_failure
+from rr_actors.registrar.servers.registered_servers import Servers
+from rr_actors.registrar.servers.server_actor import RequestReader
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.runtime.thread_rules import on_loop
@@ -52,7 +54,7 @@ class RegistrarActor(RegistrarBase):
         self.clients = ProviderLinks(self)
         self.types = ServerTypes(self, self.clients)
         self.runner = EffectRunner(self, self.consumers, self.servers, self.clients)
-        self.reader = self.servers
+        self.reader = RequestReader(self, self.consumers, self.servers.get)
 
     # -- start and stop ------------------------------------------------------------------------------------------
 
@@ -177,7 +179,7 @@ class RegistrarActor(RegistrarBase):
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
         resource = self.catalog.resources.get(loaded.resource_id)
         server = None if resource is None else self.servers.get(resource.server)
-        failure = failure_of(error) if server is None else server.load_failure(error)
+        failure = failure_of(error) if server is None else load_failure(error, server.origin)
         return LoadRefused(loaded.query_id, failure)
 
     # -- loads and unloads ---------------------------------------------------------------------------------------

@@ -1,0 +1,148 @@
+"""Health: the health callbacks of one server probe its resources, and set their states by what they find."""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from rr_actors.base.errors import InvalidResponse, Unavailable, is_a, readable, shown
+from rr_actors.base.names import new_id
+from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.health import WELL, Health, ProbeCounts, ProbeResult, first_counts, judged
+from rr_actors.registrar.model.roles import PROBE
+from rr_actors.registrar.model.rows import LOADED, Resource, State
+from rr_actors.registrar.servers.callback_failures import said
+from rr_actors.registrar.servers.server_base import ServerBase, nothing
+from rr_actors.runtime.callback_errors import log_raised
+from rr_actors.runtime.thread_rules import on_loop
+from rr_actors.runtime.time_limits import Probes
+
+logger = Log("rr_actors.server")
+
+_NO_HEALTH = Health()
+_CAREFUL_S = 60.0  # so long after its start, a process writes down which health callbacks run
+
+
+class HealthCallbacks:
+    """Runs the health callback of one server, in rounds.
+
+    Attributes:
+        probes: the rounds.
+    """
+
+    def __init__(self, server: ServerBase) -> None:
+        self._registrar, self._server, self._origin = server.registrar, server, server.origin
+        health = server.spec.health or _NO_HEALTH
+        loop, rounds = server.registrar.node.dispatcher.loop, (health.every_s, health.timeout_s)
+        self.probes = Probes(loop, *rounds, self._probed, self._probe, self._probe_late)
+        self._health, self._counts = health, dict[str, ProbeCounts]()  # by resource
+        self._inherited = self._held_before() if server.spec.health else frozenset[str]()
+        self._careful_until = math.inf
+        server.add(PROBE, self._probe_arguments, self._found)
+
+    @on_loop
+    def open(self) -> None:
+        """Begin to probe. Before on_start has returned, the health callback may lack what that makes."""
+        if self._server.spec.health is not None:
+            self._careful_until = time.monotonic() + _CAREFUL_S
+            self.probes.open()
+
+    @on_loop
+    def _probed(self) -> list[str]:
+        """Return the resources of the next round, and forget the results of the others."""
+        with self._registrar.lock:
+            ids = list(self._registrar.whole().by_server.get(self._server.spec.name, ()))
+        ids = [id for id in ids if self._is_probed(id)]
+        self._counts = {id: counts for id in ids if (counts := self._counts.get(id)) is not None}
+        return ids
+
+    def _is_probed(self, resource_id: str) -> bool:
+        catalog = self._registrar.catalog
+        resource = catalog.resources.get(resource_id)
+        lives = resource is not None and resource.phase is LOADED and resource.state is not State.FATAL
+        return lives and resource_id not in catalog.recovering and resource_id not in catalog.revocations
+
+    @on_loop
+    def _probe(self, ids: Sequence[str]) -> None:
+        """Have the health callback run for each of these resources."""
+        self._registrar.workers.threads.gather()
+        try:
+            for id in ids:
+                resource = self._registrar.catalog.resources.get(id)
+                if resource is not None and self._is_suspect(id):
+                    self._registrar.post(c.BeginRun("health", id, self._server.spec.name))
+                elif resource is None:
+                    self.probes.ended(id)
+                else:
+                    self._server.submit(PROBE, resource, resource.attempt, functools.partial(self._probe_ended, id))
+        finally:
+            self._registrar.workers.threads.go()
+
+    def _held_before(self) -> frozenset[str]:
+        with self._registrar.lock:
+            return frozenset(self._registrar.whole().by_server.get(self._server.spec.name, ()))
+
+    def _is_suspect(self, resource_id: str) -> bool:
+        """Return whether the process before may have died in this callback: the disk has its next runs first.
+
+        A row for each run would cost too much for ever. The first death of a process in a health callback counts as any
+        other crash does.
+        """
+        return resource_id in self._inherited and time.monotonic() < self._careful_until
+
+    @on_loop
+    def start(self, resource_id: str) -> None:
+        """Run a health callback that the disk has."""
+        resource = self._registrar.catalog.resources.get(resource_id)
+        if not self.probes.is_waiting(resource_id):  # for a server of this name that was here before
+            self._registrar.post(c.RunEnded("health", resource_id))
+        elif resource is None:
+            self.probes.ended(resource_id)
+        else:
+            done = functools.partial(self._suspect_ended, resource_id)
+            self._server.submit(PROBE, resource, resource.attempt, done)
+
+    def _suspect_ended(self, resource_id: str, found: ProbeResult | None, error: BaseException | None) -> None:
+        self._registrar.post(c.RunEnded("health", resource_id))
+        self._probe_ended(resource_id, found, error)
+
+    def _probe_arguments(self, resource: Resource) -> tuple[Any, Any]:
+        if not self.probes.begins(resource.id, self._is_probed):
+            raise Unavailable(f"{self._origin}: resource {resource.id} is not probed now")
+        return self._server.request_and_response_of(resource)
+
+    def _found(self, answer: object) -> ProbeResult:
+        if answer is None:
+            return WELL
+        status = answer if is_a(answer, Status) else None
+        state = answer if status is None else status.state
+        if not is_a(state, State) or state is State.UPDATE:
+            expected = "None, or the State OK, WARNING, ERROR or FATAL, or a Status with one"
+            text = f"expected {expected}, got {shown(answer)} ({type(answer).__name__})"
+            raise InvalidResponse(text, server=self._origin, path="", expected=expected)
+        return ProbeResult(State(state), "" if status is None else status.message)
+
+    def _probe_ended(self, resource_id: str, found: ProbeResult | None, error: BaseException | None) -> None:
+        if self.probes.ended(resource_id):
+            self._judge(resource_id, found or ProbeResult(State.ERROR, "" if error is None else said(error)), error)
+
+    def _probe_late(self, resource_id: str) -> None:
+        self._judge(resource_id, ProbeResult(State.ERROR, f"not returned within {self._health.timeout_s:g} s"))
+
+    def _judge(self, resource_id: str, found: ProbeResult, error: BaseException | None = None) -> None:
+        """Count a result, and set the status of the resource if its state changes by that."""
+        if self._registrar.closed or not self._is_probed(resource_id):
+            return
+        counts = self._counts.get(resource_id) or first_counts(self._registrar.catalog.resources[resource_id].state)
+        self._counts[resource_id], state = judged(self._health, counts, found, self.probes.ran_s())
+        if state is None:
+            return
+        text = readable(f"health: {found.message or found.state}")
+        if error is not None:
+            log_raised(logger, error, "%s: %s; resource %s has the state %s", self._origin, text, resource_id, state)
+        self._registrar.post(c.SetStatus(resource_id, new_id(), state, text, nothing))

@@ -1,0 +1,591 @@
+"""ServerActor: one kind of resource of one registrar. It runs its callbacks in workers, and says how they ended.
+
+In the worker, a request and a response are decoded, the callback is called, and its result is encoded. The end of a run
+is heard on the event loop; the end of one that goes well is heard first in the worker, which may deal with it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import math
+import threading
+import time
+import zlib
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import (
+    InvalidSpec,
+    MailboxFull,
+    NotSerializable,
+    RrError,
+    Unavailable,
+    readable,
+    shortened,
+    shown,
+    text_of,
+)
+from rr_actors.base.names import new_id
+from rr_actors.base.reporting.log import Log
+from rr_actors.base.values.canonical import Codec
+from rr_actors.base.values.failure import Failure, failure_of
+from rr_actors.base.values.type_shapes import digest_of
+from rr_actors.registrar.core.callback_runs import deaths_of
+from rr_actors.registrar.core.decide import Item
+from rr_actors.registrar.engine.registrar_base import RegistrarBase
+from rr_actors.registrar.engine.server import Callback, ServerSpec, checked_callback
+from rr_actors.registrar.engine.status import status_of
+from rr_actors.registrar.links.consumer_links import Consumers
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Server
+from rr_actors.registrar.model.messages import Load
+from rr_actors.registrar.model.roles import LOAD, PAUSE, RECOVER, RESUME, STATUS, UNLOAD, Role
+from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
+from rr_actors.registrar.servers import stream_events
+from rr_actors.registrar.servers.callback_context import Current, enter
+from rr_actors.registrar.servers.callback_failures import load_failure, said
+from rr_actors.registrar.servers.health_callbacks import HealthCallbacks
+from rr_actors.registrar.servers.server_base import nothing
+from rr_actors.registrar.servers.usage_callbacks import UsageCallbacks
+from rr_actors.runtime.callback_errors import Raised, described_error, log_raised
+from rr_actors.runtime.thread_rules import on_loop, with_lock
+from rr_actors.runtime.user_loop import COROUTINE, Done, closing
+from rr_actors.runtime.workers import Gate, is_async
+from rr_actors.wire.frames import ADVICE
+
+logger = Log("rr_actors.server")
+
+_NEWEST = 500  # load callbacks of a server, of which the times are kept
+_ROW_BYTES = 1024  # room for the names and ids that are sent with a request, a response, or types
+
+
+class LoadTimes:
+    """How many load callbacks of one server have ended since it was registered, and how long they took. Any thread.
+
+    Attributes:
+        loaded, failed: how many have returned, and raised.
+        seconds: how long they took together.
+        longest_s: how long the longest took.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest: deque[float] = deque(maxlen=_NEWEST)
+        self.loaded = self.failed = 0
+        self.seconds = self.longest_s = 0.0
+
+    def take(self, began_s: float, *, failed: bool) -> None:
+        """Count a callback that began at this time of the monotonic clock, and has ended now."""
+        took_s = time.monotonic() - began_s
+        with self._lock:
+            self.failed += failed
+            self.loaded += not failed
+            self.seconds += took_s
+            self.longest_s = max(self.longest_s, took_s)
+            self._newest.append(took_s)
+
+    def p95_s(self) -> float:
+        """Return the time within which 95 % of the newest 500 callbacks ended; 0.0 if none has ended."""
+        with self._lock:
+            newest = sorted(self._newest)
+        return newest[math.ceil(0.95 * len(newest)) - 1] if newest else 0.0
+
+
+class ServerActor:
+    """One server of a registrar: starts its callbacks, and says how they ended.
+
+    The registrar tells it which callback to start; it posts LoadDone, LoadErred and so on back.
+
+    Attributes:
+        facts: what decisions know of it.
+        usage, health: these two callbacks.
+        digest: of the types of requests and responses.
+
+    Raises:
+        InvalidSpec: a callback has attributes that cannot be read.
+        NotSerializable: the types are too long to be sent to consumers.
+    """
+
+    def __init__(self, registrar: RegistrarBase, spec: ServerSpec, types: bytes) -> None:
+        self.spec = spec
+        self.restored = False  # whether it came from the catalog; then a second registration replaces it
+        has = spec.status is not None, spec.recover is not None
+        limits = spec.linger_s, spec.load_timeout_s, spec.recovery or "keep"
+        checksum = zlib.crc32(types)
+        idle = spec.idle == "pause", spec.paused_s
+        self.facts = Server(spec.name, *limits, *has, types, checksum, spec.recover_timeout_s, *idle)
+        self.registrar = registrar
+        self.origin = f"{registrar.name}/{spec.name}"
+        if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):
+            text = f"{self.origin}: types: {size} bytes are over the limit of {limit} (frame_limit_bytes)"
+            raise NotSerializable(f"{text}: have a module that others can import, or raise the limit", path="types")
+        self._runs_again = spec.recover is not None or self.facts.recovery != "keep"
+        self.request = Codec(spec.request_type, f"{self.origin}: request")
+        self.response = Codec(spec.response_type, f"{self.origin}: response")
+        self.digest = digest_of((self.request.shape, self.response.shape))
+        self._gate = registrar.gate or (None if spec.at_once is None else Gate(spec.at_once))
+        self._runs: dict[Role, Callback] = {}
+        one, both = self.request_of, self.request_and_response_of
+        self.add(LOAD, one, self.response.encode)
+        self.add(UNLOAD, both, nothing)
+        self.add(RECOVER, both, self.response.encode)
+        self.add(STATUS, one, nothing)
+        self.add(PAUSE, both, nothing)
+        self.add(RESUME, both, self._new_response)
+        self.usage = UsageCallbacks(self)
+        self.health = HealthCallbacks(self)
+        self.load_times = LoadTimes()
+
+    def add(self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]) -> None:
+        """Run callbacks of a role from now on.
+
+        Args:
+            arguments: returns what the callback is called with, in the worker.
+            result: returns what is made of the callback's answer, in the worker.
+
+        Raises:
+            InvalidSpec: the callback has attributes that cannot be read.
+        """
+        what = f"{self.origin}: {role.name}"
+        callback = getattr(self.spec, role.name) or nothing
+        try:
+            taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
+            self._runs[role] = self._wrapped(taking, arguments, result)
+        except Exception as error:
+            expected = "a callable whose attributes can be read"
+            text = f"{what}: expected {expected}, got {shown(callback)}: {text_of(error)}"
+            raise InvalidSpec(text, field=role.name, expected=expected, got=callback) from None
+
+    def request_of(self, resource: Resource) -> tuple[Any]:
+        """Return the request, as the argument of a callback. In a worker."""
+        return (self.request.decode(resource.request, self.origin),)
+
+    def request_and_response_of(self, resource: Resource) -> tuple[Any, Any]:
+        """Return the request and the response, as the arguments of a callback. In a worker."""
+        request = self.request.decode(resource.request, self.origin)
+        if resource.response is None:
+            return request, None
+        return request, self.response.decode(resource.response, self.origin, "response")
+
+    # -- load ----------------------------------------------------------------------------------------------------
+
+    def readable(self, load: Load) -> Load | c.RefuseLoad:
+        """Return a consumer's Load with its request in canonical form, or the refusal of a request that cannot be read.
+
+        A worker calls it if reading the request runs user code.
+        """
+        try:
+            canonical = self.request.canonical(load.request, self.origin)
+        except RrError as error:
+            return c.RefuseLoad(load.origin, load.query_id, failure_of(error))
+        return load if canonical == load.request else msgspec.structs.replace(load, request=canonical)
+
+    @on_loop
+    def start_load(self, resource: Resource) -> None:
+        """Run the load callback."""
+        began_s = time.monotonic()
+        done = functools.partial(self._load_ended, resource, began_s)
+        at_once = functools.partial(self._loaded, resource, began_s)
+        self.submit(LOAD, resource, resource.attempt, done, at_once=at_once)
+
+    def _loaded(self, resource: Resource, began_s: float, response: bytes) -> bool:
+        """Decide LoadDone in the thread that ran the callback; return False if the loop has to."""
+        reports = self.registrar.progress
+        if self.too_long(resource, response) is not None or (reports.loads and not reports.forget_sent(resource.id)):
+            return False
+        self._let_in(resource)
+        is_decided = self.registrar.decide_here(c.LoadDone(resource.id, resource.attempt, response))
+        if is_decided:
+            self.load_times.take(began_s, failed=False)
+        return is_decided
+
+    def _load_ended(self, resource: Resource, began_s: float, response: bytes, error: BaseException | None) -> None:
+        self.registrar.progress.end(resource.id)
+        error = error or self.too_long(resource, response)
+        self.load_times.take(began_s, failed=error is not None)
+        if error is None:
+            self._let_in(resource)
+            self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
+        else:
+            self.registrar.publishers.close(resource.id)
+            self.registrar.post(c.LoadErred(resource.id, resource.attempt, load_failure(error, self.origin)))
+
+    def _let_in(self, resource: Resource) -> None:
+        """Let readers in to the streams that a callback has opened."""
+        if self.registrar.publishers.streams:  # most registrars have none
+            self.registrar.publishers.let_in(resource.id, functools.partial(stream_events.tell, self, resource))
+
+    def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
+        """Return the error for a response that, with its request, is too long for a frame; None if it is not."""
+        limit = self.registrar.node.config.frame_limit_bytes
+        size = len(resource.request) + len(response or b"")
+        if size + _ROW_BYTES <= limit:
+            return None
+        why = f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
+        return NotSerializable(f"{why}: {ADVICE}", path="response")
+
+    # -- unload --------------------------------------------------------------------------------------------------
+
+    @on_loop
+    def start_unload(self, resource: Resource) -> None:
+        """Run the unload callback; without one, the resource counts as unloaded at once."""
+        if self.spec.unload is None:
+            self.registrar.publishers.close(resource.id)
+            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+            return
+
+        def at_once(_result: None) -> bool:
+            self.registrar.publishers.close(resource.id)
+            return self.registrar.decide_here(c.UnloadDone(resource.id, resource.tries))
+
+        done = functools.partial(self._unload_ended, resource)
+        start = functools.partial(self.submit, UNLOAD, resource, resource.tries, done, at_once=at_once)
+        self.health.probes.when_free(resource.id, start)
+
+    def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
+        if error is None:
+            self.registrar.publishers.close(resource.id)
+            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+            return
+        trace = error.details[1] if type(error) is Raised else failure_of(error, self.origin).trace
+        text = readable(f"{self.origin}: {said(error)}")
+        log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
+        text += "; the resource is kept as unload_failed, and may be unloaded again"
+        failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, trace)
+        self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
+
+    # -- recover -------------------------------------------------------------------------------------------------
+
+    @on_loop
+    def start_recover(self, resource: Resource, reload: bool) -> None:
+        """Ask the recover callback whether the resource lives, or load the resource again."""
+        instead = LOAD if reload or self.spec.recover is None else None
+        done = functools.partial(self._recover_ended, resource)
+        self.submit(RECOVER, resource, resource.attempt, done, instead=instead)
+
+    def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
+        self.registrar.progress.end(resource.id)
+        error = error or self.too_long(resource, response)
+        if error is None:
+            self._let_in(resource)
+            self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
+            return
+        self.registrar.publishers.close(resource.id)
+        text = readable(f"lost: {self.origin}: {said(error)}")
+        logger.warning("%s (resource %s)", text, resource.id)
+        failure = Failure("LoadFailed", text, {"server": self.origin})
+        self.registrar.post(c.RecoverErred(resource.id, resource.attempt, failure, new_id()))
+
+    # -- pause and resume ----------------------------------------------------------------------------------------
+
+    @on_loop
+    def start_pause(self, resource: Resource) -> None:
+        """Run the pause callback."""
+        done = functools.partial(self._pause_ended, resource)
+        self.health.probes.when_free(
+            resource.id, functools.partial(self.submit, PAUSE, resource, resource.attempt, done)
+        )
+
+    def _pause_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
+        if error is None:
+            self.registrar.post(c.PauseDone(resource.id, resource.attempt))
+            return
+        text = readable(f"{self.origin}: pause: {said(error)}")
+        log_raised(logger, error, "%s; resource %s runs on", text, resource.id)
+        failure = Failure("LoadFailed", text, {"server": self.origin})
+        self.registrar.post(c.PauseErred(resource.id, resource.attempt, failure))
+
+    @on_loop
+    def start_resume(self, resource: Resource) -> None:
+        """Run the resume callback; without one, as the server does not pause any more, the resource runs."""
+        self.submit(RESUME, resource, resource.attempt, functools.partial(self._resume_ended, resource))
+
+    def _new_response(self, answer: Any, where: str = "") -> bytes | None:
+        return None if answer is None else self.response.encode(answer, where or self.origin)
+
+    def _resume_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
+        error = error or self.too_long(resource, response)
+        if error is None:
+            self.registrar.post(c.ResumeDone(resource.id, resource.attempt, response, new_id()))
+            return
+        text = readable(f"lost: {self.origin}: resume: {said(error)}")
+        logger.warning("%s (resource %s)", text, resource.id)
+        failure = Failure("LoadFailed", text, {"server": self.origin})
+        self.registrar.post(c.ResumeErred(resource.id, resource.attempt, failure, new_id()))
+
+    # -- status --------------------------------------------------------------------------------------------------
+
+    @on_loop
+    def start_status(self, resource: Resource, notice: Notice, *, repeated: bool) -> None:
+        """Run the status callback for a status of the resource, or of one of its parts."""
+        status = status_of(notice, repeated=repeated)
+
+        def done(_result: None, error: BaseException | None) -> None:
+            if error is not None:
+                self.registrar.callback_failures += 1
+                log_raised(logger, error, "%s: the status callback raised; the status goes on", self.origin)
+            self.registrar.post(c.StatusDone(resource.id, notice, status.is_handled))
+
+        self.submit(STATUS, resource, resource.attempt, done, status)
+
+    # -- how callbacks run -------------------------------------------------------------------------------------------
+
+    @on_loop
+    def submit(
+        self,
+        role: Role,
+        resource: Resource,
+        number: int,
+        done: Done,
+        *more: Any,
+        instead: Role | None = None,
+        at_once: Callable[[Any], bool] | None = None,
+    ) -> None:
+        """Run the callback of a role for a resource.
+
+        Args:
+            number: the number of the run, as decisions count it.
+            done: called on the loop with the result, or the error.
+            more: further arguments of the callback.
+            instead: the role whose callback runs for this one.
+            at_once: called with the result in the worker. If it returns True, `done` is not called.
+        """
+        registrar = self.registrar
+        catalog = registrar.catalog
+        holder = catalog.holder_of(resource.id)
+        interrupted = role is UNLOAD and resource.response is None
+        counts = role.counted and instead is None  # else a reload, whose attempts the row counts
+        attempt = deaths_of(catalog, role.counted, resource.id) + 1 if counts else number
+        place = resource.id, attempt, holder, self.spec.name, registrar
+        current = Current(*place, role, number, interrupted, resource.request, self._runs_again)
+        run = self._runs[instead or role]
+        gate = self._gate
+        if registrar.node.watched.level[0] > 1:
+            done, at_once = self._recorded(role, resource, done, at_once)
+        try:
+            if role.in_order:
+                run = run if gate is None else gate.around(run, enters=True)
+                registrar.workers.serial((role.name, resource.id), run, current, role, resource, *more, done=done)
+            elif gate is None:
+                args = current, role, resource, *more
+                registrar.workers.submit(run, *args, done=done, patient=role.patient, at_once=at_once)
+            else:
+                self._enter(gate, run, (current, role, resource, *more), done, at_once)
+        except (MailboxFull, Unavailable) as error:
+            done(None, error)
+
+    def _enter(
+        self,
+        gate: Gate,
+        run: Callback,
+        args: tuple[Current, Role, Resource, *tuple[Any, ...]],
+        done: Done,
+        at_once: Callable[[Any], bool] | None,
+    ) -> None:
+        """Run a callback when it has room in the gate. It needs no thread before."""
+        registrar, key = self.registrar, f"{args[1].name}:{args[2].id}"
+        inside = gate.around(run, enters=False)
+        registrar.outside.add(key)
+
+        def ended(result: Any, error: BaseException | None) -> None:
+            if error is not None and type(error) is not Raised:  # it got no thread, and so has not left the gate
+                gate.leave()
+            done(result, error)
+
+        def begin() -> bool:
+            registrar.outside.discard(key)
+            call = registrar.node.dispatcher.call
+            try:
+                call(registrar.runner.let_in, key)
+                registrar.workers.submit(inside, *args, done=ended, patient=True, at_once=at_once)
+            except Unavailable as error:
+                with contextlib.suppress(Unavailable):  # the process ends
+                    call(done, None, error)
+                return False
+            return True
+
+        gate.enter(begin)
+
+    # -- recording -----------------------------------------------------------------------------------------------
+
+    def _record(self, event: str, role: Role, resource: Resource, detail: str = "") -> None:
+        self.registrar.recorder.callback(event, self.origin, role.name, resource.id, detail)
+
+    def _recorded(
+        self, role: Role, resource: Resource, done: Done, at_once: Callable[[Any], bool] | None
+    ) -> tuple[Done, Callable[[Any], bool] | None]:
+        """Return `done` and `at_once` changed to record the callback's end first, and only once."""
+        ended: list[bool] = []
+
+        def recorded(result: Any, error: BaseException | None) -> None:
+            if not ended:
+                self._record("ended", role, resource, "" if error is None else readable(shortened(said(error))))
+            done(result, error)
+
+        def recorded_at_once(result: Any) -> bool:
+            ended.append(True)
+            self._record("ended", role, resource)
+            return at_once is not None and at_once(result)
+
+        return recorded, None if at_once is None else recorded_at_once
+
+    # -- in the worker -------------------------------------------------------------------------------------------
+
+    def _wrapped(
+        self, callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
+    ) -> Callback:
+        """Return a function that decodes the arguments, calls the callback, and encodes its result. Off the loop.
+
+        It raises Raised for each error. A load that was told to stop, and is needed again, runs once more.
+        """
+
+        async def run_async(current: Current, role: Role, resource: Resource, *more: Any, begun: Any = None) -> Any:
+            while not self._is_over(role, resource):
+                self._begin(current, role, resource)
+                try:
+                    answer = result(await self._heeding(role, resource, begun or callback(*arguments(resource), *more)))
+                except BaseException as error:
+                    begun = None
+                    if self._may_run_again(role, resource, error):
+                        continue
+                    raised = await described_error(error, self._describe)
+                else:
+                    self._end_run(role, resource)
+                    return answer
+                raise raised from None
+            return None
+
+        def run(current: Current, role: Role, resource: Resource, *more: Any) -> Any:
+            while not self._is_over(role, resource):
+                self._begin(current, role, resource)
+                try:
+                    answer = callback(*arguments(resource), *more)
+                    if type(answer) is COROUTINE:  # the callback is a wrapper or a lambda around an async function
+                        return closing(answer, run_async(current, role, resource, *more, begun=answer))
+                    answer = result(answer)
+                except BaseException as error:
+                    if not self._may_run_again(role, resource, error):
+                        raise Raised(error, self._describe) from None
+                else:
+                    self._end_run(role, resource)
+                    return answer
+            return None
+
+        return run_async if is_async(callback) else run
+
+    def _begin(self, current: Current, role: Role, resource: Resource) -> None:
+        enter(current)
+        if self.registrar.node.watched.level[0] > 1:
+            self._record("began", role, resource)
+
+    def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
+        """Return the failure and the trace that describe a callback's error. In the thread that ran the callback."""
+        return load_failure(error, self.origin), failure_of(error, self.origin).trace
+
+    async def _heeding(self, role: Role, resource: Resource, answer: Awaitable[Any]) -> Any:
+        """Await the answer of a callback. If it may be stopped, it is cancelled when nobody needs it any more."""
+        task = asyncio.current_task()
+        if role.phase is None or not role.reports or task is None:
+            return await answer
+        cancel = functools.partial(_cancel, asyncio.get_running_loop(), task)
+        self.registrar.stop_event(resource.id, role.phase, resource.attempt, cancel)
+        return await answer
+
+    def _may_run_again(self, role: Role, resource: Resource, error: BaseException) -> bool:
+        """Note that a run has ended by an error; return whether it was told to stop, and its result is needed again."""
+        if not self._end_run(role, resource):
+            return False
+        if not isinstance(error, asyncio.CancelledError):
+            return isinstance(error, Exception)
+        if (task := asyncio.current_task()) is not None:
+            while task.cancelling():
+                task.uncancel()
+        return True
+
+    def _end_run(self, role: Role, resource: Resource) -> bool:
+        if role.phase is None or not role.reports:
+            return False
+        return self.registrar.end_run(resource.id, role.phase, resource.attempt)
+
+    def _is_over(self, role: Role, resource: Resource) -> bool:
+        """Return whether a callback must not begin any more: its registrar is closed, or its resource is unloaded.
+
+        Of a closed registrar nothing is decided, so its callback's result does not matter.
+        """
+        registrar = self.registrar
+        if registrar.closed or role is not STATUS:
+            return registrar.closed
+        left = registrar.catalog.resources.get(resource.id)
+        return left is None or left.phase is UNLOADING
+
+
+def _cancel(loop: asyncio.AbstractEventLoop, task: asyncio.Task[Any]) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop is closed, and has cancelled its tasks
+        loop.call_soon_threadsafe(task.cancel)
+
+
+class RequestReader:
+    """Reads the requests in the Loads of consumers, for the servers of one registrar.
+
+    Args:
+        server_of: returns a server by its name; None: there is none.
+    """
+
+    def __init__(
+        self, registrar: RegistrarBase, consumers: Consumers, server_of: Callable[[str], ServerActor | None]
+    ) -> None:
+        self._registrar, self._consumers, self._server_of = registrar, consumers, server_of
+
+    @on_loop
+    def read_first(self, load: Load, sender: str) -> bool:
+        """Have a worker read the request first if that runs user code, and return whether it does."""
+        registrar, server = self._registrar, self._server_of(load.server)
+        if server is None or not server.request.runs_code(load.request):
+            return False
+        with registrar.lock:
+            if self._is_read(load):
+                return False
+        link_of = self._consumers.link_of
+        link = link_of(sender)
+
+        def done(read: Load | c.RefuseLoad, error: BaseException | None) -> None:
+            if registrar.closed or link_of(sender) is not link:  # the consumer sends it again over the next link
+                return
+            if self._server_of(load.server) is not server:  # unregistered meanwhile, and perhaps registered anew
+                registrar.receive(load, sender)
+                return
+            if error is not None:
+                read = c.RefuseLoad(sender, load.query_id, failure_of(error))
+            registrar.deliver(read, sender if type(read) is Load else None)
+            registrar.progress.greet(sender, load.query_id)
+
+        try:
+            registrar.workers.submit(server.readable, load, done=done)
+        except MailboxFull as error:
+            done(load, error)
+        except Unavailable:  # this process is stopping
+            pass
+        return True
+
+    @with_lock
+    def read(self, load: Load, sender: str | None) -> Item:
+        """Return the Load in canonical form, or its refusal; a worker has read it already if that runs user code."""
+        server = self._server_of(load.server)
+        if server is None or self._is_read(load) or server.request.runs_code(load.request):
+            return load, sender
+        read = server.readable(load)
+        return read, sender if type(read) is Load else None
+
+    @with_lock
+    def _is_read(self, load: Load) -> bool:
+        """Return whether the Load can be decided without reading its request."""
+        catalog = self._registrar.whole()
+        known = catalog.queries.get(load.query_id)
+        if known is not None:
+            return known.resource_id not in catalog.recovering  # such a resource may have to be loaded anew
+        return load.query_id in catalog.refused or catalog.joinable(load.server, load.request) is not None
