@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -218,6 +218,32 @@ def _check_notices(contents: Contents) -> Iterator[str]:
             yield f"{contents.name}: notice {notice.id} is about resource {notice.resource_id}, which does not exist"
         elif not is_own(notice) and notice.query_id not in contents.queries and notice.query_id not in contents.taken:
             yield f"{contents.name}: notice {notice.id} is about query {notice.query_id}, which does not exist"
+
+
+def check_delivered(state: Mapping[str, Contents], down: Collection[str] = ()) -> Iterator[str]:
+    """Yield a sentence for each row that one of two registrars lacks or owes, if neither of them is `down`.
+
+    What is in flight looks the same: a row counts if it is found again and again, for longer than a message takes.
+    """
+    for name in state.keys() - down:
+        contents = state[name]
+        for query in contents.queries.values():
+            resource = contents.resources.get(query.resource_id)
+            if query.origin in down or (resource and resource.phase not in (Phase.LOADED, *RESTING)):
+                continue
+            origin = state.get(query.origin)
+            mine = origin.held.get(query.id) if origin is not None else None
+            if mine is None:
+                yield f"{name}: query {query.id} is unknown to {query.origin}, which should hold it"
+            elif mine.hold is Hold.HELD and (mine.resource_id, mine.parent) != (query.resource_id, query.parent):
+                yield f"{name}: query {query.id} is on another resource, or for another, than {query.origin} says"
+        for held in contents.held.values():
+            if held.hold is Hold.OWED and held.registrar not in down:
+                yield f"{name}: its query {held.id} at {held.registrar} is {held.hold}"
+        for notice in contents.notices.values():
+            if notice.origin not in down:
+                whom = notice.origin or f"the server of resource {notice.resource_id}"
+                yield f"{name}: notice {notice.id} for {whom} is not delivered"
 
 
 def readable(encoded: bytes | None, limit: int = 60) -> str:

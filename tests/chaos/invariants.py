@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from rr_actors.registrar.model.rows import Hold, Phase
 from rr_actors.registrar.queries import ResourceInfo
-from rr_actors.tools.inspection import Contents, check
+from rr_actors.tools.inspection import Contents, check, check_delivered
 
 _LOOK_S = 0.1
 
@@ -22,7 +22,8 @@ def settled(look: Callable[[], list[str]], timeout_s: float) -> list[str]:
 
 def check_at_rest(state: Mapping[str, Contents]) -> list[str]:
     """Return the errors of a system at rest: those that inspection finds, and rows of anything still in flight."""
-    return [*check(state), *(wrong for contents in state.values() for wrong in _moving(contents, state))]
+    moving = (wrong for contents in state.values() for wrong in _moving(contents))
+    return [*check(state), *check_delivered(state), *moving]
 
 
 def check_empty(state: Mapping[str, Contents]) -> list[str]:
@@ -78,7 +79,7 @@ def used_by(devices: Iterable[ResourceInfo]) -> float:
     return sum(info.request.watts for info in devices if info.server == "device" and info.phase == "loaded")
 
 
-def _moving(contents: Contents, state: Mapping[str, Contents]) -> Iterator[str]:
+def _moving(contents: Contents) -> Iterator[str]:
     held = {query.resource_id for query in contents.queries.values()}
     for resource in contents.resources.values():
         what = f"{contents.name}: resource {resource.id}"
@@ -86,16 +87,6 @@ def _moving(contents: Contents, state: Mapping[str, Contents]) -> Iterator[str]:
             yield f"{what} is {resource.phase}"
         elif resource.id not in held:
             yield f"{what} is held by nobody"
-    for query in contents.queries.values():
-        origin = state.get(query.origin)
-        mine = origin.held.get(query.id) if origin is not None else None
-        if mine is None:
-            yield f"{contents.name}: query {query.id} is unknown to {query.origin}, which should hold it"
-        elif (mine.resource_id, mine.parent) != (query.resource_id, query.parent):
-            yield f"{contents.name}: query {query.id} is on another resource, or for another, than {query.origin} says"
     for row in contents.held.values():
-        if row.hold is not Hold.HELD:
+        if row.hold is Hold.PENDING:
             yield f"{contents.name}: its query {row.id} at {row.registrar} is {row.hold}"
-    for notice in contents.notices.values():
-        whom = notice.origin or f"the server of resource {notice.resource_id}"
-        yield f"{contents.name}: notice {notice.id} for {whom} is not delivered"

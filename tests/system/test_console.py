@@ -537,7 +537,7 @@ def test_a_child_is_killed_and_comes_back(shop: rr.System, console: ConsoleClien
 
     done = console.ask(Kill("shop"))
 
-    assert done.facts == {"path": "inner/shop", "pid": pid, "signal": "SIGKILL"}
+    assert done.facts == {"path": "inner/shop", "pid": pid, "signal": "SIGKILL", "restart": "permanent"}
     eventually(lambda: shop.ref("shop").pid not in (None, pid))
 
 

@@ -273,7 +273,8 @@ class Kill(Command[c.Done], frozen=True):
         if child.pid == (SupervisorRef(above).which_child(id).pid if above else os.getpid()):
             raise UsageError(f"{path}: it runs in a thread of process {child.pid}, with others; terminate it instead")
         name = signal_name(self.signal)
-        facts = {"path": path, "pid": child.pid, "signal": name}
+        restart = supervisor.get_childspec(child.id).restart
+        facts = {"path": path, "pid": child.pid, "signal": name, "restart": restart}
         if self.dry_run:
             return c.Done(f"would send {name} to {path} (pid {child.pid})", facts)
         try:

@@ -110,8 +110,9 @@ RowLimit = Annotated[
     int | None,
     typer.Option("--limit", min=1, show_default=False, help=f"Show at most so many; {_SHOWN} in a table, else all."),
 ]
+complete_child = _completing(_children)
 ChildArgument = Annotated[
-    str, typer.Argument(metavar="ID", help="A child's id, or its path.", autocompletion=_completing(_children))
+    str, typer.Argument(metavar="ID", help="A child's id, or its path.", autocompletion=complete_child)
 ]
 
 

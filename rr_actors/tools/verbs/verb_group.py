@@ -46,6 +46,12 @@ def _recording() -> ModuleType:
     return recording_verbs
 
 
+def _chaos() -> ModuleType:
+    from rr_actors.tools.verbs import chaos_verb
+
+    return chaos_verb
+
+
 def _state() -> ModuleType:
     from rr_actors.tools.verbs import state_verbs
 
@@ -138,6 +144,11 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
             "restart": "Start a child again",
             "start": "Add a child to the running tree, and start it",
             "shutdown": "Stop the whole system in order, as its own stop() does",
+        },
+        _chaos: {
+            "chaos": (
+                "Kill children of the running system at random, and check that it recovers; exit code 1 if it does not"
+            )
         },
         _system: {
             "run": (
