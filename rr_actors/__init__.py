@@ -79,12 +79,11 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.base.values.codecs import codec
         from rr_actors.registrar.declarations import Declared, server
         from rr_actors.registrar.engine.progress import Progress
-        from rr_actors.registrar.engine.status import Status
         from rr_actors.registrar.load_groups import Queries
         from rr_actors.registrar.manager import Manager, ref
         from rr_actors.registrar.model.health import Health
         from rr_actors.registrar.model.rows import State
-        from rr_actors.registrar.queries import Query, ResourceInfo
+        from rr_actors.registrar.queries import Query, ResourceInfo, Status, Subscription
         from rr_actors.registrar.registrar import Registrar
         from rr_actors.registrar.servers.callback_context import Current, current
         from rr_actors.streams.publisher import Publisher
@@ -189,6 +188,7 @@ __all__ = [
     "StreamFrame",
     "StreamInfo",
     "StreamReader",
+    "Subscription",
     "SupervisionError",
     "Supervisor",
     "SupervisorRef",
@@ -239,12 +239,11 @@ if not TYPE_CHECKING:
         "rr_actors.registrar.declarations": "Declared server",
         "rr_actors.registrar.engine.progress": "Progress",
         "rr_actors.registrar.servers.callback_context": "Current current",
-        "rr_actors.registrar.engine.status": "Status",
         "rr_actors.registrar.load_groups": "Queries",
         "rr_actors.registrar.manager": "Manager ref",
         "rr_actors.registrar.model.health": "Health",
         "rr_actors.registrar.model.rows": "State",
-        "rr_actors.registrar.queries": "Query ResourceInfo",
+        "rr_actors.registrar.queries": "Query ResourceInfo Status Subscription",
         "rr_actors.registrar.registrar": "Registrar",
         "rr_actors.supervision.core.rendering": "Tree render",
         "rr_actors.supervision.core.specs": "Backoff ChildSpec Supervisor",

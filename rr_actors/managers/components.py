@@ -42,10 +42,9 @@ from rr_actors.managers.program_checks import parameter_faults, program_faults
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.servers.callback_context import current
 from rr_actors.system.registrar_lookup import registrar_in
 

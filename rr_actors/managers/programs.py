@@ -33,9 +33,9 @@ from rr_actors.managers.program_conditions import (
 )
 from rr_actors.registrar.declarations import costing, server
 from rr_actors.registrar.engine.server import ServerSpec, checked_spec, checked_whole
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State
+from rr_actors.registrar.queries import Status
 from rr_actors.registrar.servers.callback_context import current
 from rr_actors.runtime.processes.control_groups import CONTROLLERS
 

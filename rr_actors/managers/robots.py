@@ -24,10 +24,9 @@ from rr_actors.managers.planning.last_good import last_good_file, path_of
 from rr_actors.managers.planning.retries import GIVEN_UP, Retries
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.servers.callback_context import current
 
 logger = Log("rr_actors.managers.robots")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import inspect
@@ -214,14 +215,20 @@ def checked(
     codec = None if response_type is None else codec_for(response_type)
     on_status = options.get("on_status")
     status_callback(on_status, called.removesuffix("_async"))
-    loop = None
+    loop: CallersLoop | None = None
     if called.endswith("_async"):
         check_asyncio(called)
-        if on_status is not None and is_async(on_status) and current_or_none() is None:
-            loop = CallersLoop()  # a callback of a server has a context that ends before the statuses come
+        loop = callers_loop(on_status)
     if "priority" in options:
         options["priority"] = checked_priority(options["priority"], called)
     return LoadOptions(**options, own="priority" in options, codec=codec, loop=loop)
+
+
+def callers_loop(callback: StatusCallback | None) -> CallersLoop | None:
+    """Return the event loop that runs here, for an async status callback; None: the callback runs elsewhere."""
+    if callback is None or not is_async(callback) or asyncio._get_running_loop() is None:
+        return None
+    return CallersLoop() if current_or_none() is None else None  # a server's context ends before the statuses come
 
 
 def checked_priority(value: object, called: str) -> int | None:

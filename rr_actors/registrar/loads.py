@@ -373,7 +373,7 @@ class Loads:
         if options.own:
             check_allowed(options.priority, self.actor.config)
         if options.on_status is not None:
-            self.views.listen(query.id, described(options.on_status, "load: on_status"), options.loop)
+            self.views.callbacks.set(query.id, described(options.on_status, "load: on_status"), options.loop)
 
     def _begin(self, query: Query, request: bytes, options: LoadOptions, hearing: Hearing | None = None) -> Loading:
         """Have the loop send a load."""
@@ -697,7 +697,7 @@ class Unloads:
             UnknownServer: the registrar holds nothing at that server, and never did.
         """
 
-        def is_wanted(held: Held) -> bool:
+        def is_wanted(held: Held | Query) -> bool:
             return not held.parent if server is None else (held.registrar, held.server) == server
 
         if server is not None:
@@ -792,7 +792,7 @@ class Unloads:
         failure = Failure("Unavailable", f"{text}; {provider} is {doing}", details)
         actor.post(c.ReleaseOverdue(query_id, failure))
 
-    def _many_now(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
+    def _many_now(self, wanted: Callable[[Held | Query], bool], timeout_s: float | None) -> Reply[None]:
         """Begin to release. The reply raises the first error; the others are its notes."""
         reply: Reply[None] = Reply()
         errors: list[RrError] = []

@@ -22,8 +22,8 @@ from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
-from rr_actors.registrar.engine.status import Status, state_of, status_of
-from rr_actors.registrar.model.rows import OK, Held, Notice, Phase, ServerType, State
+from rr_actors.registrar.engine.status import StatusMessage, state_of, status_of
+from rr_actors.registrar.model.rows import OK, Held, Hold, Notice, Phase, ServerType, State
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.event_loop import check_asyncio, check_may_block
 from rr_actors.runtime.shielding import Flag
@@ -68,6 +68,10 @@ class Holder(Protocol):
         """Give the query a priority."""
         ...
 
+    def set_on_status(self, query_or_id: Query, callback: StatusCallback | None, /) -> None:
+        """Replace the status callback of the query."""
+        ...
+
 
 def raise_or_note(refusal: RrError, error: BaseException | None) -> None:
     """Raise the error of an unload at the end of a block; or note it on the block's own exception, which goes on."""
@@ -79,6 +83,44 @@ def raise_or_note(refusal: RrError, error: BaseException | None) -> None:
 def patience_s(error: BaseException | None) -> float:
     """Return how long the end of a block waits for a provider that is down: not long if the block was cancelled."""
     return _CANCELLED_S if isinstance(error, asyncio.CancelledError) else _UNLOAD_S
+
+
+class Status(StatusMessage):
+    """A message about the state of a resource (thesis: status message).
+
+    To send one, make it with a state and a message. One that is received also says which resource it is about.
+
+    Attributes:
+        state: OK, UPDATE, WARNING, ERROR or FATAL. The name is accepted, too, in any case: Status("fatal").
+        message: text for people.
+        resource_id: the resource through which the status reached the receiver. The receiver holds it; in a server's
+            status callback it is the server's own if its owner has set the status.
+        query_id: the receiver's query on that resource; "" if the resource is the receiver's own.
+        source: the server where the status began, "registrar/server".
+        repeated: whether the status may have been heard before; a crash made that uncertain.
+        reason: "revoked" if the resource's owner takes it away; "ended" if a client's system has ended; "" else.
+        deadline_s: of a revoked resource, how many seconds after the status was sent it is unloaded by force: 0.0, if
+            that is done. None for any other status.
+    """
+
+    __slots__ = ("_find",)
+
+    _find: Callable[[str], Query[Any] | None]  # the receiver's queries, by id; only of a status that was received
+
+    @property
+    def query(self) -> Query[Any] | None:
+        """The receiver's query that the status is of, as long as the receiver's registrar holds it; None else.
+
+        It is None if the resource is the receiver's own, and in another process, to which a status travels without it.
+        """
+        find: Callable[[str], Query[Any] | None] | None = getattr(self, "_find", None)
+        return None if find is None or not self.query_id else find(self.query_id)
+
+
+def received(status: Status, find: Callable[[str], Query[Any] | None]) -> Status:
+    """Return the status, which finds its query among those of its receiver."""
+    status._find = find  # pyright: ignore[reportPrivateUsage]  # same file
+    return status
 
 
 class _Statuses(deque[Status]):
@@ -241,6 +283,20 @@ class Query(Generic[Response]):
     def standby(self) -> None:
         """Keep the query, and say that the resource is not needed now. A priority ends that."""
         self.priority = None
+
+    def on_status(self, callback: StatusCallback | None) -> None:
+        """Call `callback(status)` for each status of this query from now on; None: call nothing.
+
+        It takes the place of the load's `on_status`, and of an earlier call's. When this has returned, the one before
+        is not begun again: the new one hears what still waits for it. What a callback has heard is not heard again, and
+        `state` has it. An ``async def`` runs on the event loop that runs here, if there is one. A query that a restart
+        has restored has no callback.
+
+        Raises:
+            UnknownQuery: the query is not held any more, or another process holds it.
+            UsageError: `callback` cannot be called with a status alone.
+        """
+        self._at_holder().set_on_status(self, callback)
 
     def _at_holder(self) -> Holder:
         if self._holder is None:
@@ -598,6 +654,130 @@ _TYPES_S = 2.0
 _AFTER_FATAL = (State.FATAL, State.UPDATE)  # what is heard of a resource that is lost
 
 
+class Subscription:
+    """A callback of on_status(). A context manager stops it at the end."""
+
+    __slots__ = ("_stop",)
+
+    def __init__(self, stop: Callable[[], object]) -> None:
+        self._stop = stop
+
+    def stop(self) -> None:
+        """Stop it: when this has returned, the callback is not begun again. One that runs goes on.
+
+        What waited for the callback goes its way without it. A second stop does nothing. Call it from any thread, also
+        in the callback.
+
+        Raises:
+            Unavailable: the process of a handle's registrar does not answer.
+        """
+        self._stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+
+class _Listener:
+    """Who hears statuses: a callback, which may be replaced; None: it was stopped."""
+
+    __slots__ = ("callback",)
+
+    def __init__(self) -> None:
+        self.callback: StatusCallback | None = None
+
+
+class StatusCallbacks:
+    """The status callbacks of a registrar: those of its queries, and those of servers where it holds some.
+
+    A callback is looked up when it begins: what waits is heard by the one that is there then.
+
+    Args:
+        hears: returns whether callbacks for a query may begin now.
+        keys: gets the ids of the queries and the servers that have a callback.
+    """
+
+    def __init__(self, hears: Callable[[str], bool], keys: set[str]) -> None:
+        self._hears, self._keys = hears, keys
+        self._on_query: dict[str, _Listener] = {}
+        self._on_server: dict[str, dict[str, _Listener]] = {}
+        self._lock = threading.RLock()  # for those of servers; a finalizer may stop one
+
+    def set(self, query_id: str, callback: StatusCallback | None, loop: CallersLoop | None = None) -> None:
+        """Have the callback called for a query, in the place of the one before; if it is async, on this loop."""
+        listener = self._on_query.get(query_id) or _Listener()
+        if callback is not None and loop is not None:
+            callback = self._brought(query_id, listener, callback, loop)
+        listener.callback = callback
+        if callback is None:
+            self.drop(query_id)
+        else:
+            self._on_query[query_id] = listener  # first: an interrupt may come now, and drop() looks here
+            self._keys.add(query_id)
+
+    def drop(self, query_id: str) -> None:
+        """Drop the callback of a query that is not held any more."""
+        if self._on_query.pop(query_id, None) is not None:
+            self._keys.discard(query_id)
+
+    def listen(self, server: str, id: str, callback: StatusCallback) -> None:
+        """Have the callback called for every query at a server, until stop() gets the same id."""
+        with self._lock:
+            listener = self._on_server.setdefault(server, {})[id] = _Listener()
+            listener.callback = callback
+            self._keys.add(server)
+
+    def stop(self, server: str, id: str) -> None:
+        """Begin a callback of listen() no more; do nothing if it is stopped."""
+        with self._lock:
+            listeners = self._on_server.get(server, {})
+            if (listener := listeners.pop(id, None)) is not None:
+                listener.callback = None
+                if not listeners:
+                    del self._on_server[server]
+                    self._keys.discard(server)
+
+    def of(self, query_id: str, server: str) -> list[_Listener]:
+        """Return those that hear a status of a query: its own callback first."""
+        own = self._on_query.get(query_id)
+        listeners = [] if own is None else [own]
+        if server in self._on_server:
+            with self._lock:
+                listeners += self._on_server.get(server, {}).values()
+        return listeners
+
+    def beginning(self, query_id: str, listener: _Listener) -> StatusCallback:
+        """Return a function that calls the callback that is there when it begins, if it may begin then."""
+
+        def begin(status: Status) -> Any:
+            callback = listener.callback
+            return callback(status) if callback is not None and self._hears(query_id) else None
+
+        if (callback := listener.callback) is not None and is_async(callback):
+            return functools.partial(self._begin_async, query_id, listener)
+        return begin
+
+    async def _begin_async(self, query_id: str, listener: _Listener, status: Status) -> None:
+        if (callback := listener.callback) is not None and self._hears(query_id):
+            await (callback(status) if is_async(callback) else asyncio.to_thread(callback, status))
+
+    def _brought(
+        self, query_id: str, listener: _Listener, callback: StatusCallback, loop: CallersLoop
+    ) -> StatusCallback:
+        """Return an async callback for any loop, which runs on this one; if it was replaced meanwhile, the new one."""
+
+        async def begin(status: Status) -> None:
+            if listener.callback is not brought:
+                await self._begin_async(query_id, listener, status)
+            elif self._hears(query_id):
+                await callback(status)
+
+        brought = loop.bring(begin)
+        return brought
+
+
 class Views:
     """The Query objects that a registrar has given out, and the status callbacks. A status reaches both.
 
@@ -609,10 +789,9 @@ class Views:
         self._actor = actor
         self.holder = holder
         self._queries: dict[str, Query] = {}
-        self._taken: dict[str, Held] = {}  # queries that were taken away, until their callbacks have heard of that
+        self._taken: dict[str, Query] = {}  # queries that were taken away, until their callbacks have heard of that
         self._lost: set[str] = set()  # queries whose resource has said FATAL
-        self._on_query: dict[str, StatusCallback] = {}
-        self._on_server: dict[str, list[StatusCallback]] = {}
+        self.callbacks = StatusCallbacks(self.hears, actor.catalog.listened)
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
         self._of_all = self.codecs_of, self._all_streams  # the same bound methods for all queries
         self._left: set[tuple[str, str]] = set()  # servers where something was held, and released
@@ -640,6 +819,29 @@ class Views:
             view = self._queries[held.id] = self.seen(held)
         return view
 
+    def received(self, notice: Notice, *, repeated: bool) -> Status:
+        """Return the status that a notice carries, for a callback of this registrar."""
+        return received(status_of(notice, Status, repeated=repeated), self.find)
+
+    def find(self, query_id: str) -> Query | None:
+        """Return the Query of this id that is held, also while callbacks hear that it was taken away; None else."""
+        if self._actor.closed:
+            return None
+        view = self._queries.get(query_id) or self._taken.get(query_id)
+        if view is None:
+            with self._actor.lock:
+                catalog = self._actor.whole()
+                held = catalog.held.get(query_id)
+                if held is None or held.hold is Hold.OWED:
+                    return None
+                if query_id in catalog.ending:  # the status callback of its whole hears that it was taken away
+                    view = self.seen(held)
+                    view.released = True
+                    end(view)
+                else:
+                    view = self.of(held)
+        return view
+
     def known(self, query_id: str) -> Query | None:
         """Return the Query of this id that was given out, or is being loaded; None once it is not held any more."""
         return self._queries.get(query_id)
@@ -648,28 +850,16 @@ class Views:
         """Have statuses reach a query."""
         self._queries[query.id] = query
 
-    def listen(self, query_id: str, callback: StatusCallback, loop: CallersLoop | None = None) -> None:
-        """Have the callback called with each status of one query, on this loop if it is async."""
-        if loop is not None:
-            callback = loop.bring(self._while_heard(query_id, callback))
-        self._on_query[query_id] = callback  # first: an interrupt may come now, and forget() looks here
-        self._actor.catalog.listened.add(query_id)
-
-    def listen_to_server(self, server: str, callback: StatusCallback) -> None:
-        """Have the callback called with each status of every query at a server."""
-        self._actor.catalog.listened.add(server)
-        self._on_server.setdefault(server, []).append(callback)
-
     def forget(self, query_id: str) -> None:
         """Forget a query that its holder has released: no callback begins for it from now on."""
         self._taken.pop(query_id, None)
         self._drop(query_id)
 
-    def forget_taken(self, wanted: Callable[[Held], bool]) -> None:
+    def forget_taken(self, wanted: Callable[[Held | Query], bool]) -> None:
         """Forget the wanted ones of the queries that were taken away, and whose callbacks have not heard all of it."""
-        for held in list(self._taken.values()):
-            if wanted(held):
-                self.forget(held.id)
+        for query in list(self._taken.values()):
+            if wanted(query):
+                self.forget(query.id)
 
     def hears(self, query_id: str) -> bool:
         """Return whether callbacks for a query may begin now: it is not released, nor is the registrar closed."""
@@ -682,8 +872,7 @@ class Views:
             if view.resource_id:
                 self._left.add((view.registrar, view.server))
         self._lost.discard(query_id)
-        if self._on_query.pop(query_id, None) is not None:
-            self._actor.catalog.listened.discard(query_id)
+        self.callbacks.drop(query_id)
 
     def was_at(self, server: ServerId) -> bool:
         """Return whether the registrar holds something at the server, is loading it, or did once. On the loop.
@@ -708,17 +897,16 @@ class Views:
             return
         if notice.state is State.FATAL and notice.source == server:  # else a part of the resource is lost
             self._lost.add(held.id)
-        status = status_of(notice, repeated=repeated)
-        callbacks = list(self._on_server.get(server, ()))
-        if (own := self._on_query.get(held.id)) is not None:
-            callbacks.insert(0, own)
-        view = self.of(held) if callbacks else self._queries.get(held.id)
+        status = self.received(notice, repeated=repeated)
+        listeners = self.callbacks.of(held.id, server)
+        view = self.of(held) if listeners else self._queries.get(held.id)
         if view is not None:
             hear(view, status, notice.response, released=notice.released)
+            if notice.released:
+                self._taken[held.id] = view
         if notice.released:
-            self._taken[held.id] = held
             self._drop(held.id)
-        left = itertools.count(len(callbacks) - 1, -1)
+        left = itertools.count(len(listeners) - 1, -1)
 
         def through() -> None:
             if next(left) <= 0:
@@ -726,12 +914,12 @@ class Views:
                     self._taken.pop(held.id, None)
                 heard(status.is_handled)
 
-        for callback in callbacks:
-            self._run(held, callback, status, through)
-        if not callbacks:
+        for listener in listeners:
+            self._run(held, listener, status, through)
+        if not listeners:
             through()
 
-    def _run(self, held: Held, callback: StatusCallback, status: Status, through: Callable[[], None]) -> None:
+    def _run(self, held: Held, listener: _Listener, status: Status, through: Callable[[], None]) -> None:
         def done(_result: Any, error: BaseException | None) -> None:
             through()
             if error is not None:
@@ -739,23 +927,11 @@ class Views:
                 log_raised(logger, error, "%s: a status callback for %s raised", self._actor.name, held.server)
 
         try:
-            run, gate = self._while_heard(held.id, callback), self._actor.gate
+            run, gate = self.callbacks.beginning(held.id, listener), self._actor.gate
             run = run if gate is None else gate.around(run, enters=True)
             self._actor.workers.serial(("hear", held.id), run, status, done=done)
         except Unavailable as error:
             done(None, error)
-
-    def _while_heard(self, query_id: str, callback: StatusCallback) -> StatusCallback:
-        """Return a callback that does nothing if, when it begins, no callback for the query may begin any more."""
-
-        async def begin_async(status: Status) -> None:
-            if self.hears(query_id):
-                await callback(status)
-
-        def begin(status: Status) -> Any:
-            return callback(status) if self.hears(query_id) else None
-
-        return begin_async if is_async(callback) else begin
 
     def _all_streams(self, query: Query[Any]) -> Callable[[], bool]:
         return functools.partial(self.has_all_streams, query)

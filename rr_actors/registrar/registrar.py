@@ -34,6 +34,7 @@ from rr_actors.registrar.arguments import (
     LoadKeywords,
     LoadOptions,
     Parent,
+    callers_loop,
     check_allowed,
     check_text,
     checked,
@@ -42,6 +43,7 @@ from rr_actors.registrar.arguments import (
     resource_target,
     server_target,
     shows,
+    status_callback,
     target_id,
 )
 from rr_actors.registrar.declarations import Declared
@@ -49,7 +51,7 @@ from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.server import RECOVER_S, ServerSpec, checked_spec, checked_whole, log_unread_types
-from rr_actors.registrar.engine.status import Status, message_text
+from rr_actors.registrar.engine.status import message_text
 from rr_actors.registrar.links.provider_link import ListQueries
 from rr_actors.registrar.links.remote_calls import for_handles
 from rr_actors.registrar.load_groups import Group, GroupWays, LoadWanted, Queries, wanted
@@ -72,7 +74,16 @@ from rr_actors.registrar.model.rows import (
 )
 from rr_actors.registrar.model.rows import ServedQuery as QueryRow
 from rr_actors.registrar.pages import Page, Wanted, counted_loads, load_rows, page_of
-from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, response_bytes
+from rr_actors.registrar.queries import (
+    PLAIN,
+    Query,
+    ResourceInfo,
+    Status,
+    StatusCallback,
+    Subscription,
+    Views,
+    response_bytes,
+)
 from rr_actors.registrar.replacements import Replacements, encoded_response
 from rr_actors.registrar.servers import stored_values
 from rr_actors.registrar.servers.callback_context import (
@@ -87,6 +98,7 @@ from rr_actors.registrar.servers.server_actor import ServerActor
 from rr_actors.registrar.servers.usage_callbacks import Measured, Usages
 from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import RunningLimit, finite_time, time_limit
+from rr_actors.runtime.user_loop import CallersLoop
 from rr_actors.streams.stream import StreamInfo
 
 if TYPE_CHECKING:
@@ -169,6 +181,34 @@ class Consumer(abc.ABC):
     @abc.abstractmethod
     def set_priority(self, query_or_id: Query | str, priority: int | None) -> None:
         """Give a query a priority."""
+
+    @abc.abstractmethod
+    def set_on_status(self, query_or_id: Query | str, callback: StatusCallback | None) -> None:
+        """Replace the status callback of a query."""
+
+    @abc.abstractmethod
+    def _listen(self, server: str, id: str, callback: StatusCallback) -> None:
+        """Have the callback called for every query at a server, until _stop_listening() gets the same id."""
+
+    @abc.abstractmethod
+    def _stop_listening(self, server: str, id: str) -> None:
+        """Begin the callback no more; do nothing if it is stopped."""
+
+    # -- status --------------------------------------------------------------------------------------------------
+
+    def on_status(self, server: str | Declared[Any, Any, Any], callback: StatusCallback) -> Subscription:
+        """Call `callback(status)` for every query that this registrar holds at that server, now and later.
+
+        Several callbacks are called side by side, until each is stopped. `status.query` is the query. As in a load's
+        `on_status`, `status.handled()` stops the status from going further up.
+
+        Returns:
+            A Subscription. Its `stop()` stops the callback, and so does the end of a ``with`` block. It also ends with
+            the registrar's process.
+        """
+        key, id = str(self._target(server)), new_id()
+        self._listen(key, id, callback)
+        return Subscription(functools.partial(self._stop_listening, key, id))
 
     # -- load ----------------------------------------------------------------------------------------------------
 
@@ -452,6 +492,7 @@ class Consumer(abc.ABC):
         Raises:
             InvalidName: `server` does not have that form.
             UnknownServer: this registrar holds nothing there and never did. `.known` has the servers where it does.
+            UsageError: the call comes from outside, by a handle, and a resource of this registrar has a part there.
             The errors of unload(), after all queries have been tried.
         """
         self._check_open()
@@ -662,6 +703,18 @@ class Registrar(Consumer):
     @for_handles(repeatable=False)
     def _unload_from_outside(self, query_id: str, *, timeout_s: float | None = 30.0) -> None:
         """Release a query as unload() does, for a handle. A part is its whole's to release: its callbacks may."""
+        self._check_no_part(query_id)
+        self.unload(query_id, timeout_s=timeout_s)
+
+    @for_handles(repeatable=False)
+    def _unload_client_from_outside(self, server: str, *, timeout_s: float | None = 30.0) -> None:
+        """Release as unload_client() does, for a handle, unless that would take a part from its whole."""
+        for row in self._held_now():
+            if f"{row.registrar}/{row.server}" == server:
+                self._check_no_part(row.id)
+        self.unload_client(server, timeout_s=timeout_s)
+
+    def _check_no_part(self, query_id: str) -> None:
         with self._actor.enter():
             catalog = self._actor.whole()
             held = catalog.held.get(query_id)
@@ -669,7 +722,6 @@ class Registrar(Consumer):
             failure = None if whole is None else failures.held_by_whole(query_id, _name_of(whole, self.name))
         if failure is not None:
             raise error_of(failure)
-        self.unload(query_id, timeout_s=timeout_s)
 
     @for_handles(repeatable=False)
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
@@ -1129,13 +1181,30 @@ class Registrar(Consumer):
     # -- status --------------------------------------------------------------------------------------------------
 
     @for_handles(repeatable=False)
-    def on_status(self, server: str, callback: StatusCallback) -> None:
-        """Call `callback(status)` for every query that this registrar holds at that server, now and later.
+    def set_on_status(self, query_or_id: Query | str, callback: StatusCallback | None) -> None:
+        """Replace the status callback of a query that this registrar holds, as `query.on_status(callback)` does.
 
-        As in a load's `on_status`, `status.handled()` stops the status from going further up.
+        Raises:
+            UnknownQuery: the query is not held any more.
+            UsageError: `callback` cannot be called with a status alone.
         """
-        key = str(self._target(server))
-        self._calls.call(self._views.listen_to_server, key, checked_callback(callback))
+        id, own = target_id(query_or_id), status_callback(callback, "on_status", "callback")
+        self._calls.call(self._set_on_status, id, own, callers_loop(own))
+
+    def _set_on_status(self, id: str, callback: StatusCallback | None, loop: CallersLoop | None) -> None:
+        with self._actor.enter():  # no thread releases the query meanwhile
+            self._held_row(id)
+            if id in self._actor.whole().ending:
+                raise UnknownQuery(f"query {shortened(id)}: its provider has taken the resource away", query_id=id)
+            self._views.callbacks.set(id, callback, loop)
+
+    @for_handles(repeatable=False)
+    def _listen(self, server: str, id: str, callback: StatusCallback) -> None:
+        self._calls.call(self._views.callbacks.listen, server, id, checked_callback(callback))
+
+    @for_handles(repeatable=True)
+    def _stop_listening(self, server: str, id: str) -> None:
+        self._views.callbacks.stop(server, id)
 
     # -- the catalog ---------------------------------------------------------------------------------------------
 

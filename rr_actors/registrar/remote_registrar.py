@@ -8,6 +8,7 @@ that it has connected to.
 from __future__ import annotations
 
 import abc
+import contextlib
 import functools
 import inspect
 import threading
@@ -20,7 +21,7 @@ from msgspec.structs import replace
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
-from rr_actors.base.errors import RegistrarDown, RrError, Unavailable, UnknownQuery, UsageError, is_a
+from rr_actors.base.errors import RegistrarDown, RrError, Unavailable, UnknownQuery, UnknownRegistrar, UsageError, is_a
 from rr_actors.base.names import ServerId
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.arguments import LoadOptions
@@ -232,9 +233,10 @@ class RemoteGroup:
 class RemoteUnloads:
     """The unloads of a registrar that another process has. From any thread."""
 
-    def __init__(self, calls: RemoteCalls, release: str = "unload") -> None:
+    def __init__(self, calls: RemoteCalls, release: str = "unload", release_client: str = "unload_client") -> None:
         self._calls = calls
         self._release = release  # the method that releases a query
+        self._release_client = release_client  # the one that releases all at a server
 
     def begin(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Begin to release a query, and return a future of its end at once."""
@@ -254,22 +256,19 @@ class RemoteUnloads:
 
     def begin_all(self, server: ServerId | None, timeout_s: float | None) -> Reply[None]:
         """Begin to release all queries at a server, or, for None, all that the registrar holds for itself."""
-        method, args = _all_at(server)
-        return self._begun(method, *args, timeout_s=timeout_s)
+        return self._begun(*self._all_at(server), timeout_s=timeout_s)
 
     def wait_all(self, server: ServerId | None, timeout_s: float | None) -> None:
         """Release as begin_all() does, and return when all have been tried."""
-        method, args = _all_at(server)
-        self._calls.ask(method, *args, timeout_s=timeout_s)
+        self._calls.ask(*self._all_at(server), timeout_s=timeout_s)
+
+    def _all_at(self, server: ServerId | None) -> tuple[str, ...]:
+        return ("unload_all",) if server is None else (self._release_client, str(server))
 
     def _begun(self, method: str, *args: Any, **options: Any) -> Reply[None]:
         reply: Reply[None] = Reply()
         self._calls.send(reply, method, *args, **options)
         return reply
-
-
-def _all_at(server: ServerId | None) -> tuple[str, tuple[str, ...]]:
-    return ("unload_all", ()) if server is None else ("unload_client", (str(server),))
 
 
 # -- a registrar of the same system ------------------------------------------------------------------------------------
@@ -365,7 +364,7 @@ class RegistrarHandle(Registrar):
         self._node = node
         self._name = name
         self._far = HandleCalls(node.handle(name), name, patient=patient)
-        self._unload_ways = RemoteUnloads(self._far, "_unload_from_outside")
+        self._unload_ways = RemoteUnloads(self._far, "_unload_from_outside", "_unload_client_from_outside")
 
     @property
     def _load_ways(self) -> HandleLoads:
@@ -396,6 +395,11 @@ class RegistrarHandle(Registrar):
         for role in ROLES:
             pickling.dumps(getattr(spec, role), f"{role} callback")  # its error names the callback that cannot travel
         self._register_stored(pickling.dumps(spec, f"server {spec.name!r}"))
+
+    def _stop_listening(self, server: str, id: str) -> None:
+        if not self._node.dispatcher.closed:  # else the system has ended
+            with contextlib.suppress(RegistrarDown, UnknownRegistrar):  # its callbacks have ended with its process
+                self._ask("_stop_listening", server, id)
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
         """Refuse to close: a manager's registrar lives as long as its manager.

@@ -17,12 +17,12 @@ from rr_actors.base.errors import LoadError, UnknownQuery, UsageError
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.arguments import LoadOptions
-from rr_actors.registrar.engine.status import Status, next_spare
+from rr_actors.registrar.engine.status import next_spare
 from rr_actors.registrar.loads import Loads, Unloads
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.failures import is_released
 from rr_actors.registrar.model.rows import Held, Hold, Resource, priority_of
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.servers.callback_context import status_callback_of
 from rr_actors.registrar.servers.server_actor import ServerActor
 

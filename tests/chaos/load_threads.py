@@ -15,9 +15,8 @@ from typing import NamedTuple
 from chaos.report import Tally
 from chaos.victim_managers import PATIENCE_S, Want
 from rr_actors.base.errors import RrError
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.system.system import System
 

@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import UnknownQuery, UnknownRegistrar
-from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.queries import Status
 from rr_actors.system.console.client_queries import status_heard
 from rr_actors.system.console.console_messages import Heard
 from support import LIMIT_S, Calls, eventually, kill, wait_respawned

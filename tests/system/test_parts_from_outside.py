@@ -27,7 +27,7 @@ class Maps(rr.Manager):
             self.registrar.unload(query)
 
 
-@pytest.mark.parametrize("by", ["handle", "command line"])
+@pytest.mark.parametrize("by", ["handle", "handle, all at a server", "command line"])
 def test_a_part_is_not_unloaded_from_outside_without_force(tmp_path: Path, by: str) -> None:
     state = tmp_path / "state"
     with rr.System([rr.ChildSpec(Maps, id="maps")], state_dir=state) as system:
@@ -35,9 +35,9 @@ def test_a_part_is_not_unloaded_from_outside_without_force(tmp_path: Path, by: s
         whole = app.load("maps/map", "hall")
         maps = system.registrar("maps")
         (part,) = app.children(whole)
-        if by == "handle":
+        if by.startswith("handle"):
             with pytest.raises(rr.UsageError, match=r'a part of maps/map "hall".*revoke.*force'):
-                maps.unload(part.id)
+                maps.unload(part.id) if by == "handle" else maps.unload_client("maps/tile")
         else:
             for more in ((), ("--dry-run",)):
                 done = run_cli("unload", part.id, "--state", str(state), *more)

@@ -16,9 +16,8 @@ from rr_actors.base.checks import is_number
 from rr_actors.base.errors import LoadFailed, UsageError, shown
 from rr_actors.managers.actions.graph_checks import Signature
 from rr_actors.managers.actions.graph_model import SEPARATOR, Parameter, flat, nested
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.registrar.servers.callback_context import Current, current
 from rr_actors.runtime.processes.isolated import Events

@@ -58,10 +58,9 @@ from rr_actors.managers.actions.graph_runs import (
 )
 from rr_actors.managers.actions.run_controls import RunControl, Word
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOADED, State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.servers.callback_context import current
 from rr_actors.runtime.processes.isolated import Events, run_isolated
 

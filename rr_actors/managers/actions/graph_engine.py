@@ -33,9 +33,8 @@ from rr_actors.managers.actions.graph_runs import (
     feedback,
 )
 from rr_actors.managers.actions.run_controls import Word
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
 
 logger = Log("rr_actors.managers.actions")

@@ -22,9 +22,8 @@ from rr_actors.managers.budgets.pools import Pool, Reserve
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
 from rr_actors.managers.planning.setbacks import Setbacks
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import NO_FIELDS, Registrar
 from rr_actors.supervision.core.specs import Backoff
 

@@ -38,10 +38,9 @@ from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import GIVEN_UP, SOON_S
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOWEST, Phase, State
-from rr_actors.registrar.queries import Query, StatusCallback
+from rr_actors.registrar.queries import Query, Status, StatusCallback
 from rr_actors.registrar.registrar import NO_FIELDS
 from rr_actors.registrar.servers.callback_context import current
 

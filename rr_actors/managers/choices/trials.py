@@ -14,9 +14,8 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.managers.choices.planning import UNKNOWN, Choice, Plan, Standing, failed, plan
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault
 from rr_actors.managers.planning.retries import Retries
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query, StatusCallback
+from rr_actors.registrar.queries import Query, Status, StatusCallback
 
 logger = Log("rr_actors.managers.choices")
 

@@ -40,10 +40,9 @@ from rr_actors.managers.planning.last_good import LastGood, Sources, one_file, p
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
 from rr_actors.managers.planning.setbacks import BACKOFF, Setbacks
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import Phase, State
-from rr_actors.registrar.queries import Query, ResourceInfo
+from rr_actors.registrar.queries import Query, ResourceInfo, Status
 from rr_actors.registrar.registrar import NO_FIELDS
 from rr_actors.supervision.core.specs import Backoff
 

@@ -30,8 +30,7 @@ from rr_actors.managers.planning.blame import is_own_fault
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.templates import Parameters
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.status import Status
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.servers.callback_context import current
 
 logger = Log("rr_actors.managers.pipes")

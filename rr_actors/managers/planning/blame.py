@@ -17,9 +17,8 @@ from rr_actors.base.errors import (
     RegistrarDown,
     UsageError,
 )
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.registrar.servers.callback_context import current
 

@@ -29,6 +29,7 @@ from rr_actors.hosting.process_node import ProcessNode
 from rr_actors.registrar.core.decide import Item, refuse_uncommitted
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
 from rr_actors.registrar.engine.registrar_state import RegistrarState
+from rr_actors.registrar.engine.status import StatusMessage
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.effects import AnswerCall, Effect
@@ -94,6 +95,10 @@ class Audience(Protocol):
 
     def hears(self, query_id: str) -> bool:
         """Return whether callbacks for a query may begin now: it is not released, nor is the registrar closed."""
+        ...
+
+    def received(self, notice: Notice, *, repeated: bool) -> StatusMessage:
+        """Return the status that a notice carries, for a callback of this registrar."""
         ...
 
     def forget(self, query_id: str) -> None:

@@ -1,9 +1,9 @@
-"""Status: a message of an owner about a resource, as its holders hear it."""
+"""StatusMessage: a message of an owner about a resource, as its holders hear it."""
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, TypeVar
 
 from rr_actors.base.errors import UsageError, exact_text, is_a, readable, shown, text_of
 from rr_actors.registrar.model.rows import Notice, State
@@ -25,23 +25,8 @@ def state_of(state: object, what: str) -> State:
     return found
 
 
-class Status:
-    """A message about the state of a resource (thesis: status message).
-
-    To send one, make it with a state and a message. One that is received also says which resource it is about.
-
-    Attributes:
-        state: OK, UPDATE, WARNING, ERROR or FATAL. The name is accepted, too, in any case: Status("fatal").
-        message: text for people.
-        resource_id: the resource through which the status reached the receiver. The receiver holds it; in a server's
-            status callback it is the server's own if its owner has set the status.
-        query_id: the receiver's query on that resource; "" if the resource is the receiver's own.
-        source: the server where the status began, "registrar/server".
-        repeated: whether the status may have been heard before; a crash made that uncertain.
-        reason: "revoked" if the resource's owner takes it away; "ended" if a client's system has ended; "" else.
-        deadline_s: of a revoked resource, how many seconds after the status was sent it is unloaded by force: 0.0, if
-            that is done. None for any other status.
-    """
+class StatusMessage:
+    """A Status (registrar/queries.py) without the query that it is of: what the engine knows of one."""
 
     __slots__ = (
         "_event",
@@ -100,7 +85,7 @@ class Status:
         return f"{self.state}: {self.message}" if self.message else str(self.state)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Status) and self._key() == other._key()
+        return isinstance(other, StatusMessage) and self._key() == other._key()
 
     def __hash__(self) -> int:
         return hash(self._key())
@@ -109,20 +94,23 @@ class Status:
         return (self.state, self.message, self.resource_id, self.query_id, self.source)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_remake, (*self._key(), self.repeated, self.reason, self.deadline_s))
+        return (_remake, (type(self), *self._key(), self.repeated, self.reason, self.deadline_s))
 
 
-def status_of(notice: Notice, *, repeated: bool = False) -> Status:
+S = TypeVar("S", bound=StatusMessage)
+
+
+def status_of(notice: Notice, kind: type[S], *, repeated: bool = False) -> S:
     """Return the status that a notice carries."""
     place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
-    status = Status(notice.state, notice.message, **place, repeated=repeated)
+    status = kind(notice.state, notice.message, **place, repeated=repeated)
     status._event = notice.event  # pyright: ignore[reportPrivateUsage]  # same file
     if notice.reason:
         status.reason, status.deadline_s = notice.reason, notice.grace_ms / 1000
     return status
 
 
-def next_spare(status: Status) -> str:
+def next_spare(status: StatusMessage) -> str:
     """Return a name for the next spare part that a status needs: the same if a crash repeats the status."""
     return f"{status._event} {next(status._spares)}"  # pyright: ignore[reportPrivateUsage]  # same file
 
@@ -142,8 +130,8 @@ def message_text(message: object) -> str:
 
 
 def _remake(
-    state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool, *revoked: Any
-) -> Status:
-    status = Status(state, message, resource_id=resource_id, query_id=query_id, source=source, repeated=repeated)
-    status.reason, status.deadline_s = revoked
+    kind: type[S], state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool, *more: Any
+) -> S:
+    status = kind(state, message, resource_id=resource_id, query_id=query_id, source=source, repeated=repeated)
+    status.reason, status.deadline_s = more
     return status

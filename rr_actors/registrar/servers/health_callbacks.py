@@ -11,7 +11,7 @@ from typing import Any
 from rr_actors.base.errors import InvalidResponse, Unavailable, is_a, readable, shown
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
-from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.engine.status import StatusMessage
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.health import WELL, Health, ProbeCounts, ProbeResult, first_counts, judged
 from rr_actors.registrar.model.roles import PROBE
@@ -119,7 +119,7 @@ class HealthCallbacks:
     def _found(self, answer: object) -> ProbeResult:
         if answer is None:
             return WELL
-        status = answer if is_a(answer, Status) else None
+        status = answer if is_a(answer, StatusMessage) else None
         state = answer if status is None else status.state
         if not is_a(state, State) or state is State.UPDATE:
             expected = "None, or the State OK, WARNING, ERROR or FATAL, or a Status with one"

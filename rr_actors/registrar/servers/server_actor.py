@@ -39,7 +39,7 @@ from rr_actors.registrar.core.callback_runs import deaths_of
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.server import Callback, ServerSpec, checked_callback
-from rr_actors.registrar.engine.status import status_of
+from rr_actors.registrar.engine.status import StatusMessage, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
@@ -323,7 +323,9 @@ class ServerActor:
     @on_loop
     def start_status(self, resource: Resource, notice: Notice, *, repeated: bool) -> None:
         """Run the status callback for a status of the resource, or of one of its parts."""
-        status = status_of(notice, repeated=repeated)
+        audience = self.registrar.audience
+        received = functools.partial(status_of, kind=StatusMessage) if audience is None else audience.received
+        status = received(notice, repeated=repeated)
 
         def done(_result: None, error: BaseException | None) -> None:
             if error is not None:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import asyncio
 import inspect
 import threading
-from collections.abc import Awaitable, Callable, Coroutine, Generator
+from collections.abc import Awaitable, Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rr_actors.base.errors import NotRunning, RrError
+from rr_actors.base.errors import NotRunning, RrError, UnknownQuery, shortened
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.arguments import LoadOptions
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query, Response, StatusCallback, end, hear
+from rr_actors.registrar.queries import Query, Response, Status, StatusCallback, StatusCallbacks, end, hear, received
 from rr_actors.runtime.callback_errors import described, log_raised
+from rr_actors.runtime.user_loop import CallersLoop
 from rr_actors.system.console.console_client import Connections, ConsoleClient
 from rr_actors.system.console.console_messages import Dropped, Heard
 
@@ -132,8 +132,8 @@ class ClientViews:
         self.is_open = is_open
         self._is_connected = is_connected
         self._lock = threading.Lock()
-        self._held: dict[str, tuple[ClientQuery, StatusCallback | None]] = {}
-        self._on_server: dict[str, list[StatusCallback]] = {}
+        self._held: dict[str, ClientQuery] = {}
+        self.callbacks = StatusCallbacks(self._hears, set())
         self._loads = 0  # in flight
         self._early: dict[str, list[Heard | Dropped]] = {}  # of loads whose answers have not been read yet
 
@@ -153,26 +153,37 @@ class ClientViews:
     def add(self, query: ClientQuery, options: LoadOptions) -> None:
         """Have statuses reach a query and its callback."""
         own = None if options.on_status is None else described(options.on_status, "load: on_status")
-        if own is not None and options.loop is not None:
-            own = options.loop.bring(self._while_held(query.id, own))
         with self._lock:
-            self._held[query.id] = query, own
+            self._held[query.id] = query
+            self.callbacks.set(query.id, own, options.loop)
             early = self._early.pop(query.id, [])
         for heard in early:
             self.hear(heard)
 
-    def add_callback(self, server: str, callback: StatusCallback) -> None:
-        """Have the callback called for the queries at a server."""
+    def find(self, query_id: str) -> ClientQuery | None:
+        """Return the query of this id that is held; None else."""
+        return self._held.get(query_id)
+
+    def set_callback(self, query_id: str, callback: StatusCallback | None, loop: CallersLoop | None) -> None:
+        """Replace the status callback of a query.
+
+        Raises:
+            UnknownQuery: the query is not held any more.
+        """
         with self._lock:
-            self._on_server.setdefault(server, []).append(callback)
+            if query_id not in self._held:
+                text = f"query {shortened(query_id)}: this registrar does not hold it any more"
+                raise UnknownQuery(text, query_id=query_id)
+            self.callbacks.set(query_id, callback, loop)
 
     def forget(self, query_id: str, server: str) -> None:
         """Forget a query that is released; or all at a server; or all."""
         with self._lock:
-            held = [query for query, _ in self._held.values()]
+            held = self._held.values()
             gone = [one for one in held if query_id in ("", one.id) and server in ("", one.server_id)]
             for query in gone:
                 del self._held[query.id]
+                self.callbacks.drop(query.id)
         for query in gone:
             end(query)
 
@@ -189,30 +200,25 @@ class ClientViews:
         if isinstance(heard, Dropped):
             self.forget(heard.query_id, "")
         else:
-            self._tell(*held, status_heard(heard), heard.response, released=heard.released)
+            self._tell(held, status_heard(heard), heard.response, released=heard.released)
 
     def lost(self, error: NotRunning) -> None:
         """End all queries, as the system has ended: each hears FATAL, and its calls raise the error."""
         with self._lock:
             held = list(self._held.values())
-        for query, own in held:
+        for query in held:
             place = {"resource_id": query.resource_id, "query_id": query.id, "source": query.server_id}
             status = Status(State.FATAL, error.message, repeated=False, **place)
             status.reason = ENDED
             lose(query, error)
-            self._tell(query, own, status, None, released=True)
+            self._tell(query, status, None, released=True)
         self.forget("", "")
 
-    def _tell(
-        self, query: ClientQuery, own: StatusCallback | None, status: Status, response: bytes | None, *, released: bool
-    ) -> None:
-        callbacks = [*([own] if own is not None else []), *self._on_server.get(query.server_id, ())]
-        hear(query, status, response, released=released)
-        for callback in callbacks:
-            if not self._hears(query.id):
-                return
+    def _tell(self, query: ClientQuery, status: Status, response: bytes | None, *, released: bool) -> None:
+        hear(query, received(status, self.find), response, released=released)
+        for listener in self.callbacks.of(query.id, query.server_id):
             try:
-                if inspect.isawaitable(answer := callback(status)):
+                if inspect.isawaitable(answer := self.callbacks.beginning(query.id, listener)(status)):
                     asyncio.run(_await(answer))
             except Exception as error:
                 log_raised(logger, error, "a status callback for %s raised", query.server_id)
@@ -220,14 +226,7 @@ class ClientViews:
     def _hears(self, query_id: str) -> bool:
         if (held := self._held.get(query_id)) is None or not self.is_open():
             return False
-        return is_lost(held[0]) or self._is_connected()
-
-    def _while_held(self, query_id: str, callback: StatusCallback) -> Callable[[Status], Coroutine[Any, Any, None]]:
-        async def begin(status: Status) -> None:
-            if self._hears(query_id):
-                await callback(status)
-
-        return begin
+        return is_lost(held) or self._is_connected()
 
 
 def status_heard(heard: Heard) -> Status:

@@ -17,9 +17,8 @@ from collections.abc import Callable
 from rr_actors.base.errors import RrError, UnknownQuery, UnknownRegistrar, shown
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query, when_over
+from rr_actors.registrar.queries import Query, Status, when_over
 from rr_actors.registrar.registrar import Registrar, news
 from rr_actors.system.console.console_messages import RESPONSE_LIMIT_BYTES, Dropped, Heard
 

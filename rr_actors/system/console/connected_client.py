@@ -21,7 +21,16 @@ from rr_actors.base.errors import NotRunning, NotSerializable, RrError, Unavaila
 from rr_actors.base.names import ServerId, parse_server_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode
-from rr_actors.registrar.arguments import LoadOptions, Parent, checked_callback, checked_priority, state_path, target_id
+from rr_actors.registrar.arguments import (
+    LoadOptions,
+    Parent,
+    callers_loop,
+    checked_callback,
+    checked_priority,
+    state_path,
+    status_callback,
+    target_id,
+)
 from rr_actors.registrar.declarations import Declared, declaring
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries, note_request
 from rr_actors.registrar.pages import QueryRow
@@ -314,9 +323,21 @@ class ClientRegistrar(Consumer):
         given.value = value
         return given
 
-    def on_status(self, server: str, callback: StatusCallback) -> None:
-        """Call `callback(status)` for every query that this registrar holds at that server, now and later."""
-        self._views.add_callback(str(self._target(server)), checked_callback(callback))
+    def set_on_status(self, query_or_id: Query | str, callback: StatusCallback | None) -> None:
+        """Replace the status callback of a query of this registrar, as `query.on_status(callback)` does.
+
+        Raises:
+            UnknownQuery: the query is not held any more.
+            UsageError: `callback` cannot be called with a status alone.
+        """
+        own = status_callback(callback, "on_status", "callback")
+        self._views.set_callback(target_id(query_or_id), own, callers_loop(own))
+
+    def _listen(self, server: str, id: str, callback: StatusCallback) -> None:
+        self._views.callbacks.listen(server, id, checked_callback(callback))
+
+    def _stop_listening(self, server: str, id: str) -> None:
+        self._views.callbacks.stop(server, id)
 
     def queries(self) -> list[QueryRow]:
         """Return the queries that the registrar holds, each with the state of its last status.

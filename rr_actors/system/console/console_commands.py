@@ -24,11 +24,10 @@ from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id,
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.values.failure import error_of
 from rr_actors.registrar.arguments import LoadOptions
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.failures import held_by_whole
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.pages import QueryRow, ResourceRow
-from rr_actors.registrar.queries import response_bytes
+from rr_actors.registrar.queries import Status, response_bytes
 from rr_actors.registrar.registrar import load_bytes
 from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.runtime.processes.process import signal_name

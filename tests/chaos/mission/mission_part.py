@@ -25,8 +25,8 @@ from chaos.mission.mission_managers import (
 from chaos.mission.mission_threads import LIMIT_S, Operator
 from chaos.report import Tally
 from rr_actors.base.errors import RrError
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
+from rr_actors.registrar.queries import Status
 from rr_actors.supervision.core.specs import Backoff, ChildSpec
 from rr_actors.system.system import System
 from rr_actors.tools.inspection import Contents

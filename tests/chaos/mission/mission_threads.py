@@ -15,9 +15,8 @@ from chaos.report import Tally
 from rr_actors.base.errors import RrError
 from rr_actors.managers import Choose, RunGraph
 from rr_actors.managers.actions.graph_runs import ENDED, OVER, run_in
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.model.rows import State
-from rr_actors.registrar.queries import Query
+from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.system.system import System
 
