@@ -20,7 +20,9 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import eventually, kill, wait_respawned
+from rr_actors.streams.stream_sockets import known_streams
+from support import Gate, eventually, kill, pid_of, wait_respawned
+from support_inside import on_loop
 from support_interrupts import interrupted
 
 Start = Callable[..., rr.System]
@@ -48,6 +50,9 @@ class Boards(rr.Manager):
     @rr.server("once")
     def open_once(self) -> None:
         self.streams["once"] = rr.current().open_stream("once")
+
+    def on_receive(self, message: Any) -> None:
+        raise RuntimeError(message)
 
     def publish(self, name: str, *values: object, timeout_s: Any = None) -> list[int]:
         return [self.streams[name].publish(value, timeout_s=timeout_s) for value in values]
@@ -640,3 +645,44 @@ def test_a_stream_of_a_manager_that_has_crashed_since_the_load_is_waited_for(sta
                 asked(joined, None)
         with before.stream(timeout_s=1.0) as reader, pytest.raises(TimeoutError):
             next(reader)
+
+
+def test_a_stream_is_waited_for_before_the_event_loop_has_heard_of_the_crash(system: rr.System, boards: Any) -> None:
+    app, gate = system.open_registrar("app"), Gate()
+    with app.load("boards/board", ["a"]) as board:
+        busy = threading.Thread(target=on_loop, args=(app, gate))
+        pid = pid_of(system, "boards")
+        busy.start()
+        gate.wait_arrived()
+        os.kill(pid, signal.SIGKILL)
+        eventually(lambda: known_streams(board.resource_id) == {})
+        try:
+            reader = board.stream("a", timeout_s=30)
+        finally:
+            gate.open()
+        busy.join()
+        reads_on(boards, reader)
+
+
+def test_a_stream_is_waited_for_while_its_manager_in_a_thread_crashes(start: Start) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards", placement="thread"))
+    boards = system.ref("boards").proxy()
+    with load(system, "a") as board:
+        system.ref("boards").tell("crash")
+        while known_streams(board.resource_id):
+            pass
+        reads_on(boards, board.stream("a", timeout_s=30))
+
+
+def reads_on(boards: Any, reader: rr.StreamReader) -> None:
+    """Check that the reader gets what is published when it has come."""
+
+    def publish() -> None:
+        when_wanted(boards)
+        boards.publish("a", "again").get()
+
+    publishing = threading.Thread(target=publish)
+    publishing.start()
+    with reader:
+        assert next(reader).value == "again"
+    publishing.join()

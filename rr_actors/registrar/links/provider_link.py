@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import os
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -48,6 +49,7 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
 )
 from rr_actors.registrar.model.rows import Put, ServerType
+from rr_actors.runtime.processes.lifeline import is_ending
 from rr_actors.runtime.thread_rules import any_thread, on_loop
 from rr_actors.wire.name_service import NameEntry, Presence
 from rr_actors.wire.thread_connections import ThreadConnections
@@ -177,10 +179,13 @@ class ProviderLink(TurnActor):
     def has_run_since(self, seq: int) -> bool:
         """Return whether the provider is up, and no link to it has ended since the query of this number was asked for.
 
-        Then the process that has answered the load runs.
+        Then the process that has answered the load runs. The event loop hears of the end of a link later than others
+        see what the provider's end has closed, so this looks at the provider itself, too.
         """
-        is_up = self.link is not None and self._registrar.catalog.up.get(self.provider) == self.opened
-        return is_up and seq > self._lost_seq
+        link, here = self.link, self._registrar.peers.get(self.provider)
+        if link is None or self._registrar.catalog.up.get(self.provider) != self.opened or seq <= self._lost_seq:
+            return False
+        return not is_ending(link.pid) if link.pid != os.getpid() else here is not None and not here.closed
 
     @any_thread
     def _dial_for_thread(self, timeout_s: float) -> Exchange | None:

@@ -39,6 +39,10 @@ _ROUNDS = 20
 _LOOK_S = 0.005  # between two checks of a process, if there are no pidfds
 _END_S = 1.0  # the longest wait for the end of a swept process
 
+_ENDED = (b"Z", b"X", b"")  # states of a process
+_FLAGS = 6  # the place of its flags after its state
+_EXITING = 0x4  # PF_EXITING
+
 _F_SETSIG = 10  # fcntl's number on Linux; Python's fcntl module has no name for it
 
 
@@ -169,7 +173,7 @@ def reap(family: int, own: int | None) -> None:
         for task in Path("/proc/self/task").iterdir():
             for pid in map(int, (task / "children").read_text().split()):
                 mark = _mark_of(str(pid))
-                if mark is None or mark == ours or pid == own or _state(pid) != b"Z":
+                if mark is None or mark == ours or pid == own or _stat(pid)[0] != b"Z":
                     continue
                 if mark == OUTLIVES or mark >> _PID_BITS == family:
                     os.waitpid(pid, os.WNOHANG)
@@ -207,20 +211,25 @@ def _mark_of(pid: str) -> int | None:
 
 
 def _is_alive(pid: int) -> bool:
-    return _state(pid) not in (b"Z", b"X", b"")
+    return _stat(pid)[0] not in _ENDED
 
 
-def _state(pid: int) -> bytes:
-    try:
-        with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123
-            return file.read().rpartition(b")")[2].split()[0]
-    except (OSError, IndexError):
-        return b""
+def is_ending(pid: int) -> bool:
+    """Return whether a process ends, or is not there: true before the kernel closes the first of its descriptors."""
+    stat = _stat(pid)
+    return stat[0] in _ENDED or bool(int(stat[_FLAGS]) & _EXITING)
+
+
+def _stat(pid: int) -> list[bytes]:
+    """Return what the kernel says of a process, from its state on; no state if the process is not there."""
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123
+        return file.read().rpartition(b")")[2].split() or [b""]
+    return [b""]
 
 
 def stopped(pid: int) -> str:
     """Return words for a process that a signal has stopped, and that does nothing until it goes on; "" for another."""
-    if _state(pid) != b"T":
+    if _stat(pid)[0] != b"T":
         return ""
     return (
         "stopped by a signal, such as the terminal sends to a process in the background that uses it "
