@@ -133,7 +133,7 @@ class StreamReader:
         try:
             found = self._look(began, is_first=True)
             while isinstance(found, _Wait):
-                wake.wait(self._fds(), found.seconds)
+                wake.wait(self._links(), found.seconds)
                 found = self._look(began)
         except BaseException:
             self._leave()
@@ -153,7 +153,7 @@ class StreamReader:
             try:
                 found = self._look(began, is_first=True)
                 while isinstance(found, _Wait):
-                    await wake.wait_async(self._fds(), found.seconds)
+                    await wake.wait_async(self._links(), found.seconds)
                     found = self._look(began)
             except BaseException:
                 self._leave()
@@ -200,9 +200,10 @@ class StreamReader:
                 if self._link is not None:
                     self._link.leave()
 
-    def _fds(self) -> tuple[int, ...]:
+    def _links(self) -> tuple[PublisherLink, ...]:
+        """Return what to wait for. It stays open while somebody has it, also if another thread closes the reader."""
         link = self._link
-        return () if link is None or not link.is_open else (link.fileno(),)
+        return () if link is None or not link.is_open else (link,)
 
     def _release(self) -> None:
         """Give everything back, and wake all that wait."""

@@ -7,8 +7,15 @@ import contextlib
 import os
 import select
 from collections.abc import Sequence
+from typing import Protocol
 
 from rr_actors.streams.stream_sockets import close_in_children
+
+
+class Readable(Protocol):
+    """What has a descriptor."""
+
+    def fileno(self) -> int: ...
 
 
 class Wake:
@@ -39,18 +46,21 @@ class Wake:
             os.eventfd_read(self._fd)
         return True
 
-    def wait(self, more: Sequence[int], timeout_s: float | None) -> None:
-        """Wait until the flag is set, or one of more descriptors can be read."""
+    def wait(self, more: Sequence[Readable], timeout_s: float | None) -> None:
+        """Wait until the flag is set, or there is something to read.
+
+        What it waits for must stay open meanwhile: its descriptor would be that of another file.
+        """
         poll = select.poll()
-        for fd in (self._fd, *more):
+        for fd in (self._fd, *(each.fileno() for each in more)):
             poll.register(fd, select.POLLIN)
         poll.poll(None if timeout_s is None else timeout_s * 1000)
 
-    async def wait_async(self, more: Sequence[int], timeout_s: float | None) -> None:
+    async def wait_async(self, more: Sequence[Readable], timeout_s: float | None) -> None:
         """Wait as wait() does, in the running loop, without a thread."""
         loop = asyncio.get_running_loop()
         ready: asyncio.Future[None] = loop.create_future()
-        fds = (self._fd, *more)
+        fds = (self._fd, *(each.fileno() for each in more))
         try:
             for fd in fds:
                 loop.add_reader(fd, _end, ready)

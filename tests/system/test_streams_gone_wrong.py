@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+import uvloop
 
 import rr_actors as rr
 from rr_actors.streams.stream_sockets import known_streams
@@ -686,3 +687,25 @@ def reads_on(boards: Any, reader: rr.StreamReader) -> None:
     with reader:
         assert next(reader).value == "again"
     publishing.join()
+
+
+@pytest.mark.parametrize("new_loop", [asyncio.new_event_loop, uvloop.new_event_loop])
+def test_a_reader_that_is_closed_while_a_task_waits_takes_no_other_socket_along(
+    system: rr.System, boards: Any, new_loop: Callable[[], asyncio.AbstractEventLoop]
+) -> None:
+    async def close_and_receive(board: rr.Query[Any]) -> bytes:
+        reader = board.stream("a")
+        waiting = asyncio.ensure_future(anext(reader, None))
+        await asyncio.to_thread(when_wanted, boards)
+        await asyncio.to_thread(reader.close)
+        here, there = socket.socketpair()  # they would have the descriptor of the reader's connection
+        with here, there:
+            here.setblocking(False)
+            receiving = asyncio.ensure_future(asyncio.get_running_loop().sock_recv(here, 10))
+            await waiting
+            there.send(b"received")
+            return await asyncio.wait_for(receiving, 10)
+
+    with load(system, "a") as board, asyncio.Runner(loop_factory=new_loop) as runner:
+        for _ in range(5):
+            assert runner.run(close_and_receive(board)) == b"received"
