@@ -13,8 +13,8 @@ import math
 import time
 from asyncio import AbstractEventLoop, TimerHandle
 from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -237,23 +237,33 @@ class TimeLimits:
 # -- callbacks in rounds, each with a limit ----------------------------------------------------------------------------
 #
 # A round has all keys of that moment. Its probes are spread over the period, so 10,000 keys do not wake all threads at
-# once. Of one key no two probes run at the same time: one that hangs is not started again until it has returned.
+# once. Of one key no two probes run at the same time: one that hangs is not started again until it has returned. Each
+# key has a period and a limit of its own: a round has the keys that are due.
 
 _PART_S = 0.05  # between the parts of a round
 _FEW = 8  # probes that begin together, without being spread
 _SOON_S = 0.005
 
 
+class ProbeTimes(NamedTuple):
+    """The seconds from one probe of a key to the next, and its time limit in seconds."""
+
+    every_s: float
+    timeout_s: float
+
+
 class TimedRun(msgspec.Struct, eq=False):
     """One run of a callback.
 
     Attributes:
+        times: those of its key.
         began: when the callback began; None while it waits for a thread. Another thread sets it.
         ran_s: how long it has run, without standstills of this process, as of the last look.
         late_at: when the callback was last found late, by the running time; None: it is not late.
         after: what waits until it has returned, or is late.
     """
 
+    times: ProbeTimes
     began: float | None = None
     ran_s: float = 0.0
     late_at: float | None = None
@@ -265,9 +275,8 @@ class Probes:
     """The probes of the resources of one server. Their time limits count the time for which this process runs.
 
     Args:
-        every_s: the length of a period.
-        timeout_s: the time limit of a callback.
-        keys: returns the keys of the next round.
+        look_s: the longest time from one round to the next: a new key is found within it.
+        keys: returns the keys that can be probed, each with its times.
         start: starts the callbacks of keys. Each calls begins(), and ended() is called on the loop for each.
         late: called for a key whose callback is late, and in each later round in which it has not returned.
     """
@@ -275,20 +284,21 @@ class Probes:
     def __init__(
         self,
         loop: AbstractEventLoop,
-        every_s: float,
-        timeout_s: float,
-        keys: Callable[[], Sequence[str]],
+        look_s: float,
+        keys: Callable[[], Mapping[str, ProbeTimes]],
         start: Callable[[Sequence[str]], None],
         late: Callable[[str], None],
     ) -> None:
         self._loop = loop
-        self._every_s, self._timeout_s = every_s, timeout_s
+        self._look_s = self._round_s = look_s
         self._keys, self._start, self._late = keys, start, late
         self._running: dict[str, TimedRun] = {}
+        self._times: Mapping[str, ProbeTimes] = {}
+        self._due_at: dict[str, float] = {}
         self._left: deque[str] = deque()
         self._size = 0  # keys of this round
         self._round_began = -math.inf
-        self._slice_s = slice_of(timeout_s)
+        self._slice_s = _SLICE_S
         self._ran, self._ran_s = RunningTime(self._slice_s), 0.0  # and the running time at the last look
         self._timer: TimerHandle | None = None
         self._closed = False
@@ -347,17 +357,25 @@ class Probes:
             return
         now = time.monotonic()
         self._end_late(now)
-        if not self._left and now >= self._round_began + self._every_s:
-            self._left = deque(self._keys())
-            self._size, self._round_began = len(self._left), now
+        if not self._left and now >= self._round_began + self._round_s:
+            self._begin_round(now)
         self._probe(self._due(now))
         wait_s = max(self._next_at(now) - now, _SOON_S)
         self._ran.slice_s = max(wait_s, self._slice_s)
         self._timer = self._loop.call_later(wait_s, self._tick)
 
+    def _begin_round(self, now: float) -> None:
+        self._times = self._keys()
+        due = [key for key in self._times if now >= self._due_at.get(key, now)]
+        self._due_at = {key: self._due_at.get(key, now) for key in self._times}
+        self._due_at.update((key, now + self._times[key].every_s) for key in due)
+        self._round_s = min(self._look_s, min(self._due_at.values(), default=math.inf) - now)
+        self._slice_s = min((slice_of(times.timeout_s) for times in set(self._times.values())), default=_SLICE_S)
+        self._left, self._size, self._round_began = deque(due), len(due), now
+
     def _due(self, now: float) -> list[str]:
         """Take the next keys out of the round: as many as belong into the part of the period that is over."""
-        part = 1.0 if self._size <= _FEW else (now - self._round_began + _PART_S) / self._every_s
+        part = 1.0 if self._size <= _FEW else (now - self._round_began + _PART_S) / self._round_s
         due = len(self._left) - math.floor(self._size * (1 - min(part, 1.0)))
         return [self._left.popleft() for _ in range(due)]
 
@@ -367,7 +385,7 @@ class Probes:
             for key in set(keys) - set(free):
                 self._still_late(key, self._running[key])
         if free:
-            self._running.update((key, TimedRun()) for key in free)
+            self._running.update((key, TimedRun(self._times[key])) for key in free)
             self._start(free)
 
     def _end_late(self, now: float) -> None:
@@ -375,20 +393,20 @@ class Probes:
         for key, probe in list(self._running.items()):
             if probe.late_at is None and probe.began is not None:
                 probe.ran_s += min(self._ran_s - before_s, now - probe.began)
-                if probe.ran_s >= self._timeout_s:
+                if probe.ran_s >= probe.times.timeout_s:
                     probe.late_at = self._ran_s
                     self._late(key)
                     _go_on(probe)
 
     def _still_late(self, key: str, probe: TimedRun) -> None:
         late_at = probe.late_at
-        if late_at is not None and self._ran_s - late_at >= self._every_s / 2:  # else this round has counted it
+        if late_at is not None and self._ran_s - late_at >= probe.times.every_s / 2:  # else this round has counted it
             probe.late_at = self._ran_s
             self._late(key)
 
     def _next_at(self, now: float) -> float:
-        round_at = now + _PART_S if self._left else self._round_began + self._every_s
-        left_s = (self._timeout_s - probe.ran_s for probe in self._running.values() if probe.late_at is None)
+        round_at = now + _PART_S if self._left else self._round_began + self._round_s
+        left_s = (probe.times.timeout_s - probe.ran_s for probe in self._running.values() if probe.late_at is None)
         return min(round_at, now + min((min(left, self._slice_s) for left in left_s), default=math.inf))
 
 

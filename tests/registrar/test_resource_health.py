@@ -54,6 +54,9 @@ LATE_WARNING = rr.Health(warn_after=2, fail_after=3, pass_after=2)
         (LATE_WARNING, [ERROR, ERROR, ERROR, OK, WARNING, OK, OK], [None, WARNING, ERROR, None, WARNING, None, OK]),
         (rr.Health(fatal_after_s=3), [ERROR, ERROR, ERROR, ERROR], [WARNING, None, ERROR, FATAL]),
         (rr.Health(fatal_after_s=3), [ERROR, ERROR, OK, ERROR, ERROR], [WARNING, None, OK, WARNING, None]),
+        (rr.Health(fatal_after=3), [ERROR, ERROR, ERROR], [WARNING, None, FATAL]),
+        (rr.Health(fatal_after=2), [ERROR, WARNING, ERROR, ERROR], [WARNING, None, None, FATAL]),
+        (rr.Health(fatal_after=1), [OK, ERROR], [None, FATAL]),
     ],
 )
 def test_the_state_follows_from_the_results(health: rr.Health, results: list[State], said: list[State | None]) -> None:
@@ -119,6 +122,7 @@ def test_the_state_after_any_results_is_what_the_latest_in_a_row_say(health: rr.
         ("warn_after", 4, "health: warn_after: expected at most fail_after, 3, got 4"),
         ("fail_after", 1.5, "health: fail_after: expected a whole number, 1 or more, got 1.5"),
         ("pass_after", True, "health: pass_after: expected a whole number, 1 or more, got True"),
+        ("fatal_after", 0, "health: fatal_after: expected a whole number, 1 or more, or None, got 0"),
     ],
 )
 def test_a_wrong_number_is_refused_by_name(field: str, value: Any, text: str) -> None:

@@ -15,7 +15,7 @@ from rr_actors.base.errors import InvalidSpec, is_a, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.fields import annotated_types, by_fields, field_names, hints_of
-from rr_actors.registrar.model.health import Health
+from rr_actors.registrar.model.health import Health, HealthOf
 from rr_actors.registrar.model.roles import ROLES, Role
 from rr_actors.runtime.workers import is_async
 from rr_actors.wire.name_service import LABELS_BYTES
@@ -51,7 +51,7 @@ class ServerSpec(msgspec.Struct, frozen=True):
     paused_s: float | None = None
     pause: Callback | None = None
     resume: Callback | None = None
-    health: Health | None = None
+    health: Health | HealthOf | None = None
     probe: Callback | None = None
     provides: Labels | None = None
     at_once: int | None = None  # None: as many as ask
@@ -99,7 +99,7 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
         if not is_number(spec.linger_s) or spec.linger_s < 0:
             _invalid(name, "linger_s", "seconds, 0 or more", spec.linger_s)
         _check_idle(name, spec)
-        if spec.health is not None and not is_a(spec.health, Health):
+        if spec.health is not None and not is_a(spec.health, (Health, HealthOf)):
             _invalid(name, "health", "an rr.Health or None", spec.health)
         if spec.at_once is not None and (type(spec.at_once) is not int or spec.at_once < 1):
             _invalid(name, "at_once", "a whole number of at least 1, or None", spec.at_once)

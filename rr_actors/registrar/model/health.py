@@ -6,13 +6,17 @@ that is respawned counts anew.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
 
 from rr_actors.base.checks import check_number, invalid
 from rr_actors.base.errors import is_a
 from rr_actors.registrar.model.rows import State
 
-_SHORTEST_S, _LONGEST_S = 0.01, 86_400.0
+SHORTEST_S, LONGEST_S = 0.01, 86_400.0
+LOOK_S = 1.0
+"""Seconds within which a resource with a Health of its own is found, and probed for the first time."""
 _NOT_WELL = (State.WARNING, State.ERROR)
 
 
@@ -29,6 +33,7 @@ class Health(msgspec.Struct, frozen=True):
         fail_after: failures in a row after which it has the state ERROR.
         pass_after: probes in a row that find it well, after which it has the state OK again.
         fatal_after_s: seconds of failures in a row after which it is lost, with the state FATAL. None: never.
+        fatal_after: failures in a row after which it is lost. None: never.
 
     Raises:
         InvalidSpec: a number is wrong.
@@ -40,6 +45,7 @@ class Health(msgspec.Struct, frozen=True):
     fail_after: int = 3
     pass_after: int = 1
     fatal_after_s: float | None = None
+    fatal_after: int | None = None
 
     def __post_init__(self) -> None:
         self._check_seconds("every_s", self.every_s)
@@ -47,14 +53,31 @@ class Health(msgspec.Struct, frozen=True):
         if self.fatal_after_s is not None:
             self._check_seconds("fatal_after_s", self.fatal_after_s, ", or None")
         for field in ("warn_after", "fail_after", "pass_after"):
-            count = getattr(self, field)
-            if not is_a(count, int) or is_a(count, bool) or count < 1:
-                raise invalid("health", field, "a whole number, 1 or more", count)
+            check_count(getattr(self, field), "health", field)
+        if self.fatal_after is not None:
+            check_count(self.fatal_after, "health", "fatal_after", also=", or None")
         if self.warn_after > self.fail_after:
             raise invalid("health", "warn_after", f"at most fail_after, {self.fail_after}", self.warn_after)
 
     def _check_seconds(self, field: str, seconds: object, also: str = "") -> None:
-        check_number(seconds, "health", field, least=_SHORTEST_S, most=_LONGEST_S, also=also)
+        check_number(seconds, "health", field, least=SHORTEST_S, most=LONGEST_S, also=also)
+
+
+class HealthOf(msgspec.Struct, frozen=True):
+    """How each resource of a ready-made manager's server is probed.
+
+    Attributes:
+        of: returns the Health of a resource by its id; None: it is not probed. The event loop calls it, so it must not
+            block.
+    """
+
+    of: Callable[[str], Health | None]
+
+
+def check_count(count: object, who: str, field: str, also: str = "") -> None:
+    """Check that a count is a whole number, 1 or more; `also` names an alternative, for the error."""
+    if not is_a(count, int) or is_a(count, bool) or count < 1:
+        raise invalid(who, field, f"a whole number, 1 or more{also}", count)
 
 
 class ProbeResult(msgspec.Struct, frozen=True):
@@ -130,5 +153,7 @@ def _state_after(health: Health, counts: ProbeCounts, found: State, now_s: float
 
 
 def _is_lost(health: Health, counts: ProbeCounts, now_s: float) -> bool:
+    if health.fatal_after is not None and counts.failed >= health.fatal_after:
+        return True
     limit_s, since = health.fatal_after_s, counts.failing_since
     return limit_s is not None and since is not None and now_s - since >= limit_s

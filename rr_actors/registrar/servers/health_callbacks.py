@@ -13,18 +13,26 @@ from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.status import StatusMessage
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.health import WELL, Health, ProbeCounts, ProbeResult, first_counts, judged
+from rr_actors.registrar.model.health import (
+    LOOK_S,
+    WELL,
+    Health,
+    HealthOf,
+    ProbeCounts,
+    ProbeResult,
+    first_counts,
+    judged,
+)
 from rr_actors.registrar.model.roles import PROBE
 from rr_actors.registrar.model.rows import LOADED, Resource, State
 from rr_actors.registrar.servers.callback_failures import said
 from rr_actors.registrar.servers.server_base import ServerBase, nothing
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.thread_rules import on_loop
-from rr_actors.runtime.time_limits import Probes
+from rr_actors.runtime.time_limits import Probes, ProbeTimes
 
 logger = Log("rr_actors.server")
 
-_NO_HEALTH = Health()
 _CAREFUL_S = 60.0  # so long after its start, a process writes down which health callbacks run
 
 
@@ -37,10 +45,10 @@ class HealthCallbacks:
 
     def __init__(self, server: ServerBase) -> None:
         self._registrar, self._server, self._origin = server.registrar, server, server.origin
-        health = server.spec.health or _NO_HEALTH
-        loop, rounds = server.registrar.node.dispatcher.loop, (health.every_s, health.timeout_s)
-        self.probes = Probes(loop, *rounds, self._probed, self._probe, self._probe_late)
-        self._health, self._counts = health, dict[str, ProbeCounts]()  # by resource
+        loop, health = server.registrar.node.dispatcher.loop, server.spec.health
+        look_s = health.every_s if isinstance(health, Health) else LOOK_S
+        self.probes = Probes(loop, look_s, self._probed, self._probe, self._probe_late)
+        self._counts = dict[str, ProbeCounts]()  # by resource
         self._inherited = self._held_before() if server.spec.health else frozenset[str]()
         self._careful_until = math.inf
         server.add(PROBE, self._probe_arguments, self._found)
@@ -53,13 +61,17 @@ class HealthCallbacks:
             self.probes.open()
 
     @on_loop
-    def _probed(self) -> list[str]:
-        """Return the resources of the next round, and forget the results of the others."""
+    def _probed(self) -> dict[str, ProbeTimes]:
+        """Return the resources that can be probed now, and forget the results of the others."""
         with self._registrar.lock:
             ids = list(self._registrar.whole().by_server.get(self._server.spec.name, ()))
-        ids = [id for id in ids if self._is_probed(id)]
-        self._counts = {id: counts for id in ids if (counts := self._counts.get(id)) is not None}
-        return ids
+        healths = {id: health for id in ids if self._is_probed(id) and (health := self._health_of(id)) is not None}
+        self._counts = {id: counts for id in healths if (counts := self._counts.get(id)) is not None}
+        return {id: ProbeTimes(health.every_s, health.timeout_s) for id, health in healths.items()}
+
+    def _health_of(self, resource_id: str) -> Health | None:
+        health = self._server.spec.health
+        return health.of(resource_id) if isinstance(health, HealthOf) else health
 
     def _is_probed(self, resource_id: str) -> bool:
         catalog = self._registrar.catalog
@@ -132,14 +144,16 @@ class HealthCallbacks:
             self._judge(resource_id, found or ProbeResult(State.ERROR, "" if error is None else said(error)), error)
 
     def _probe_late(self, resource_id: str) -> None:
-        self._judge(resource_id, ProbeResult(State.ERROR, f"not returned within {self._health.timeout_s:g} s"))
+        if (health := self._health_of(resource_id)) is not None:
+            self._judge(resource_id, ProbeResult(State.ERROR, f"not returned within {health.timeout_s:g} s"))
 
     def _judge(self, resource_id: str, found: ProbeResult, error: BaseException | None = None) -> None:
         """Count a result, and set the status of the resource if its state changes by that."""
-        if self._registrar.closed or not self._is_probed(resource_id):
+        health = self._health_of(resource_id)
+        if self._registrar.closed or health is None or not self._is_probed(resource_id):
             return
         counts = self._counts.get(resource_id) or first_counts(self._registrar.catalog.resources[resource_id].state)
-        self._counts[resource_id], state = judged(self._health, counts, found, self.probes.ran_s())
+        self._counts[resource_id], state = judged(health, counts, found, self.probes.ran_s())
         if state is None:
             return
         text = readable(f"health: {found.message or found.state}")
