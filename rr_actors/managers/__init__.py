@@ -17,6 +17,7 @@ from rr_actors.managers.choices.chosen import Choose, Chosen
 from rr_actors.managers.components import Component, Components, LoadComponent
 from rr_actors.managers.keeper.keep_manager import Keeper, Kept
 from rr_actors.managers.pipes.pipe_manager import BuiltPipe, Pipe, Pipes
+from rr_actors.managers.program_conditions import ProgramHealth
 from rr_actors.managers.programs import Program, Programs, Ready, RunProgram
 from rr_actors.managers.robots import LoadRobot, Robot, Robots
 
@@ -45,6 +46,7 @@ __all__ = [
     "Pool",
     "PoolInfo",
     "Program",
+    "ProgramHealth",
     "Programs",
     "Ready",
     "Reserve",

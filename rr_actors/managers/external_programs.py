@@ -18,7 +18,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -30,7 +30,7 @@ from rr_actors.base.errors import RrError, shown
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.process_marks import VARIABLE, kill_allocation
-from rr_actors.managers.program_directory import Home, remove_retired, shim_of
+from rr_actors.managers.program_directory import OUTPUT, Home, remove_retired, shim_of
 from rr_actors.managers.program_usage import ProgramUsage
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.control_groups import ControlGroups
@@ -74,7 +74,12 @@ class Exit:
             how = f"exited with code {self.code}"
         else:
             how = "has ended unseen: the process that watched over it was killed, or could not write (a full disk?)"
-        return f"{how}; last output:\n" + "\n".join(f"  {line}" for line in self.output) if self.output else how
+        return with_output(how, self.output)
+
+
+def with_output(text: str, output: Sequence[str]) -> str:
+    """Return a text about a program with the last lines of its output, if it has had any."""
+    return f"{text}; last output:\n" + "\n".join(f"  {line}" for line in output) if output else text
 
 
 @dataclass(frozen=True)
@@ -254,6 +259,14 @@ class ExternalPrograms:
                 return known.now()
             except psutil.Error:
                 raise ProgramFailed("the program has ended") from None
+
+    def output_file(self, key: str) -> Path:
+        """Return the file to which the output of a program is written while it runs."""
+        return self._home(key).path / OUTPUT
+
+    def last_output(self, key: str) -> tuple[str, ...]:
+        """Return the last lines of a program's output."""
+        return self._home(key).output(TAIL_LINES)
 
     def close(self, *, final: bool = False) -> None:
         """Stop watching the programs. They run on, and can be attached to again.

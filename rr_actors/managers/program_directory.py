@@ -21,6 +21,7 @@ from rr_actors.runtime.processes.control_groups import ControlGroup
 logger = Log("rr_actors.managers.program_directory")
 
 _LINE_LIMIT = 500  # characters
+OUTPUT = "output.log"
 _RETIRED = ".retired-"
 
 
@@ -137,7 +138,7 @@ class Home:
     def output(self, lines: int) -> tuple[str, ...]:
         """Return the last lines of the program's output, whether it runs or has ended."""
         data = b""
-        for name in ("output.old", "output.log"):
+        for name in ("output.old", OUTPUT):
             with contextlib.suppress(OSError):  # the file does not exist yet
                 data += (self.path / name).read_bytes()
         last = data.decode(errors="replace").rstrip("\n").split("\n")[-lines:] if data else []

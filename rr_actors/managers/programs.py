@@ -22,10 +22,12 @@ from msgspec.structs import replace
 from rr_actors.base.errors import InvalidRequest, RrError, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
-from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order
+from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running, with_output
 from rr_actors.managers.program_conditions import (
     Condition,
     Probe,
+    ProgramCheck,
+    ProgramHealth,
     file_is_written,
     port_accepts,
     probe_agrees,
@@ -34,6 +36,7 @@ from rr_actors.managers.program_conditions import (
 from rr_actors.registrar.declarations import costing, server
 from rr_actors.registrar.engine.server import ServerSpec, checked_spec, checked_whole
 from rr_actors.registrar.manager import Manager
+from rr_actors.registrar.model.health import Health, HealthOf
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Status
 from rr_actors.registrar.servers.callback_context import current
@@ -79,6 +82,7 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         instance: a name that distinguishes requests that are otherwise the same: each name gets its own program.
         cost: what it costs of the pools of the manager's Budgets, as ``{"cpu": 0.5, "memory_bytes": 2e8}``: the shares
             are loaded before it starts. It can use no more than these two, where a control group can be made for it.
+        health: what is expected of it while it runs. None: it may be silent.
     """
 
     command: str
@@ -90,6 +94,7 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grace_s: Seconds = 5.0
     instance: str = ""
     cost: dict[str, float] = {}
+    health: ProgramHealth | None = None
 
 
 def _cost(request: RunProgram) -> dict[str, float]:
@@ -107,6 +112,8 @@ class Programs(Manager):
     """Serves `program`: starts, watches and ends external programs.
 
     If a program ends unexpectedly, its holders hear FATAL, with the exit code or signal and the last lines of output.
+    A program that is FATAL for another reason is ended before its holders hear of that: its health has found it silent,
+    or a holder has said so.
     Programs must stay in the foreground: a daemon that a program leaves is ended with it. Linux only.
     """
 
@@ -123,7 +130,7 @@ class Programs(Manager):
         """Keep a directory for each program below `directory` (default: "programs" beside the registrar's catalog).
 
         Args:
-            probes: functions that requests may name as their readiness.
+            probes: functions that requests may name as the probe of their readiness or health.
             idle, linger_s, paused_s: what becomes of a program that nobody needs, as for register_server(). A paused
                 program keeps its memory and takes no CPU: its control group is frozen, with all that it started.
                 Where none can be made, each of its processes is stopped by SIGSTOP.
@@ -138,23 +145,27 @@ class Programs(Manager):
         self._idleness = {"idle": idle, "linger_s": linger_s, "paused_s": paused_s}
         self._lock = threading.Lock()
         self._programs: ExternalPrograms | None = None
+        self._checks: dict[str, ProgramCheck] = {}  # by resource
 
     def on_stop(self) -> None:
         """Stop watching the programs. They run until their holders release them; a last stop ends those that start."""
         self._external.close(final=self._final)
 
-    @server("program", idle="pause")
+    @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _adapted()
     def run_program(self, request: RunProgram) -> Program:
         """Start a program, or adopt one that an interrupted load has started."""
         me = current()
         order, missing = _order(request), self._missing(request.ready, repeated=me.attempt > 1)
         timeout_s = request.ready.timeout_s
+        check = self._check(request)
         running = self._external.start(me.resource_id, order, attempt=me.attempt, missing=missing, timeout_s=timeout_s)
+        self._begin_checks(check)
         return Program(*running)
 
     @run_program.unload
     def end_program(self, request: RunProgram, response: Program) -> None:
         """End the program and all its descendants."""
+        self._checks.pop(current().resource_id, None)
         self._external.stop(current().resource_id)
         if self._directory is None:
             with contextlib.suppress(OSError):  # others run
@@ -163,7 +174,23 @@ class Programs(Manager):
     @run_program.recover
     def find_program(self, request: RunProgram, response: Program) -> Program:
         """Watch the program again if it still runs."""
-        return Program(*self._external.attach(current().resource_id))
+        running = self._external.attach(current().resource_id)
+        self._begin_checks(self._check(request))
+        return Program(*running)
+
+    @run_program.health
+    def check_program(self, request: RunProgram, response: Program) -> Status | None:
+        """Return what is seen of a program that is not as its health expects."""
+        id = current().resource_id
+        check = self._checks.get(id)
+        seen = "" if check is None else check.seen(Running(response.pid, response.start_time))
+        return Status(State.ERROR, with_output(seen, self._external.last_output(id))) if seen else None
+
+    @run_program.status
+    def program_status(self, request: RunProgram, status: Status) -> None:
+        """End a program that is lost, so that another can take its place: it may hold a device or a port."""
+        if status.state is State.FATAL and status.resource_id == current().resource_id:
+            self._external.stop(status.resource_id)
 
     @run_program.usage
     def program_usage(self, request: RunProgram, response: Program) -> dict[str, float]:
@@ -179,11 +206,13 @@ class Programs(Manager):
     def resume_program(self, request: RunProgram, response: Program) -> None:
         """Let it go on."""
         self._external.resume(current().resource_id)
+        if (check := self._checks.get(current().resource_id)) is not None:
+            check.begin_anew()
 
     def _adapted(self, spec: ServerSpec) -> ServerSpec:
         unused = {} if self._pauses else {"pause": None, "resume": None}
         spec = costing(spec, _cost, self._cost_from, self)
-        return checked_whole(checked_spec(replace(spec, **self._idleness, **unused)))
+        return checked_whole(checked_spec(replace(spec, **self._idleness, **unused, health=HealthOf(self._health_of))))
 
     @property
     def _external(self) -> ExternalPrograms:
@@ -208,6 +237,20 @@ class Programs(Manager):
             self.registrar.send_status(resource_id, Status(State.FATAL, f"the program {end}"))
         except RrError as error:
             logger.warning("%s: the program %s; its holders could not be told: %s", resource_id, end, error)
+
+    def _check(self, request: RunProgram) -> ProgramCheck | None:
+        if request.health is None:
+            return None
+        return ProgramCheck(request.health, self._external.output_file(current().resource_id), self._probes)
+
+    def _begin_checks(self, check: ProgramCheck | None) -> None:
+        if check is not None:
+            check.begin_anew()
+            self._checks[current().resource_id] = check
+
+    def _health_of(self, resource_id: str) -> Health | None:
+        check = self._checks.get(resource_id)
+        return None if check is None else check.health
 
     def _missing(self, ready: Ready, *, repeated: bool) -> Condition:
         """Return what says which conditions of a program's readiness do not hold. The probe is asked last."""
