@@ -148,7 +148,7 @@ def convert_typed(value: object, file: str, kind: type[_T], key: str = "") -> _T
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         raise_faults([*_faults(value, kind, file, key)])
-        raise _wrong_at(value, kind, file, str(error), key) from error
+        raise _wrong_at(value, kind, file, error, key) from error
 
 
 def _faults(value: object, kind: Any, file: str, key: str) -> Iterator[ConfigError]:
@@ -161,7 +161,7 @@ def _faults(value: object, kind: Any, file: str, key: str) -> Iterator[ConfigErr
         try:
             msgspec.convert(value, kind)
         except msgspec.ValidationError as error:
-            yield _wrong_at(value, kind, file, str(error), key)
+            yield _wrong_at(value, kind, file, error, key)
 
 
 def _faults_of_parts(value: object, kind: Any, file: str, key: str) -> Iterator[ConfigError]:
@@ -191,9 +191,15 @@ def _faults_of_table(table: dict[str, object], struct: Any, file: str, key: str)
             yield wrong(file, key, f"the key {name}", table, said="none")
 
 
-def _wrong_at(value: object, kind: Any, file: str, said: str, key: str) -> ConfigError:
-    """Return the error for msgspec's text about a value, such as "Expected `int`, got `str`"."""
-    problem = said.partition(" - at `")[0]
+def _wrong_at(value: object, kind: Any, file: str, error: msgspec.ValidationError, key: str) -> ConfigError:
+    """Return the error for msgspec's text about a value, such as "Expected `int`, got `str`".
+
+    A Struct that checks itself has said which of its fields is wrong.
+    """
+    if isinstance(error.__cause__, InvalidSpec):
+        details = error.__cause__.details
+        return wrong(file, f"{key}.{details['field']}".removeprefix("."), details["expected"], details["got"])
+    problem = str(error).partition(" - at `")[0]
     expected = _BETWEEN_TICKS.sub(_in_toml, problem.removeprefix("Expected ").partition(", got ")[0])
     if problem.startswith("Invalid enum value"):  # msgspec does not say which there are
         literal = next((one for one in (kind, *get_args(kind)) if get_origin(one) is Literal), None)

@@ -14,6 +14,9 @@ The registry is a TOML file::
     arguments = ["-m", "robot.lidar", "--publish", "${scans}"]
     directory = "${here}/.."                             # `here`: the directory of this file
     ready = { line = "scanning", timeout_s = 5 }
+
+    [component.health]                                   # as ProgramHealth, see program_conditions.py; may be left out
+    line_every_s = 1.0                                   # a component that is silent is replaced as one that has ended
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from weakref import WeakValueDictionary
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, LoadFailed, RrError, UnknownQuery
+from rr_actors.base.errors import ConfigError, LoadFailed, LoadTimeout, RrError, UnknownQuery
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
@@ -38,7 +41,8 @@ from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part
 from rr_actors.managers.planning.last_good import last_good_file, path_of
 from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import GIVEN_UP, Retries
-from rr_actors.managers.program_checks import parameter_faults, program_faults
+from rr_actors.managers.program_checks import parameter_faults, program_faults, template_faults
+from rr_actors.managers.program_conditions import ProgramHealth
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
 from rr_actors.registrar.declarations import server
@@ -64,6 +68,7 @@ class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     reliability: Annotated[float, msgspec.Meta(ge=0, le=1)] = 1.0
     parameters: dict[str, Parameter] = {}
     defaults: dict[str, Parameter] = {}
+    health: ProgramHealth | None = None
 
 
 class RegistryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -125,7 +130,8 @@ class NoComponent(LoadFailed):
 class Components(Manager):
     """Serves `component`: runs the most reliable component of a type, and the next best when that one fails.
 
-    A holder that finds one silent says so: `system.registrar("components").send_status(query, FATAL)` has it replaced.
+    One that is silent by its `health` has failed. A holder that finds one silent says so:
+    `system.registrar("components").send_status(query, FATAL)` has it replaced.
     The holders of a replaced component hear UPDATE. They hear FATAL only if no other component could replace it. One
     that fails again and again waits longer each time, with a WARNING, and is given up after ten failures in a row.
     """
@@ -208,8 +214,9 @@ class Components(Manager):
         part = next(iter(self.registrar.children(me.resource_id)), None)
         if part is not None and part.state is not State.FATAL:
             programs = registrar_in(self._node, part.registrar, patient=True, owner=self)
-            with contextlib.suppress(UnknownQuery):  # it is gone
+            with contextlib.suppress(UnknownQuery, LoadTimeout):  # it is gone, or its grace is long
                 programs.send_status(part.resource_id, Status(State.FATAL, status.message))
+                part.wait_status(State.FATAL, timeout_s=LOAD_MARGIN_S)  # it has ended, and has no device any more
         return part
 
     def _failed_part(self, status: Status) -> Query | None:
@@ -336,7 +343,9 @@ class Components(Manager):
         def filled(text: str, key: str) -> str:
             return fill(text, parameters, f"{where}: program.{key}")
 
-        ready_file = program.ready.file
+        ready_file, health = program.ready.file, component.health
+        if health is not None and health.socket is not None:
+            health = msgspec.structs.replace(health, socket=fill(health.socket, parameters, f"{where}: health.socket"))
         return msgspec.structs.replace(
             program,
             command=filled(program.command, "command"),
@@ -345,6 +354,7 @@ class Components(Manager):
             directory=str(self._path.parent / filled(program.directory or ".", "directory")),
             ready=msgspec.structs.replace(program.ready, file=ready_file and filled(ready_file, "ready.file")),
             instance=f"{name}:{request.instance}",  # two components never share a program
+            health=health,
         ), parameters
 
 
@@ -382,4 +392,9 @@ def check_components(file: str, components: Sequence[ComponentDescription]) -> N
             faults.append(wrong(file, f"{key}.type", "the name of a type", component.type))
         faults += parameter_faults(file, f"{key}.parameters", component.parameters)
         faults += program_faults(file, f"{key}.program", component.program)
+        if component.program.health is not None:
+            expected = f"none here, but at {key}.health"
+            faults.append(wrong(file, f"{key}.program.health", expected, component.program.health, said="one"))
+        if component.health is not None:
+            faults += template_faults(file, f"{key}.health", [("socket", component.health.socket or "")])
     raise_faults(faults)

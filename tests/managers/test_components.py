@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
-from collections.abc import Callable
+import socket
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,7 +19,7 @@ from rr_actors.managers import Components, LoadComponent, Programs
 from rr_actors.managers.components import read_registry
 from rr_actors.managers.planning.reliability import FALL, LEAST, RISE_S, Reliabilities
 from rr_actors.managers.templates import fill
-from support import Calls, child, eventually, kill, wait_respawned
+from support import Calls, child, eventually, kill, messages, states, wait_respawned
 from support_programs import running_programs
 
 Start = Callable[..., rr.System]
@@ -267,6 +270,79 @@ def test_the_program_managers_crash_is_not_held_against_a_component(begin: Begin
         assert lidar.response.name == "good"
 
 
+# -- a component that is silent ------------------------------------------------------------------------------------
+
+HEALTH = """[component.health]
+socket = "${place}/checked"
+every_s = 0.05
+timeout_s = 30.0
+fail_after = 2
+"""
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Callable[[], None]]:
+    """A socket that accepts the connections of all checks, until this is called, and again after a second call."""
+    path, listeners = str(tmp_path / "checked"), list[socket.socket]()
+
+    def accept(listener: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                listener.accept()[0].close()
+
+    def toggle() -> None:
+        if listeners:
+            with contextlib.suppress(OSError):
+                listeners[0].shutdown(socket.SHUT_RDWR)
+            listeners.pop().close()
+            os.unlink(path)
+            return
+        listeners.append(socket.socket(socket.AF_UNIX))
+        listeners[0].bind(path)
+        listeners[0].listen()
+        threading.Thread(target=accept, args=listeners, daemon=True).start()
+
+    toggle()
+    yield toggle
+    if listeners:
+        toggle()
+
+
+def test_a_component_that_is_silent_is_replaced_lowered_once_and_its_holders_hear_warning_then_update(
+    begin: Begin, tmp_path: Path, served: Callable[[], None]
+) -> None:
+    system, app = begin(entry("good", reliability=0.9) + HEALTH, entry("old", reliability=0.8))
+    heard = Calls()
+    with app.load("components/component", LoadComponent("lidar", {"place": str(tmp_path)}), on_status=heard) as lidar:
+        assert lidar.response.name == "good"
+        served()
+        eventually(lambda: states(heard) == [rr.State.WARNING, rr.State.UPDATE])
+        assert messages(heard)[0].startswith(f"health: socket {tmp_path}/checked: ")
+        assert (lidar.response.name, list(running_programs())) == ("old", [lidar.response.pid])
+        kept = json.loads((system.registrar("components").directory / "reliability.json").read_text())["reliability"]
+        assert kept == {"good": pytest.approx(0.45)}
+
+
+@pytest.mark.parametrize("how", ["silent", "called lost"])
+def test_the_only_component_of_a_type_is_started_anew_when_its_predecessor_has_ended(
+    begin: Begin, tmp_path: Path, served: Callable[[], None], how: str
+) -> None:
+    """It takes a device for itself: a second one cannot start beside it."""
+    device = tmp_path / "device"
+    code = f"import fcntl, time; file = open('{device}', 'w'); fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)"
+    system, app = begin(entry("driver", type="driver", code=f"{code}; print('ready'); time.sleep(600)") + HEALTH)
+    with app.load("components/component", LoadComponent("driver", {"place": str(tmp_path)})) as driver:
+        pid = driver.response.pid
+        if how == "silent":
+            served()
+            eventually(lambda: system.registrar("programs").resources()[0].state == "FATAL")
+            served()
+        else:
+            system.registrar("components").send_status(driver, LOST)
+        eventually(lambda: driver.response.pid != pid)
+        assert list(running_programs()) == [driver.response.pid]
+
+
 # -- the registry's file -------------------------------------------------------------------------------------------
 
 
@@ -285,6 +361,21 @@ def test_the_program_managers_crash_is_not_held_against_a_component(begin: Begin
         (entry("a").replace("5 }", "'5' }"), "component[0].program.ready.timeout_s", "got '5' (str)"),
         (entry("a").replace("topic =", "topic = [], to ="), "component[0].parameters.topic", "got [] (list)"),
         (entry("a") + entry("a"), "component[1].name", "'a' again"),
+        (entry("a") + HEALTH.replace("every", "evry"), "component[0].health.evry_s", "did you mean 'every_s'?"),
+        (entry("a") + HEALTH.replace("0.05", "0"), "component[0].health.every_s", "a number from 0.01 to 86400, got 0"),
+        (entry("a") + HEALTH.replace("2", "'2'"), "component[0].health.fail_after", "got '2' (str)"),
+        (
+            entry("a") + "[component.health]\n",
+            "component[0].health.line_every_s",
+            "expected this, port, socket or probe",
+        ),
+        (entry("a") + HEALTH.replace("${p", "$ {p"), "component[0].health.socket", "follows each dollar sign"),
+        (
+            entry("a") + HEALTH.replace("component.", "component.program."),
+            "component[0].program.health",
+            "none here, but",
+        ),
+        (entry("a") + HEALTH.replace("health", "helth"), "component[0].helth", "did you mean 'health'?"),
     ],
 )
 def test_a_wrong_registry_is_an_error_with_file_and_key(registry: Path, text: str, key: str | None, says: str) -> None:

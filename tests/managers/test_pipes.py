@@ -338,6 +338,17 @@ def pids(pipe: rr.Query[BuiltPipe]) -> list[int]:
     return [one.pid for one in pipe.response.segments]
 
 
+def test_a_segment_that_is_silent_is_replaced_alone(start: Start, file: Path, tmp_path: Path) -> None:
+    silent = '[component.health]\nsocket = "${place}/${output_t}"\nevery_s = 0.05\nfail_after = 2\n'
+    file.write_text(CAMERA + TRACKER + silent + SPARE)
+    system = start(rr.ChildSpec(Programs, id="programs"), rr.ChildSpec(Pipes, id="components", args=(str(file),)))
+    with load(system.open_registrar("app"), parameters={"place": str(tmp_path)}) as pipe:
+        camera = pipe.response.segments[0]
+        pipe.wait_status(rr.State.UPDATE, timeout_s=20)
+        assert (names(pipe), pipe.response.segments[0]) == (["camera", "spare"], camera)
+        eventually(lambda: sorted(running_programs()) == sorted(pids(pipe)))
+
+
 def test_a_pipe_outlives_its_manager_and_that_of_the_programs(real: tuple[rr.System, rr.Registrar]) -> None:
     system, app = real
     with load(app) as pipe:
