@@ -1,4 +1,4 @@
-"""The mission: a robot drives along a corridor while its lidar, its driver and its managers are killed one by one.
+"""The mission: a robot drives along a corridor while a lidar is disconnected, and programs and managers are killed.
 
     python examples/mission.py                  three runs: without faults, with faults, with faults and no recovery
     python examples/mission.py --speed 4        the robot, and its world, four times as fast
@@ -38,7 +38,7 @@ from mission.view import LiveView, PlainView
 import rr_actors as rr
 from rr_actors.managers.process_marks import find_processes
 
-FAULTS_AT = (0.15, 0.33, 0.5, 0.66, 0.82)  # of the way
+FAULTS_AT = (0.13, 0.28, 0.43, 0.57, 0.72, 0.86)  # of the way
 MARK = "RR_MISSION"  # in the environment of every process of the mission, so that those left over can be counted
 
 

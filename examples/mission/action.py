@@ -6,6 +6,7 @@ The graph is in mission.json. Its actions run in a thread of this process, so th
 from __future__ import annotations
 
 import itertools
+import signal
 import sys
 import threading
 import time
@@ -176,11 +177,12 @@ class Mission:
     def _strikes(self, robot: rr.Query, lidar: rr.Query) -> list[Strike]:
         app, system = self.app, self.system
         return [
-            Strike("F1", "lidar 1", lambda: lidar.response.pid, replaced(lidar)),
+            Strike("F1", "lidar 1", lambda: lidar.response.pid, replaced(lidar), "disconnected", signal.SIGUSR1),
             Strike("F2", "motor driver", lambda: robot.response.driver.pid, replaced(robot)),
             Strike("F3", "program manager", child_pid(system, "programs"), answers(app, self.world)),
             Strike("F4", "component manager", child_pid(system, "components"), answers(app, lidar)),
             Strike("F5", "robot manager", child_pid(system, "robots"), answers(app, robot)),
+            Strike("F6", "lidar 2", lambda: lidar.response.pid, replaced(lidar)),
         ]
 
     def _steer_and_watch(self, order: dict[str, object]) -> None:

@@ -59,7 +59,7 @@ def _draw_distance(axes: Axes, records: Sequence[Record]) -> None:
 
 def _mark(axes: Axes, fault: Fault, x: float, y: float, colour: str) -> None:
     recovered = fault.serving_s is not None
-    label = f"{fault.name}: {fault.what} killed" if recovered else None
+    label = f"{fault.name}: {fault.what} {fault.done}" if recovered else None
     axes.plot(x, y, marker="x", color=colour, markersize=9, markeredgewidth=2, linestyle="", label=label)
     offset = (8, -14) if recovered else (-8, 8)
     axes.annotate(fault.name, (x, y), xytext=offset, textcoords="offset points", color=colour, fontsize=9)

@@ -23,15 +23,16 @@ class Sample(NamedTuple):
 
 @dataclass
 class Fault:
-    """One process that was killed, and what came of it."""
+    """What was done to one process, and what came of it: "lidar 1", "disconnected"."""
 
     name: str
     what: str
+    done: str
     time_s: float
     x: float
     y: float
     driven_m: float
-    serving_s: float | None = None  # from SIGKILL until what it did is done again; None: it never was
+    serving_s: float | None = None  # from the fault until what it did is done again; None: it never was
     standing_s: float = 0.0
 
 

@@ -1,4 +1,4 @@
-"""The saboteur: kills one process after the other while the robot drives, and times how long the repair takes."""
+"""The saboteur: harms one process after the other while the robot drives, and times how long the repair takes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,17 @@ REPAIR_LIMIT_S = 20.0
 
 
 class Strike(NamedTuple):
-    """One process to kill: `pid` finds it, `repaired` waits until what it did is done again; False if it never is."""
+    """One process to harm: `pid` finds it, `repaired` waits until what it did is done again; False if it never is.
+
+    `number` is the signal that does to it what `done` says.
+    """
 
     name: str
     what: str
     pid: Callable[[], int]
     repaired: Callable[[], bool]
+    done: str = "killed"
+    number: signal.Signals = signal.SIGKILL
 
 
 class Saboteur:
@@ -42,11 +47,11 @@ class Saboteur:
             return
         _, strike = self._due.pop(0)
         pid = strike.pid()
-        fault = Fault(strike.name, strike.what, at.time_s, at.x, at.y, at.driven_m)
+        fault = Fault(strike.name, strike.what, strike.done, at.time_s, at.x, at.y, at.driven_m)
         self._record.faults.append(fault)
-        self._say(f"{strike.name}: SIGKILL for {strike.what} (pid {pid})")
+        self._say(f"{strike.name}: {strike.what} is {strike.done} ({strike.number.name} for pid {pid})")
         self._repair = threading.Thread(target=self._time_repair, args=(strike, fault, time.monotonic()), daemon=True)
-        os.kill(pid, signal.SIGKILL)
+        os.kill(pid, strike.number)
         self._repair.start()
 
     def finish(self) -> None:
@@ -67,7 +72,13 @@ class Saboteur:
 
 def replaced(query: rr.Query) -> Callable[[], bool]:
     """Wait until the holder of a part hears that it was replaced (UPDATE), or could not be (FATAL)."""
-    return lambda: query.wait_status(timeout_s=REPAIR_LIMIT_S).state is rr.State.UPDATE
+
+    def repaired() -> bool:
+        while (state := query.wait_status(timeout_s=REPAIR_LIMIT_S).state) not in (rr.State.UPDATE, rr.State.FATAL):
+            pass  # a WARNING comes before
+        return state is rr.State.UPDATE
+
+    return repaired
 
 
 def answers(app: rr.Registrar, query: rr.Query) -> Callable[[], bool]:

@@ -42,7 +42,9 @@ def test_the_robot_reaches_its_goal_through_all_faults_and_stops_at_the_first_wi
     assert re.fullmatch(r"[\d.]+ s", row(done.stdout, "time without faults")[2])
     assert re.fullmatch(r"[\d.]+ s", row(done.stdout, "time with faults")[2])
     assert row(done.stdout, "time without recovery")[2].startswith("stopped at F1 after")
-    for fault in ("F1", "F2", "F3", "F4", "F5"):
+    assert "simulated robot; start-up of real devices not included" in done.stdout
+    assert "WARNING: health: no line of its output for" in done.stdout
+    for fault in ("F1 lidar 1 disconnected", "F2", "F3", "F4", "F5", "F6 lidar 2 killed"):
         _, _, standing, serving = row(done.stdout, fault)
         assert re.fullmatch(r"[\d.]+ s", standing)
         assert re.fullmatch(r"\d+ ms", serving)

@@ -169,8 +169,8 @@ def record() -> Record:
         stands = 40 <= i < 60
         record.samples.append(Sample(i * 0.1, i * 0.05, 0.0, i * 0.05, 0.0 if stands else 0.5))
     record.faults = [
-        Fault("F1", "lidar 1", 1.0, 0.5, 0.0, 0.5, 0.12),
-        Fault("F2", "motor driver", 3.5, 1.75, 0.0, 1.75, 0.2),
+        Fault("F1", "lidar 1", "disconnected", 1.0, 0.5, 0.0, 0.5, 0.12),
+        Fault("F2", "motor driver", "killed", 3.5, 1.75, 0.0, 1.75, 0.2),
     ]
     record.resources_left = record.processes_left = 0
     record.finish("arrived")
@@ -186,12 +186,14 @@ def test_standing_time_counts_for_the_fault_before_it(record: Record) -> None:
 def test_the_table_puts_the_thesis_beside_what_was_measured(record: Record) -> None:
     stopped = Record("without recovery", record.samples, record.faults[:1], resources_left=0, processes_left=0)
     stopped.finish("stopped at F1")
-    stopped.faults = [Fault("F1", "lidar 1", 1.0, 0.5, 0.0, 0.5)]
+    stopped.faults = [Fault("F1", "lidar 1", "disconnected", 1.0, 0.5, 0.0, 0.5)]
     out = Console(file=io.StringIO(), width=110)
     out.print(table.make_table([record, stopped], 1.0))
     text = out.file.getvalue()  # type: ignore[attr-defined]
     for expected in ("43 s", "9.9 s", "stopped at F1 after 9.9 s", "2.00 s", "200 ms", "5 s", "processes left"):
         assert expected in text
+    assert "F1 lidar 1 disconnected: standing" in text
+    assert "simulated robot; start-up of real devices not included" in text
 
 
 def test_the_figures_are_written(record: Record, tmp_path: Path) -> None:
