@@ -26,7 +26,7 @@ import pykka
 import pytest
 
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.base.errors import InvalidRequest, NotSerializable
+from rr_actors.base.errors import InvalidRequest, InvalidSpec, NotSerializable
 from rr_actors.base.pickling import LARGE_BYTES, Large, dumps, dumps_large, loads
 from rr_actors.base.values.canonical import Codec, encode
 
@@ -578,6 +578,14 @@ def test_an_exception_with_a_part_that_cannot_travel_arrives_with_its_text_and_i
     made = loads(dumps(ValueError("kept", threading.Lock())))
     assert type(made) is ValueError
     assert made.args[0] == "kept"
+
+
+def test_an_error_of_this_package_with_a_detail_that_cannot_travel_arrives_with_the_others() -> None:
+    made: Any = InvalidSpec("wrong", field="load", expected="a callable", got=threading.Lock())
+    for _ in range(2):
+        made = loads(dumps(made))
+        assert (type(made), made.field, made.details["expected"]) == (InvalidSpec, "load", "a callable")
+        assert "lock" in made.details["got"]
 
 
 def test_an_exception_whose_class_is_unknown_there_is_caught_as_its_base(tmp_path: Path) -> None:

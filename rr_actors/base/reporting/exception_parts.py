@@ -68,6 +68,13 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
             return b""
         return blob if len(blob) <= PART_LIMIT_BYTES else b""
 
+    def attribute(value: object) -> bytes:
+        """Pickle it; a dict, such as the `details` of an RrError, with text in the place of what cannot be pickled."""
+        if (blob := part(value)) or type(value) is not dict:
+            return blob
+        named = cast("dict[object, object]", value)
+        return part({name: inner if part(inner) else shown(inner) for name, inner in named.items()})
+
     made = type(error)
     origin: type[BaseException] = vars(made).get(_ORIGIN, made)
     own = b""
@@ -78,7 +85,7 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
     classes = [part(cls) for cls in above]
     pythons_own: Any = above[-1]
     _, args, *state = pythons_own.__reduce__(error)  # an OSError's, for example, has more than its `args`
-    attributes = {name: part(value) for name, value in (state[0] if state else vars(error)).items()}
+    attributes = {name: attribute(value) for name, value in (state[0] if state else vars(error)).items()}
     return Parts(
         name=made.__qualname__,
         classes=tuple(blob for blob in classes if blob),
