@@ -22,7 +22,7 @@ from pykka._envelope import Envelope as PykkaEnvelope
 from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
 from rr_actors.actors.messaging import dead_letters, death_watch, exit_reports
 from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity, here
-from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, abnormal
+from rr_actors.actors.messaging.exit_reports import IGNORE, Down, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.actors.messaging.mailbox import (
     DownNotice,
@@ -34,6 +34,7 @@ from rr_actors.actors.messaging.mailbox import (
     is_stop,
     refuse_all,
 )
+from rr_actors.actors.messaging.message_notes import Stamp, notes
 from rr_actors.actors.monitors import Monitor, begin, take
 from rr_actors.actors.refs import ActorRef
 from rr_actors.actors.remote.hub import running, urn_of_path
@@ -195,8 +196,13 @@ class BaseActor(pykka.Actor):
         Args:
             ref: a reference or proxy, or a SupervisorRef, to an actor in any process of the system.
         """
-        mailbox = self._mailbox  # not self: a monitor does not keep its actor
-        made = Monitor(ref, lambda monitor, down: mailbox.put(DownNotice(down, monitor)), self._monitors.discard)
+        mailbox, name = self._mailbox, self._target.name  # not self: a monitor does not keep its actor
+
+        def deliver(monitor: Monitor, down: Down) -> None:
+            stamp = notes.down(name, str(down.ref), down.reason) if notes.watched.level[0] > 1 else None
+            mailbox.put(DownNotice(down, monitor, stamp))
+
+        made = Monitor(ref, deliver, self._monitors.discard)
         self._monitors.add(made)  # first: its Down removes it
         begin(made)
         return made
@@ -333,6 +339,10 @@ class BaseActor(pykka.Actor):
                 return
         doing = Activity(self._target, getattr(envelope, "chain", ()))
         activity.set(doing)
+        stamp: Stamp | None = getattr(envelope, "stamp", None)
+        if stamp is not None:
+            doing.message = stamp.id
+            notes.received(stamp, self._target.name)
         failure: BaseException | None = None
         try:
             if type(message) is Packed:
@@ -350,6 +360,8 @@ class BaseActor(pykka.Actor):
             if is_coroutine(result):
                 result = await Await(result)
             if reply is not None:
+                if stamp is not None:
+                    notes.answered(stamp, self._target.name, result)
                 reply.set(as_answer(self, self.actor_ref, message, result))
         except BaseException as error:
             failure = error
@@ -357,6 +369,8 @@ class BaseActor(pykka.Actor):
             doing.active = False
         if failure is None:
             return
+        if stamp is not None and reply is not None:
+            notes.raised(stamp, self._target.name, failure)
         if not isinstance(failure, Exception):
             await self._leave(failure, reply)
         elif reply is None:

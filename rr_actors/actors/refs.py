@@ -14,6 +14,7 @@ from rr_actors.actors.messaging import ask_cycles, dead_letters
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import ExcInfo, Reply, StopReply, error_of
 from rr_actors.actors.messaging.mailbox import Ended, Envelope, StopActor, has_ended, is_stop, put
+from rr_actors.actors.messaging.message_notes import ASK, STOP, TELL, Stamp, notes
 from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.remote.peer import Line, Whereabouts
 from rr_actors.actors.remote.proxy import Attributes, DistantInbox, DistantProxy, Mirror, attributes_of, local_proxy
@@ -77,18 +78,22 @@ class ActorRef(pykka.ActorRef[A]):
         """
         reply = self._new_reply()
         if not block:
-            reply.withdraw = self._send(message, reply, ()) or _nothing
+            stamp = notes.sent(ASK, self._target.name, message) if notes.watched.level[0] > 1 else None
+            reply.withdraw = self._send(message, reply, (), stamp) or _nothing
             return reply
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
         event_loop.check_may_block(f"asking {self._target.name}")
         ask_cycles.check_ring(self._target)
-        return self._ask(message, reply, limit_s, limit_s)
+        stamp = notes.sent(ASK, self._target.name, message) if notes.watched.level[0] > 1 else None
+        return self._ask(message, reply, stamp, limit_s, limit_s)
 
-    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None, left_s: float | None) -> Any:
+    def _ask(
+        self, message: Any, reply: Reply[Any], stamp: Stamp | None, limit_s: float | None, left_s: float | None
+    ) -> Any:
         """Send the message and wait for `left_s` seconds, what is left of `limit_s`."""
-        give_up = self._send(message, reply, ask_cycles.chain())
+        give_up = self._send(message, reply, ask_cycles.chain(), stamp)
         try:
-            return reply.get(timeout=left_s)
+            return self._heard(reply.get(timeout=left_s), stamp)
         except pykka.Timeout:
             if give_up is not None:
                 give_up()
@@ -96,14 +101,21 @@ class ActorRef(pykka.ActorRef[A]):
                 raise reply.overdue(limit_s) from None
             raise
 
+    def _heard(self, value: Any, stamp: Stamp | None) -> Any:
+        """Return the value of a reply, which is noted if the message was."""
+        if stamp is not None:
+            notes.heard(stamp, self._target.name, value)
+        return value
+
     def tell(self, message: Any) -> None:
         """Send a message, and return at once. It becomes a dead letter if an actor in another process does not take it.
 
         Raises:
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
         """
+        stamp = notes.sent(TELL, self._target.name, message) if notes.watched.level[0] > 1 else None
         try:
-            put(self, Envelope(message), self._target.name)
+            put(self, Envelope(message, stamp=stamp), self._target.name)
         except ActorDeadError as error:
             _note_dead(self, message, error)
             raise
@@ -147,7 +159,8 @@ class ActorRef(pykka.ActorRef[A]):
             event_loop.check_may_block(f"stopping {self._target.name}")
             ask_cycles.check_ring(self._target)
             ask_cycles.check_end(self._target.urn, f"stop() of {self._target.name}")
-        self._stop(reply, reason, final=final)
+        stamp = notes.sent(STOP, self._target.name, reason) if notes.watched.level[0] > 1 else None
+        self._stop(reply, reason, stamp, final=final)
         return reply.get(timeout=timeout) if block else reply
 
     def is_alive(self) -> bool:
@@ -198,16 +211,18 @@ class ActorRef(pykka.ActorRef[A]):
     def _new_reply(self) -> Reply[Any]:
         return Reply(self._target)
 
-    def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
+    def _send(
+        self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain, stamp: Stamp | None
+    ) -> Callable[[], None] | None:
         """Send a message, or set the error on `reply`. Return what to call when nobody waits for the reply any more."""
         try:
-            put(self, Envelope(message, reply, chain), self._target.name)
+            put(self, Envelope(message, reply, chain, stamp), self._target.name)
         except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
             reply.set_exception()
             _note_dead(self, message, error)
 
-    def _stop(self, reply: StopReply, reason: StopReason, *, final: bool) -> None:
-        self._send(StopActor(reason, final=final), reply, ())
+    def _stop(self, reply: StopReply, reason: StopReason, stamp: Stamp | None, *, final: bool) -> None:
+        self._send(StopActor(reason, final=final), reply, (), stamp)
 
     def __str__(self) -> str:
         return self._target.name
@@ -307,11 +322,12 @@ class DistantRef(ActorRef[A]):
 
     def tell(self, message: Any) -> None:
         local = self._local()
+        stamp = notes.sent(TELL, self._target.name, message) if notes.watched.level[0] > 1 else None
         try:
             if local is None:
-                self._hub().tell(self._where, message)
+                self._hub().tell(self._where, message, stamp)
                 return
-            put(local, Envelope(message), self._target.name)
+            put(local, Envelope(message, stamp=stamp), self._target.name)
         except (ActorDeadError, ActorUnavailable) as error:
             said = _as_directory_says(self._where, error) if isinstance(error, Ended) else error
             _note_dead(self, message, said)
@@ -363,27 +379,31 @@ class DistantRef(ActorRef[A]):
     def _new_reply(self) -> Reply[Any]:
         return DistantReply(self._where)
 
-    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None, left_s: float | None) -> Any:
+    def _ask(
+        self, message: Any, reply: Reply[Any], stamp: Stamp | None, limit_s: float | None, left_s: float | None
+    ) -> Any:
         process = hub(self.path)
         if process is None or process.local(self._target.urn) is not None:
-            return super()._ask(message, reply, limit_s, left_s)
+            return super()._ask(message, reply, stamp, limit_s, left_s)
         deadline = deadline_of(left_s)
         waiting = ask_cycles.begin_wait(reply)
         try:
-            if self._ask_now(process, message, reply, limit_s):
-                return reply.get()
+            if self._ask_now(process, message, reply, stamp, limit_s):
+                return self._heard(reply.get(), stamp)
         finally:
             ask_cycles.end_wait(waiting, reply)
-        return super()._ask(message, reply, limit_s, left_until(deadline))
+        return super()._ask(message, reply, stamp, limit_s, left_until(deadline))
 
-    def _ask_now(self, process: ActorHub, message: Any, reply: Reply[Any], limit_s: float | None) -> bool:
+    def _ask_now(
+        self, process: ActorHub, message: Any, reply: Reply[Any], stamp: Stamp | None, limit_s: float | None
+    ) -> bool:
         try:
             line = self._line
             if line is None or not process.has(line):
                 line = self._line = process.line_to(self._where)
             if line is None or not line.may_ask:
                 return False
-            return process.ask_now(line, self._where, message, reply, ask_cycles.chain(), limit_s)
+            return process.ask_now(line, self._where, message, reply, ask_cycles.chain(), stamp, limit_s)
         except TimeoutError:
             raise reply.overdue(limit_s) from None
         except (ActorDeadError, Unavailable) as error:
@@ -391,23 +411,25 @@ class DistantRef(ActorRef[A]):
             _note_dead(self, message, error)
             return True
 
-    def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
+    def _send(
+        self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain, stamp: Stamp | None
+    ) -> Callable[[], None] | None:
         try:
             local = self._local()
             if local is None:
-                return self._hub().ask(self._where, message, reply, chain)
-            put(local, Envelope(message, reply, chain), self._target.name)
+                return self._hub().ask(self._where, message, reply, chain, stamp)
+            put(local, Envelope(message, reply, chain, stamp), self._target.name)
         except (ActorDeadError, Unavailable) as error:
             reply.set_exception()
             _note_dead(self, message, error)
         return None
 
-    def _stop(self, reply: StopReply, reason: StopReason, *, final: bool) -> None:
+    def _stop(self, reply: StopReply, reason: StopReason, stamp: Stamp | None, *, final: bool) -> None:
         if self._local() is not None:
-            super()._stop(reply, reason, final=final)
+            super()._stop(reply, reason, stamp, final=final)
             return
         try:
-            self._hub().halt(self._where, reply, reason, final=final)
+            self._hub().halt(self._where, reply, reason, stamp, final=final)
         except (ActorDeadError, Unavailable):
             reply.set_exception()
 

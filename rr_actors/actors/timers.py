@@ -10,6 +10,7 @@ from typing import Any
 import pykka
 from pykka import ActorDeadError
 
+from rr_actors.actors.messaging.message_notes import notes
 from rr_actors.actors.refs import ref_in
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
 from rr_actors.base.reporting.log import Log
@@ -25,6 +26,7 @@ class Timer:
     def __init__(self, delay_s: float, ref: pykka.ActorRef[Any], message: Any) -> None:
         self._ref = ref
         self._message = message
+        self._owner = notes.sender()
         self._due = time.monotonic() + delay_s
         self._lock = threading.Lock()
         self._over = False
@@ -69,7 +71,8 @@ class Timer:
 
     def _send(self) -> None:
         try:
-            self._ref.tell(self._message)
+            with notes.as_timer(self._owner):
+                self._ref.tell(self._message)
         except (ActorDeadError, RrError) as error:
             logger.warning("the message of a timer was not sent to %s: %s", self._ref, error)
         finally:

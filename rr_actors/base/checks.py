@@ -201,6 +201,10 @@ class SupervisorCall(Struct, frozen=True):
     """A message that only a supervisor understands. Handlers of other actors never get it."""
 
 
+class SupervisorLook(SupervisorCall, frozen=True):
+    """The base of calls that change nothing. A recording does not have them: consoles send many."""
+
+
 class NoSupervisor(NotFound):
     """The call went to an actor that is no supervisor."""
 

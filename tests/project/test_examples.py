@@ -29,6 +29,14 @@ EXPECTED = {
         "robot manager takes another lidar",
         "app hears nothing of that: True",
     ],
+    "ping_pong": [
+        "ping, pong, pong",
+        "participant p1 as root/ping",
+        "Ask 'ping'",
+        "Answer 'ping, pong'",
+        "Ask 'ping, pong'",
+        "Answer 'ping, pong, pong'",
+    ],
     "replacing": [
         "killed, with both lidars held",
         "the app hears UPDATE: /scan/spare",

@@ -295,7 +295,7 @@ def test_an_id_that_is_unknown_or_begins_several_is_refused_by_name() -> None:
 
     with pytest.raises(UsageError, match="several ids begin so: abcd1, abcd2"):
         trace_of(entries, "abcd")
-    with pytest.raises(NotFound, match="'ffff': the recording has no query or resource"):
+    with pytest.raises(NotFound, match="'ffff': the recording has no query, resource or message"):
         trace_of(entries, "ffff")
 
 

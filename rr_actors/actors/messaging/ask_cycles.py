@@ -33,12 +33,14 @@ class Activity(msgspec.Struct, eq=False):
     """One run of a handler. It is not `active` once the handler has returned: a task left behind blocks no actor.
 
     `starts_in`: of a run of on_start the task that runs it, or the number of its thread; else None.
+    `message`: the id of the message that is handled, if it is recorded; else "".
     """
 
     target: Target
     chain: Chain
     active: bool = True
     starts_in: object = None
+    message: str = ""
 
 
 class Awaited(Protocol):

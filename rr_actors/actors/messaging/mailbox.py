@@ -15,18 +15,25 @@ from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPriv
 from rr_actors.actors.messaging import dead_letters
 from rr_actors.actors.messaging.ask_cycles import Chain
 from rr_actors.actors.messaging.exit_reports import Down
+from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.base.errors import MailboxFull, Unavailable
 
 
 class Envelope(PykkaEnvelope[Any]):
-    """A message, the future for its reply, and the actors that are blocked until it is answered."""
+    """A message, the future for its reply, the actors that are blocked until it is answered, and its stamp.
 
-    __slots__ = ["chain"]
+    It has a stamp while its system is recorded.
+    """
 
-    def __init__(self, message: Any, reply_to: Future[Any] | None = None, chain: Chain = ()) -> None:
+    __slots__ = ["chain", "stamp"]
+
+    def __init__(
+        self, message: Any, reply_to: Future[Any] | None = None, chain: Chain = (), stamp: Stamp | None = None
+    ) -> None:
         self.message = message
         self.reply_to = reply_to
         self.chain = chain
+        self.stamp = stamp
 
 
 class DownNotice(Envelope):
@@ -37,8 +44,8 @@ class DownNotice(Envelope):
 
     __slots__ = ["claim"]
 
-    def __init__(self, down: Down, claim: object) -> None:
-        super().__init__(down)
+    def __init__(self, down: Down, claim: object, stamp: Stamp | None = None) -> None:
+        super().__init__(down, stamp=stamp)
         self.claim = claim
 
 

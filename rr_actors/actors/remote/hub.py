@@ -17,6 +17,7 @@ from rr_actors.actors.messaging.ask_cycles import Chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import Reply, StopReply
 from rr_actors.actors.messaging.mailbox import Mailbox, refuse_all
+from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.actors.remote.inbound import Asker, Visitor
 from rr_actors.actors.remote.peer import Cut, Line, PendingCall, Whereabouts
 from rr_actors.actors.remote.protocol import ASKS, KIND, PATH_URN, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
@@ -134,11 +135,13 @@ class ActorHub:
 
     # -- the actors of others ------------------------------------------------------------------------------------------
 
-    def ask(self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain) -> Callable[[], None]:
+    def ask(
+        self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain, stamp: Stamp | None
+    ) -> Callable[[], None]:
         """Send the message; `reply` is set later. Return what to call when nobody waits for the reply any more."""
         body = pickling.dumps_large(message, f"message to {where.target.name}")
         return self._call(
-            where, reply, lambda number, line: Ask(number, where.target.urn, line.parcels.pack(body), chain)
+            where, reply, lambda number, line: Ask(number, where.target.urn, line.parcels.pack(body), chain, stamp)
         )
 
     def line_to(self, where: Whereabouts) -> Line | None:
@@ -155,7 +158,14 @@ class ActorHub:
         return self._lines.get(line.address) is line
 
     def ask_now(
-        self, line: Line, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain, timeout_s: float | None
+        self,
+        line: Line,
+        where: Whereabouts,
+        message: Any,
+        reply: Reply[Any],
+        chain: Chain,
+        stamp: Stamp | None,
+        timeout_s: float | None,
     ) -> bool:
         """Send the message by a connection of the calling thread alone, and wait until `reply` is set.
 
@@ -170,9 +180,9 @@ class ActorHub:
         call = PendingCall(line.next_number(), reply, where)
         try:
             if isinstance(body, bytes):
-                answer = line.ask(Ask(call.number, where.target.urn, body, chain), timeout_s)
+                answer = line.ask(Ask(call.number, where.target.urn, body, chain, stamp), timeout_s)
             else:
-                answer = line.ask(Ask(call.number, where.target.urn, b"", chain), timeout_s, body)
+                answer = line.ask(Ask(call.number, where.target.urn, b"", chain, stamp), timeout_s, body)
         except TimeoutError:
             raise
         except OSError as error:
@@ -185,11 +195,11 @@ class ActorHub:
         line.answer(call, answer)
         return True
 
-    def tell(self, where: Whereabouts, message: Any) -> None:
+    def tell(self, where: Whereabouts, message: Any, stamp: Stamp | None) -> None:
         """Send the message. If the actor ends before it arrives, the message is lost, and logged."""
         body = pickling.dumps_large(message, f"message to {where.target.name}")
         line = self._line(self._locate(where))
-        line.put(Tell(where.target.urn, line.parcels.pack(body)))
+        line.put(Tell(where.target.urn, line.parcels.pack(body), stamp))
 
     def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
         """Ask the actor's process about the actor: "alive", "class" or "attributes"."""
@@ -197,7 +207,9 @@ class ActorHub:
         self._call(where, reply, lambda number, _: Inquire(number, where.target.urn, what))
         return reply
 
-    def halt(self, where: Whereabouts, reply: StopReply, reason: str, *, final: bool) -> Callable[[], None]:
+    def halt(
+        self, where: Whereabouts, reply: StopReply, reason: str, stamp: Stamp | None, *, final: bool
+    ) -> Callable[[], None]:
         """Send the actor a stop; `reply` is set when the actor has ended."""
         address = self._locate(where)
 
@@ -206,7 +218,7 @@ class ActorHub:
                 where.ended_at = address
 
         reply.ended = ended
-        return self._call(where, reply, lambda number, _: Halt(number, where.target.urn, reason, final))
+        return self._call(where, reply, lambda number, _: Halt(number, where.target.urn, reason, final, stamp))
 
     def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
         """Call fire(reason, detail), as for a Down, once, when the actor has ended. Return what ends the watch.

@@ -13,6 +13,7 @@ from rr_actors.actors.messaging.ask_cycles import Chain, Target, check_chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import ExcInfo, error_of
 from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, StopActor, has_ended, put
+from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.actors.remote.protocol import (
     PATH_URN,
     Answered,
@@ -67,18 +68,18 @@ class Visitor:
     def received(self, link: Link, message: Letter) -> None:
         """Take a letter for an actor, or about it."""
         match message:
-            case Ask(call, to, body, chain):
-                self._deliver(to, body, call, chain)
-            case Tell(to, body):
-                self._deliver(to, body, None, ())
+            case Ask(call, to, body, chain, stamp):
+                self._deliver(to, body, call, chain, stamp)
+            case Tell(to, body, stamp):
+                self._deliver(to, body, None, (), stamp)
             case Inquire(call, to, what):
                 self._in_turn(to, call, message, self._inquire, call, to, what)
-            case Halt(call, to, reason, final):
+            case Halt(call, to, reason, final, stamp):
                 # Like a message, after the earlier ones. A supervisor's stop overtakes them, as in the mailbox.
                 if reason == "shutdown" or _opens_packed(self._find(to)):
-                    self._halt(call, to, reason, final)
+                    self._halt(call, to, reason, final, stamp)
                 else:
-                    self._in_turn(to, call, message, self._halt, call, to, reason, final)
+                    self._in_turn(to, call, message, self._halt, call, to, reason, final, stamp)
             case Watch(call, to):
                 self._watch(call, to)
             case Unwatch(call):
@@ -146,31 +147,35 @@ class Visitor:
         self._dirty = False
         self._link.flush()
 
-    def _deliver(self, to: str, body: bytes | Parcel, call: int | None, chain: Chain) -> None:
+    def _deliver(self, to: str, body: bytes | Parcel, call: int | None, chain: Chain, stamp: Stamp | None) -> None:
         ref = self._find(to)
         opens = (lambda: pickling.loads(body)) if isinstance(body, bytes) else self._parcels.claim(body)
         packed = Packed(opens, len(body))
         if ref is None:
             self._undeliverable(to, call, packed)
         elif _opens_packed(ref):
-            self._put(ref, to, packed, call, chain)
+            self._put(ref, to, packed, call, chain, stamp)
         else:  # this actor would unpickle it on the loop, or does not know Packed
-            self._in_turn(to, call, packed, self._open_and_put, ref, to, packed, call, chain)
+            self._in_turn(to, call, packed, self._open_and_put, ref, to, packed, call, chain, stamp)
 
-    def _open_and_put(self, ref: pykka.ActorRef[Any], to: str, packed: Packed, call: int | None, chain: Chain) -> None:
+    def _open_and_put(
+        self, ref: pykka.ActorRef[Any], to: str, packed: Packed, call: int | None, chain: Chain, stamp: Stamp | None
+    ) -> None:
         try:
             message = packed.open()
         except Exception as error:
             self._not_taken(to, call, packed, error)
         else:
-            self._put(ref, to, message, call, chain)
+            self._put(ref, to, message, call, chain, stamp)
 
-    def _put(self, ref: pykka.ActorRef[Any], to: str, message: Any, call: int | None, chain: Chain) -> None:
+    def _put(
+        self, ref: pykka.ActorRef[Any], to: str, message: Any, call: int | None, chain: Chain, stamp: Stamp | None
+    ) -> None:
         try:
             if call is not None:
                 check_chain(Target(to, str(ref)), chain)
             answer = None if call is None else RemoteAnswer(self, call, str(ref))
-            put(ref, Envelope(message, answer, chain), str(ref))
+            put(ref, Envelope(message, answer, chain, stamp), str(ref))
         except ActorDeadError:
             self._undeliverable(to, call, message)
         except Exception as error:
@@ -215,13 +220,14 @@ class Visitor:
             self._watches[call] = unwatch
             self.post(Watching(call))
 
-    def _halt(self, call: int, to: str, reason: str, final: bool) -> None:
+    def _halt(self, call: int, to: str, reason: str, final: bool, stamp: Stamp | None) -> None:
         ref = self._find(to)
         if ref is None or not ref.is_alive():
             self.post(Dead(call))
             return
         try:
-            ref.actor_inbox.put(Envelope(StopActor(reason, final=final), RemoteAnswer(self, call, str(ref))))
+            answer = RemoteAnswer(self, call, str(ref))
+            ref.actor_inbox.put(Envelope(StopActor(reason, final=final), answer, stamp=stamp))
         except Exception as error:
             self.raised(call, error, str(ref))
 

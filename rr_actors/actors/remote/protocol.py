@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.actors.messaging.ask_cycles import Chain
+from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.wire.segments import Parcel
 
 KIND = "actors"
@@ -31,6 +32,7 @@ class Ask(msgspec.Struct, frozen=True, array_like=True, tag=1):
     to: str
     body: bytes | Parcel
     chain: Chain
+    stamp: Stamp | None = None
 
 
 class Tell(msgspec.Struct, frozen=True, array_like=True, tag=2):
@@ -38,6 +40,7 @@ class Tell(msgspec.Struct, frozen=True, array_like=True, tag=2):
 
     to: str
     body: bytes | Parcel
+    stamp: Stamp | None = None
 
 
 class Inquire(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -55,6 +58,7 @@ class Halt(msgspec.Struct, frozen=True, array_like=True, tag=4):
     to: str
     reason: str
     final: bool
+    stamp: Stamp | None = None
 
 
 class Answered(msgspec.Struct, frozen=True, array_like=True, tag=5):

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from rr_actors.actors.messaging.message_notes import notes
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import (
     CatalogError,
@@ -36,6 +37,7 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.commands import ForceUnload, GiveUp
 from rr_actors.registrar.model.messages import Fetch, Gone, Message, retired
 from rr_actors.registrar.model.store import Store
+from rr_actors.registrar.servers.callback_context import current_or_none, serving
 from rr_actors.runtime.garbage import left_alone
 from rr_actors.wire.name_service import NameEntry, Presence, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Link, Welcome
@@ -80,7 +82,8 @@ class Node(ProcessNode):
     ) -> None:
         super().__init__(info, path, MESSAGES, on_event=on_event)
         self.registrars: dict[str, RegistrarActor] = {}
-        self.recorder = Recorder(path, self.dispatcher, self.emit)
+        self.recorder = Recorder(path, self.dispatcher, self.emit, self._sender)
+        notes.begin(self.watched, self.recorder)
         self._open_catalog = open_catalog
         self._remove_catalogs = remove_unneeded
         self._opening: set[str] = set()  # names of registrars whose catalogs are being read
@@ -89,8 +92,13 @@ class Node(ProcessNode):
         self._closing = False
         self._handles: dict[str, HandleLine] = {}
 
+    def _sender(self) -> tuple[str, str]:
+        running = current_or_none()
+        return (self.path, "") if running is None else (serving(running).path, running.resource_id)
+
     async def _close(self, steps: Steps) -> None:
         steps.take("sending what is recorded", self.recorder.close)
+        steps.take("ending the notes of messages", notes.end, self.recorder)
         for name in list(self.registrars):
             steps.take(f"closing registrar {name!r}", self.close_registrar, name, Presence.STOPPED)
         for line in list(self._handles.values()):

@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.base.errors import Unavailable
 from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.recorded import Entry, message_entry
@@ -36,9 +37,14 @@ class Recorder:
     Args:
         path: the process's, "root/cameras".
         emit: sends an event to the application's process; called on the loop.
+        sender: returns the name of the manager whose callback runs the calling code, and the callback's resource; the
+            path of the process and "" if none does.
     """
 
-    def __init__(self, path: str, dispatcher: Dispatcher, emit: Callable[..., None]) -> None:
+    def __init__(
+        self, path: str, dispatcher: Dispatcher, emit: Callable[..., None], sender: Callable[[], tuple[str, str]]
+    ) -> None:
+        self.sender = sender
         self._path = path
         self._dispatcher = dispatcher
         self._emit = emit
@@ -62,6 +68,11 @@ class Recorder:
         registrar = server.partition("/")[0]
         where = (self._path, self._pid, registrar)
         self._add(Entry(time.time(), event, 0, *where, "", role, "", resource, "", server, detail))
+
+    def actor_message(self, event: str, actor: str, peer: str, stamp: Stamp, cause: str, text: str) -> None:
+        """Record that an actor of this process has "sent" a message to `peer`, or "received" one from it."""
+        where = (self._path, self._pid, actor, peer)
+        self._add(Entry(time.time(), event, 0, *where, stamp.kind, stamp.id, "", cause, "", text))
 
     def _add(self, entry: Entry) -> None:
         with self._lock:

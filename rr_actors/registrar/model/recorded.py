@@ -25,15 +25,21 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     Attributes:
         seq: its number in the recording; 0 until it has one. Entries are numbered as they arrive.
         at: when it happened, in seconds since the epoch; not always in the order of `seq`.
-        event: "sent" or "received" for a message between registrars; "began" or "ended" for a callback. Otherwise an
-            event of the tree or of a resource, named as in System.subscribe().
+        event: "sent" or "received" for a message; "began" or "ended" for a callback. Otherwise an event of the tree or
+            of a resource, named as in System.subscribe(). A message between actors is "received" when its handler
+            begins.
         process: the path of the process where it happened, "root/cameras"; `pid`: its process id.
-        registrar: the registrar where it happened.
-        peer: of a message, the registrar at its other end.
-        name: of a message, its class, "Load"; of a callback, its role: "load", "unload", "recover" or "status".
-        query, resource: the ids that it is about; `parent`: the sender's resource for which a load is made.
+        registrar: the registrar or actor where it happened. Code of no actor has the name of its process.
+        peer: of a message, the registrar or actor at its other end.
+        name: of a message between registrars, its class, "Load"; between actors, "Ask", "Tell", "Timer", "Down" or
+            "Stop", and of an answer "Answer" or "Raised"; of a callback, its role: "load", "unload", "recover" or
+            "status".
+        query, resource: the ids that it is about. A message between actors has an id of its own as its `query`, and
+            so has its answer.
+        parent: what it is for: of a load, the sender's resource; of a message between actors, the message that its
+            sender was handling, or the resource whose callback the sender ran.
         server: "registrar/server", if it is known.
-        detail: a request, an error or a status, for people.
+        detail: a request, a message, an error or a status, for people.
         facts: all the facts of an event of the tree.
     """
 

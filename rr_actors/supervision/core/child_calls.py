@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 from msgspec.structs import replace
 
-from rr_actors.base.checks import SupervisorCall, invalid
+from rr_actors.base.checks import SupervisorCall, SupervisorLook, invalid
 from rr_actors.base.errors import (
     AlreadyPresent,
     AlreadyStarted,
@@ -49,7 +49,7 @@ class Change(SupervisorCall, frozen=True):
     subject: Any
 
 
-class Question(SupervisorCall, frozen=True):
+class Question(SupervisorLook, frozen=True):
     """A call that is answered at once."""
 
     name: Literal["which_children", "which_child", "count_children", "get_childspec", "history", "describe"]

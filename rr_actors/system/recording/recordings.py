@@ -24,7 +24,7 @@ from rr_actors.registrar.links.recorder import RECORDED, entries_of
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.system.recording.figures import Counters
-from rr_actors.system.recording.traces import Trace, trace_of
+from rr_actors.system.recording.traces import DEAD_LETTER, Trace, messages_of, trace_of
 
 logger = Log("rr_actors")
 
@@ -131,15 +131,16 @@ def entry_of(event: dict[str, Any]) -> Entry:
     """Return the entry of an event of the tree or of a resource."""
     facts = {key: value for key, value in event.items() if key not in ("event", "at")}
     at = event.get("at")
+    is_letter = event["event"] == DEAD_LETTER
     return Entry(
         at if isinstance(at, float) else time.time(),
         event["event"],
         process=str(event.get("path", "")),
         pid=event.get("pid") or 0,
-        registrar=event.get("registrar", ""),
+        registrar=event["to"] if is_letter else event.get("registrar", ""),
         resource=event.get("resource_id", ""),
         server=event.get("server", ""),
-        detail=readable(event.get("detail", "")),
+        detail=readable(f"{event['message']}: {event['why']}" if is_letter else event.get("detail", "")),
         facts=facts,
     )
 
@@ -222,14 +223,27 @@ class Recording:
     def trace(self, what: Query[Any] | ResourceInfo | str) -> Trace:
         """Return the trace of one load: its messages and answers, its callbacks, and the loads that these made.
 
+        Of a message between actors it is the message, its answer, and the messages that its handler sent.
+
         Args:
-            what: a query, a resource, or the id of either; the first four characters of an id are enough.
+            what: a query, a resource, or the id of either or of a message; its first four characters are enough.
 
         Raises:
             NotFound: the recording has no entry of it.
             UsageError: several ids begin with these characters.
         """
         return trace_of(self.entries(), what if isinstance(what, str) else what.id, of_query=isinstance(what, Query))
+
+    def messages(self, *actors: str) -> Trace:
+        """Return the messages, callbacks and ends of these actors and registrars; of all, if none is named.
+
+        Args:
+            actors: names, as entries have them: "root/ping", or its last part if that is enough.
+
+        Raises:
+            NotFound: the recording has no message of an actor of this name. `.id`, `.known`
+        """
+        return messages_of(self.entries(), actors)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the entries to a new file, which read_recording() reads. If that fails, there is no such file.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Sequence
 
+from rr_actors.actors.messaging.message_notes import REPLIES
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.timings import ANSWERS
 
@@ -50,7 +51,7 @@ def sequence_of(entries: Sequence[Entry]) -> str:
 
 
 def _participants(entries: Sequence[Entry]) -> dict[str, str]:
-    """Return the registrars of the entries, each with its name in the diagram, in the order of their appearance."""
+    """Return the registrars and actors of the entries, each with its alias, in the order of their appearance."""
     names: dict[str, str] = {}
     for entry in entries:
         ends = (entry.registrar, entry.peer) if entry.event == "sent" else (entry.peer, entry.registrar)
@@ -80,7 +81,8 @@ def _arrivals(entries: Sequence[Entry]) -> tuple[set[int], set[int]]:
         if entry.event == "received" and (waiting := sent.get(_key(entry.peer, entry.registrar, entry))):
             waiting.popleft()
             paired.add(number)
-    return paired, {number for waiting in sent.values() for number in waiting} - _answered(entries)
+    lost = {number for waiting in sent.values() for number in waiting} - _answered(entries)
+    return paired, {number for number in lost if entries[number].name not in REPLIES}  # a future's answer is noted once
 
 
 def _key(source: str, target: str, entry: Entry) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Timings: how long each load, unload and callback of a trace took, as a tree over all processes."""
+"""Timings: how long each load, unload, ask and callback of a trace took, as a tree over all processes."""
 
 from __future__ import annotations
 
@@ -7,21 +7,25 @@ from collections.abc import Sequence
 
 import msgspec
 
+from rr_actors.actors.messaging.message_notes import ANSWER, ASK, RAISED, REPLIES
 from rr_actors.registrar.model.recorded import Entry
 
-ANSWERS = {"Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "UnloadRefused": "Unload"}
+ANSWERS = {
+    "Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "UnloadRefused": "Unload", ANSWER: ASK, RAISED: ASK
+}  # fmt: skip
 """For the name of each answer, that of its question."""
 
 
 class Timing(msgspec.Struct, frozen=True):
-    """The duration of a load, an unload or a callback.
+    """The duration of a load, an unload or a callback, or of an ask or its handler.
 
     Attributes:
         id: 16 hexadecimal digits, the same in each process.
         trace_id: 32 hexadecimal digits, of the whole trace: the id of the query that began it.
         parent: the id of the timing that it belongs to; "" for none.
-        name: "load cameras/camera", "unload cameras/camera", "callback load cameras/camera".
-        kind: "client" for a load or unload at its consumer, "server" for a callback.
+        name: "load cameras/camera", "unload cameras/camera", "callback load cameras/camera"; "ask root/maps",
+            "handle Ask".
+        kind: "client" for a load or unload at its consumer, and an ask; "server" for a callback or a handler.
         process, pid: the process that did it.
         began, ended: seconds since the epoch. `ended` is None if the recording does not have its end.
         error: the error of a failure; "" if there was none.
@@ -58,7 +62,30 @@ def timings_of(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
         else timing
         for timing in found
     ]
-    return sorted(placed, key=lambda timing: timing.began)
+    return sorted([*placed, *_asks(trace_id, entries)], key=lambda timing: timing.began)
+
+
+def _asks(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
+    """Return the asks between actors, each with the time of its handler below it, and below the handler what it asked.
+
+    An ask that a callback makes is below nothing.
+    """
+    found: dict[tuple[str, str], Timing] = {}
+    for entry in entries:
+        if entry.name == ASK:
+            is_sent = entry.event == "sent"
+            kind, above = ("client", ("handle", entry.parent)) if is_sent else ("server", ("ask", entry.query))
+            key = ("ask" if is_sent else "handle"), entry.query
+            parent = found[above].id if above in found else ""
+            name = f"ask {entry.peer}" if is_sent else f"handle {entry.name}"
+            what = _id(trace_id, *key), trace_id, parent, name, kind
+            found[key] = Timing(*what, entry.process, entry.pid, entry.registrar, "", entry.query, "", entry.at)
+        elif entry.name in REPLIES:
+            for key in (("ask", entry.query), ("handle", entry.query)):
+                if key in found:
+                    error = entry.detail if entry.name == RAISED else ""
+                    found[key] = msgspec.structs.replace(found[key], ended=entry.at, error=error)
+    return list(found.values())
 
 
 def _calls(trace_id: str, entries: Sequence[Entry]) -> tuple[list[Timing], dict[str, str], dict[str, str]]:

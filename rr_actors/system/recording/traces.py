@@ -1,7 +1,8 @@
-"""Traces: the entries of a recording that belong to one load, from all processes.
+"""Traces: the entries of a recording that belong to one load or one message, from all processes.
 
 The entries are joined by the ids that registrars send each other anyway. A load has the id of its query. The answer,
-or a callback, has the id of the resource. A load that a callback makes has this resource as its parent.
+or a callback, has the id of the resource. A load that a callback makes has this resource as its parent. A message
+between actors has an id of its own, and its cause as its parent.
 """
 
 from __future__ import annotations
@@ -12,23 +13,26 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.messaging.message_notes import MESSAGES
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import NotFound, UsageError, shown
+from rr_actors.base.errors import NotFound, UsageError, few, shown
 from rr_actors.base.notebook import bundle, table
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.timings import Timing, timings_of
 
+DEAD_LETTER = "dead_letter"
+"""The event of a message that reached no actor. Its registrar is that actor."""
 _PREFIX = 4  # an id can be given by its first characters, at least so many
 _STARTS = ("started", "restarted")
 _ENDS = ("exited", "stopped", "started", "restarted", "start_failed", "gave_up")
 
 
 class Trace:
-    """The entries of one load, from all processes. Recording.trace() makes it.
+    """The entries of one load, one message or some actors, from all processes. Recording.trace() makes it.
 
     Attributes:
-        id: the id of the query or resource.
+        id: the id of the query, resource or message; of messages(), the names of the actors.
         entries: the entries in the order of time, with the ends and starts of the processes that took part.
     """
 
@@ -37,18 +41,19 @@ class Trace:
         self.entries = list(entries)
 
     def sequence(self) -> str:
-        """Return a Mermaid sequence diagram: registrars, their messages, their callbacks, the deaths of processes."""
+        """Return a Mermaid sequence diagram: registrars and actors, messages, callbacks, the deaths of processes."""
         return sequence_of(self.entries)
 
     def timings(self) -> list[Timing]:
-        """Return the duration of each load and unload, with its callback, below the callback that asked for it."""
+        """Return the duration of each load, unload and ask, with its callback or handler, below what it is for."""
         return timings_of(self.id, self.entries)
 
     def spans(self) -> list[Any]:
         """Return the timings as OpenTelemetry's spans, for any SpanExporter's export(). Needs the extra `otel`.
 
         A load's span belongs to the consumer's process. Below it is the span of its callback, in the provider's
-        process. The trace's id is the query's id.
+        process. An ask has one of its asker, and below it that of the handler. The trace's id is the query's id, or
+        that of the message.
 
         Raises:
             UsageError: the extra is not installed.
@@ -84,8 +89,37 @@ def line_of(entry: Entry) -> str:
     return " ".join(text for text in (what, ids, entry.detail) if text)
 
 
+def messages_of(entries: Sequence[Entry], actors: Sequence[str]) -> Trace:
+    """Return the messages, callbacks and ends of these actors and registrars; of all, if none is named.
+
+    Args:
+        entries: the entries of a recording, in the order of time.
+        actors: names such as "root/cameras", or the last part of one.
+
+    Raises:
+        NotFound: the recording has no message of an actor of this name.
+    """
+    named = {name for entry in entries for name in (entry.registrar, entry.peer) if name}
+    wanted: set[str] = set()
+    for actor in actors:
+        found = {name for name in named if actor in (name, name.rpartition("/")[2])}
+        if not found:
+            text = f"{shown(actor)}: the recording has no message of an actor or registrar of this name; there are: "
+            raise NotFound(text + (few(sorted(named)) or "none"), id=actor, known=tuple(sorted(named)))
+        wanted |= found
+    events = ("sent", "received", "began", "ended", DEAD_LETTER)
+    chosen = [
+        entry
+        for entry in entries
+        if entry.event in events and (not actors or entry.registrar in wanted or entry.peer in wanted)
+    ]
+    return Trace(
+        " ".join(actors), sorted([*chosen, *Index(entries).deaths(chosen, entries)], key=lambda one: (one.at, one.seq))
+    )
+
+
 def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Trace:
-    """Return the trace of a query or a resource.
+    """Return the trace of a query, a resource or a message.
 
     Args:
         entries: the entries of a recording, in the order of time.
@@ -99,7 +133,7 @@ def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Tr
     id = known.whole(id)
     chosen = known.below(id, of_query=of_query)
     found = [entries[number] for number in sorted(chosen)]
-    return Trace(id, sorted([*found, *known.deaths(found)], key=lambda entry: (entry.at, entry.seq)))
+    return Trace(id, sorted([*found, *known.deaths(found, found)], key=lambda entry: (entry.at, entry.seq)))
 
 
 class Index:
@@ -112,7 +146,10 @@ class Index:
         self.resource_of: dict[str, str] = {}
         self.loads_for: dict[str, dict[str, None]] = defaultdict(dict)  # resource -> the queries of its parts
         self.queries_on: dict[str, dict[str, None]] = defaultdict(dict)
+        self.messages: set[str] = set()  # the ids of messages between actors
         for number, entry in enumerate(entries):
+            if entry.name in MESSAGES:
+                self.messages.add(entry.query)
             if entry.query:
                 self.of_query[entry.query].append(number)
                 if entry.resource:
@@ -137,7 +174,7 @@ class Index:
             several = ", ".join(found[:5]) + (", ..." if len(found) > 5 else "")
             raise UsageError(f"{shown(id)}: several ids begin so: {several}; give more of the id")
         if not found:
-            raise NotFound(f"{shown(id)}: the recording has no query or resource of this id", id=id)
+            raise NotFound(f"{shown(id)}: the recording has no query, resource or message of this id", id=id)
         return found[0]
 
     def below(self, id: str, *, of_query: bool) -> set[int]:
@@ -157,6 +194,8 @@ class Index:
                 continue
             seen.add(query)
             chosen.update(numbers)
+            if query in self.messages:
+                ahead += [(caused, 0.0) for caused in self.loads_for.get(query, ())]
             resource = self.resource_of.get(query)
             if resource is not None and f"resource {resource}" not in seen:
                 self._resource(resource, self.entries[numbers[0]].at, chosen, ahead, seen)
@@ -182,16 +221,20 @@ class Index:
         chosen.update(number for number in numbers if self.entries[number].at >= since)
         ahead += [(query, since) for query in self.loads_for.get(resource, ())]
 
-    def deaths(self, chosen: Sequence[Entry]) -> list[Entry]:
-        """Return the ends and starts of the children whose registrars took part, and the start after an end."""
+    def deaths(self, chosen: Sequence[Entry], during: Sequence[Entry]) -> list[Entry]:
+        """Return the ends and starts of the children that took part, and the start after an end.
+
+        Args:
+            during: between the first and the last of these entries.
+        """
         if not chosen:
             return []
         names = {name for entry in chosen for name in (entry.registrar, entry.peer) if name}
-        first, last = min(entry.at for entry in chosen), max(entry.at for entry in chosen)
+        first, last = min(entry.at for entry in during), max(entry.at for entry in during)
         down: set[str] = set()
         found: list[Entry] = []
         for entry in self.entries:
-            name = entry.process.rpartition("/")[2]
+            name = entry.process if entry.process in names else entry.process.rpartition("/")[2]
             if entry.event not in _ENDS or name not in names or entry.at < first:
                 continue
             if entry.at <= last or (entry.process in down and entry.event in _STARTS):

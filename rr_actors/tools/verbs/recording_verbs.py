@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -12,16 +13,19 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
+from rr_actors.base.errors import NotFound
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.recording.recordings import Recording, RecordingFile, add, read_recording
 from rr_actors.system.recording.timelines import read_timeline
+from rr_actors.system.recording.traces import Trace
 from rr_actors.tools.cli_commands import JsonOption, StateOption, json_text, say, say_lines
 from rr_actors.tools.web.timeline_file import html
 
 app = typer.Typer()
 
 _LISTEN_S = 10.0
+_ID = re.compile("[0-9a-f]{1,32}")
 
 
 @app.command(epilog="Example: rr-actors record crash.jsonl --seconds 30")
@@ -32,7 +36,7 @@ def record(
     ] = None,
     state: StateOption = None,
 ) -> None:
-    """Record the events, exits and callbacks of the system, and the messages between its registrars."""
+    """Record the events, exits and callbacks of the system, and the messages between its actors and registrars."""
     count = missed = 0
     with ConsoleClient(find_console(state)) as client:
         sink = RecordingFile(file, client.welcome.system, time.time())
@@ -50,7 +54,13 @@ def record(
 
 @app.command(epilog="Example: rr-actors sequence 01a2085d3f7c --file crash.jsonl > load.mmd")
 def sequence(
-    id: Annotated[str, typer.Argument(metavar="QUERY-OR-RESOURCE", help="Its id, or the beginning of it.")],
+    of: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="WHAT...",
+            help="The id of a query, resource or message, or its beginning; or actors, root/ping. Default: all.",
+        ),
+    ] = None,
     file: Annotated[Path | None, typer.Option(help="A recording. Default: record the running system now.")] = None,
     seconds: Annotated[
         float, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="Without a file: for how long.")
@@ -58,11 +68,14 @@ def sequence(
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the trace of a load, over all processes, as a Mermaid sequence diagram; with --json, print its entries."""
+    """Draw the trace of a load or a message, over all processes, or the messages of actors, as a Mermaid diagram.
+
+    With --json, print the entries.
+    """
     recording = _recorded(state, seconds) if file is None else read_recording(file)
     if recording.missed:
         say(f"{recording.missed} entries were missed, and are not in it", err=True)
-    trace = recording.trace(id)
+    trace = _drawn(recording, of or [])
     if as_json:
         for entry in trace.entries:
             typer.echo(json_text(_line(entry)))
@@ -84,6 +97,16 @@ def timeline(
     if drawn.missed:
         say(f"{drawn.missed} entries were missed, and are not in it", err=True)
     typer.echo(drawn.svg() if format == "svg" else html(drawn))
+
+
+def _drawn(recording: Recording, of: list[str]) -> Trace:
+    """Return the trace of one id; or the messages of actors, whose names are tried first."""
+    try:
+        return recording.messages(*of)
+    except NotFound:
+        if len(of) != 1 or not _ID.fullmatch(of[0]):
+            raise
+    return recording.trace(of[0])
 
 
 def _recorded(state: Path | None, seconds: float) -> Recording:

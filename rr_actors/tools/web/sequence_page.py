@@ -15,6 +15,7 @@ from functools import partial
 import msgspec
 from nicegui import Client, ui
 
+from rr_actors.actors.messaging.message_notes import MESSAGES
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console import console_messages as c
@@ -28,6 +29,7 @@ _LIMIT = 20_000  # entries of a page's recording
 _LISTED = 30
 _AROUND_S = 1.0
 _UNSEEN_S = 60.0
+_BEGINNINGS = {"Load", "Unload", *MESSAGES}
 _CRASHES = ("exited", "restarted", "start_failed", "gave_up", "stopped", "started")
 
 
@@ -95,13 +97,16 @@ class Recorder:
             thread.join()
 
     def happenings(self) -> list[Entry]:
-        """Return the entries that can be drawn, newest first: consumers' loads and unloads, statuses, crashes."""
+        """Return the entries that can be drawn, newest first: loads, unloads and messages without a cause; others.
+
+        The others are statuses and crashes.
+        """
         found = [
             entry
             for entry in self.recording.entries()
             if entry.event in _CRASHES
             or entry.event == "status"
-            or (entry.event == "sent" and entry.name in ("Load", "Unload") and not entry.parent)
+            or (entry.event == "sent" and entry.name in _BEGINNINGS and not entry.parent)
         ]
         return found[: -_LISTED - 1 : -1]
 
@@ -219,5 +224,9 @@ def _placed(entry: Entry) -> Entry:
 
 
 def _line(entry: Entry) -> str:
-    what = f"{entry.name} {entry.server}" if entry.event == "sent" else f"{entry.event} {entry.process or entry.server}"
+    what = (
+        f"{entry.name} {entry.server or entry.peer}"
+        if entry.event == "sent"
+        else f"{entry.event} {entry.process or entry.server}"
+    )
     return f"{time.strftime('%H:%M:%S', time.localtime(entry.at))} {what} {entry.detail[:40]}".rstrip()
