@@ -39,6 +39,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
 from rr_actors.managers.planning.last_good import last_good_file, path_of
+from rr_actors.managers.planning.late_word import LateWord
 from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import GIVEN_UP, Retries
 from rr_actors.managers.program_checks import parameter_faults, program_faults, template_faults
@@ -181,11 +182,11 @@ class Components(Manager):
     # -- replacing -------------------------------------------------------------------------------------------------
 
     def _replace_component(self, request: LoadComponent, status: Status, part: Query) -> None:
-        failed = self._component_of(request, part.request)
-        run, why = functools.partial(self._swap, status, part), list[str]()
+        failed, why = self._component_of(request, part.request), list[str]()
         try:
             in_turn = self._after(failed, status, part, lambda: self.candidates(request.type), why)
-            component = self._run_best(request, run, in_turn, why)
+            with LateWord(self.registrar, failed.name if failed else request.type, status) as late:
+                component = self._run_best(request, functools.partial(self._swap, status, part, late), in_turn, why)
         except UnknownQuery:
             status.handled()  # it is being unloaded
         except RrError as error:
@@ -297,9 +298,11 @@ class Components(Manager):
     def _load(self, program: RunProgram, made: Made, timeout_s: float) -> Component:
         return made(self.registrar.load(self._programs, program, timeout_s=timeout_s))
 
-    def _swap(self, status: Status, part: Query, program: RunProgram, made: Made, timeout_s: float) -> Component:
+    def _swap(
+        self, status: Status, part: Query, late: LateWord, program: RunProgram, made: Made, timeout_s: float
+    ) -> Component:
         spare = self.registrar.replace_part(
-            status, program, self._programs, part=part, response=made, timeout_s=timeout_s
+            status, program, self._programs, part=part, response=late.before(made), timeout_s=timeout_s
         )
         return made(spare)
 

@@ -21,6 +21,7 @@ from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.components import Component, LoadComponent
 from rr_actors.managers.planning.blame import is_own_failure, part_of
 from rr_actors.managers.planning.last_good import last_good_file, path_of
+from rr_actors.managers.planning.late_word import LateWord
 from rr_actors.managers.planning.retries import GIVEN_UP, Retries
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
 from rr_actors.registrar.declarations import server
@@ -146,12 +147,13 @@ class Robots(Manager):
 
         if self._retries.rest(key, what, say) is None:
             raise LoadFailed(f"{what}: {GIVEN_UP}")
-        spare = self.registrar.replace_part(
-            status,
-            failed.request,
-            response=lambda spare: self._assembled(request, self._in_order(request, [*others, spare])),
-            timeout_s=_LOAD_LIMIT_S,
-        )
+        with LateWord(self.registrar, what, status) as late:
+            spare = self.registrar.replace_part(
+                status,
+                failed.request,
+                response=late.before(lambda spare: self._assembled(request, self._in_order(request, [*others, spare]))),
+                timeout_s=_LOAD_LIMIT_S,
+            )
         self._retries.used(key)
         name = spare.response.name
         logger.warning("%s: %s takes the place of a part that failed: %s", request.name, name, status.message)

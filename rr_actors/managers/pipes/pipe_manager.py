@@ -27,6 +27,7 @@ from rr_actors.managers.components import (
 from rr_actors.managers.pipes.chains import Goal, Link, best_chain, substitutes, why_none
 from rr_actors.managers.pipes.pipe_files import PipeDescription, read_pipe_file
 from rr_actors.managers.planning.blame import is_own_fault
+from rr_actors.managers.planning.late_word import LateWord
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.templates import Parameters
 from rr_actors.registrar.declarations import server
@@ -174,22 +175,27 @@ class Pipes(Components):
             return [self._described[link.name] for link in self._fitting(request, segments, place)]
 
         def put(one: ComponentDescription) -> str:
-            self._put(request, status, segments, place, one.name)
+            self._put(request, status, segments, place, one.name, late)
             return one.name
 
-        found = self._first_of(self._after(self._described.get(failed), status, part, fitting, why), put, why)
+        with LateWord(self.registrar, failed, status) as late:
+            found = self._first_of(self._after(self._described.get(failed), status, part, fitting, why), put, why)
         if found is None:
             raise NoPipe("\n".join([f"no component can take the place of {failed}:", *(why or ["none fits there"])]))
         logger.warning("%s: %s takes the place of %s: %s", request.of_type, found, failed, status.message)
 
-    def _put(self, request: Pipe, status: Status, segments: list[Component], place: int, name: str) -> None:
+    def _put(
+        self, request: Pipe, status: Status, segments: list[Component], place: int, name: str, late: LateWord
+    ) -> None:
         program, parameters = self._segment(request, name, place)
         made = functools.partial(component_of, self._described[name], parameters)
         self.registrar.replace_part(
             status,
             program,
             self._programs,
-            response=lambda spare: self._built(request, [*segments[:place], made(spare), *segments[place + 1 :]]),
+            response=late.before(
+                lambda spare: self._built(request, [*segments[:place], made(spare), *segments[place + 1 :]])
+            ),
             timeout_s=program.ready.timeout_s + LOAD_MARGIN_S,
         )
 
