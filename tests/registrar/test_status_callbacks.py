@@ -442,6 +442,7 @@ class Customer(rr.Manager):
         self.work = Workshop(root)
 
     def on_start(self) -> None:
+        self.work.step("starts")
         if not self.registrar.queries():
             self.registrar.load("shop/thing", Order("lamp"))
         (query,) = self.registrar.queries()
@@ -460,15 +461,21 @@ def shop(start: Start, workshop: Workshop) -> rr.System:
     return start(rr.ChildSpec(Shop, args=(root,), id="shop"), rr.ChildSpec(Customer, args=(root,), id="customer"))
 
 
-def test_a_query_that_a_restart_has_restored_gets_a_callback(shop: rr.System, workshop: Workshop) -> None:
+def test_a_query_that_a_restart_has_restored_gets_a_callback_in_on_start_which_misses_nothing(
+    shop: rr.System, workshop: Workshop
+) -> None:
     workshop.wait("listens")
-    pid = kill(shop, "customer")
-    wait_respawned(shop, "customer", pid)
-    workshop.wait("listens", 2)
     provider = shop.registrar("shop")
     (resource,) = provider.resources()
-    provider.send_status(resource, WARNING)
-    assert workshop.wait("hears") == ["hears low light lamp"]
+    workshop.shut("starts")
+    pid = kill(shop, "customer")
+    provider.send_status(resource, said(0))
+    workshop.wait("starts", 2)
+    provider.send_status(resource, said(1))
+    workshop.open("starts")
+    wait_respawned(shop, "customer", pid)
+    provider.send_status(resource, said(2))
+    assert workshop.wait("hears", 3) == [f"hears {number} lamp" for number in range(3)]
 
 
 def note_in(root: str, word: str) -> Callable[[rr.Status], None]:

@@ -114,6 +114,14 @@ def use(app: rr.Registrar, block: bool) -> None:
     declared = app.load(Cameras.open_camera, OpenCamera("/dev/video0"), on_status=print, timeout_s=5)
     assert_type(declared, rr.Query[Feed])
     assert_type(declared.response, Feed)
+
+    def heard(status: rr.Status) -> None:
+        assert_type(status.query, rr.Query[Any] | None)
+
+    with app.on_status(Cameras.open_camera, heard) as subscription:
+        assert_type(subscription, rr.Subscription)
+    declared.on_status(heard)
+    declared.on_status(None)
     of_subclass = app.load(BetterCameras.open_camera, OpenCamera("/dev/video0"))
     assert_type(of_subclass.response, Feed)
     rate: rr.Query[float] = app.load(Cameras.measure_rate, "/dev/video0")  # of async callbacks mypy knows Any
