@@ -44,7 +44,7 @@ demo: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-demo)
 	$(BIN)/python examples/mission.py $(ARGS)
 
 lab: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-web)
-	$(BIN)/rr-actors web --lab $(ARGS)
+	$(BIN)/rr-actors web --lab examples/lab $(ARGS)
 
 docs: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-docs)
 	$(BIN)/python -m sphinx -qWE --keep-going -c docs/_site -d build/doctrees docs build/docs $(ARGS)

@@ -21,7 +21,7 @@ import psutil
 import pytest
 from playwright.async_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, Playwright, async_playwright
 
-from support import BROWSERS, LIMIT_S, eventually, wait_gone
+from support import BROWSERS, LIMIT_S, REPOSITORY, eventually, wait_gone
 
 T = TypeVar("T")
 
@@ -31,6 +31,7 @@ CHROMIUM = os.environ.get("RR_CHROMIUM") or shutil.which("chromium")
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None, reason="needs Debian's Chromium: apt-get install chromium, or RR_CHROMIUM=/path/to/chromium"
 )
+LAB = REPOSITORY / "examples" / "lab"
 PATIENCE_S = 30.0
 """How long somebody waits for what a page shows: it has come through four processes of a machine that may be busy."""
 _ARGUMENTS = (

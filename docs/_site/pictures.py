@@ -16,7 +16,7 @@ IMAGES = ROOT / "docs" / "images"
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import rr_actors as rr  # noqa: E402
-from support_browser import Chromium, Tab, web  # noqa: E402
+from support_browser import LAB, Chromium, Tab, web  # noqa: E402
 
 
 class Cameras(rr.Manager):
@@ -143,7 +143,7 @@ def take(tab: Tab, name: str) -> None:
 
 def take_lab(tab: Tab) -> None:
     """Take the picture of an experiment that is played again."""
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.clicks("A tree of your own")
         tab.do(tab.page.get_by_label("strategy").click())

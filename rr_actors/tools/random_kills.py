@@ -26,7 +26,7 @@ _MOMENT_S = 0.5  # the longest pause before a kill, so that kills come at any mo
 _MOVING = ("starting", "restarting", "unavailable")
 
 
-class Plan(msgspec.Struct, frozen=True):
+class KillPlan(msgspec.Struct, frozen=True):
     """What to kill, and how often.
 
     Attributes:
@@ -54,7 +54,7 @@ class Killed(msgspec.Struct, frozen=True):
     back_s: float | None = None
 
 
-class Report(msgspec.Struct):
+class KillReport(msgspec.Struct):
     """What was done, and what is wrong.
 
     Attributes:
@@ -85,7 +85,7 @@ class RandomKills:
         UsageError: no child can be killed; the text says why.
     """
 
-    def __init__(self, client: ConsoleClient, plan: Plan, say: Callable[[str], None]) -> None:
+    def __init__(self, client: ConsoleClient, plan: KillPlan, say: Callable[[str], None]) -> None:
         self._client = client
         self._plan = plan
         self._say = say
@@ -93,7 +93,7 @@ class RandomKills:
         self._state_dir = Path(client.welcome.state_dir)
         self._returns: set[str] = set()  # paths of children that their supervisors start again
         self._began = time.monotonic()
-        self.report = Report(plan.seed, {})
+        self.report = KillReport(plan.seed, {})
         rows = self._rows()
         for name in plan.only:
             if child_meant(name, rows) is None:
@@ -130,7 +130,7 @@ class RandomKills:
         self.report.left_alone[path] = why
         return False
 
-    def run(self) -> Report:
+    def run(self) -> KillReport:
         """Kill until the plan is done or something is wrong, and return the report.
 
         Raises:

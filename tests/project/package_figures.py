@@ -126,7 +126,7 @@ def private_uses() -> list[str]:
     shared: set[str] = set()
     uses: list[tuple[Path, str, str]] = []
     for path, tree in trees("tests"):
-        is_support = path.stem.startswith("support") or path.parent.name == "simulation"
+        is_support = path.stem.startswith("support") or path.parent.name in ("simulation", "chaos")
         defined = shared if is_support else own[path]
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):

@@ -18,7 +18,7 @@ from rr_actors.storage.opening import open_store
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import ChildRow
 from rr_actors.tools.inspection import Contents, check_delivered
-from rr_actors.tools.random_kills import Plan, RandomKills, missing_after
+from rr_actors.tools.random_kills import KillPlan, RandomKills, missing_after
 from support import Workshop, pid_of
 from support_cli import run_cli
 from support_managers import Order, Shop
@@ -224,7 +224,7 @@ def test_catalogs_that_disagree_before_are_named_and_nothing_is_killed(shop: rr.
 
 def test_catalogs_that_disagree_after_a_kill_end_the_run(shop: rr.System) -> None:
     with ConsoleClient(find_console(shop.state_dir)) as client:
-        plan = Plan(kills=5, seed=1, only=("shop",), timeout_s=5.0)
+        plan = KillPlan(kills=5, seed=1, only=("shop",), timeout_s=5.0)
         report = RandomKills(client, plan, lambda line: spoil(shop.state_dir)).run()
 
     assert [kill.path for kill in report.kills] == ["root/shop"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,15 +12,16 @@ from typing import Any
 
 import pytest
 
-from rr_actors.tools.web.lab.lab_catalog import EXPERIMENTS, experiment_called
+from rr_actors.tools.web.lab.lab_folder import read_lab
 from rr_actors.tools.web.lab.lab_runs import Place, Run
-from rr_actors.tools.web.lab.lab_texts import texts_of
 from support import eventually
-from support_browser import Tab, needs_chromium, web
+from support_browser import LAB, Tab, needs_chromium, web
 
 pytestmark = pytest.mark.timeout(180)
 
+EXPERIMENTS = read_lab(LAB).experiments
 LONG_S = 60.0
+SHARING = LAB / "sharing_and_parts.py"
 AT_ONCE = 10  # experiments side by side: more of them make each too slow to show what it should
 
 
@@ -37,9 +39,8 @@ def left_behind() -> list[Path]:
 
 
 def test_each_experiment_says_what_it_is_and_what_to_look_for() -> None:
-    experiments = [texts_of(one) for one in EXPERIMENTS]
-    assert len({one.title for one in experiments}) == len(EXPERIMENTS) == 18
-    for one in experiments:
+    assert len({one.title for one in EXPERIMENTS.values()}) == len(EXPERIMENTS) == 18
+    for one in EXPERIMENTS.values():
         assert one.about
         assert one.look_for
         assert "def main(" in one.code
@@ -48,7 +49,7 @@ def test_each_experiment_says_what_it_is_and_what_to_look_for() -> None:
 
 def test_a_run_that_is_stopped_leaves_nothing() -> None:
     before = left_behind()
-    run = Run("sharing_and_parts")
+    run = Run(SHARING)
     try:
         eventually(lambda: run.watch is not None and run.watch.now.children, LONG_S)
         assert len(left_behind()) == len(before) + 1
@@ -64,11 +65,11 @@ def test_a_place_has_one_run_however_fast_buttons_are_pressed_and_none_when_its_
 
     async def press() -> None:
         place = Place(runs)
-        assert await place.start("sharing_and_parts")
-        assert await asyncio.gather(place.start("sharing_and_parts"), place.start("restart_storm")) == [True, True]
+        assert await place.start(SHARING)
+        assert await asyncio.gather(place.start(SHARING), place.start(LAB / "restart_storm.py")) == [True, True]
         assert place.run is not None
         assert [run.name for run in runs if run.is_running] == [place.run.name] == ["restart_storm"]
-        await asyncio.gather(place.start("sharing_and_parts"), place.leave())
+        await asyncio.gather(place.start(SHARING), place.leave())
 
     asyncio.run(press())
     assert runs == set()
@@ -77,17 +78,43 @@ def test_a_place_has_one_run_however_fast_buttons_are_pressed_and_none_when_its_
 
 def test_a_run_that_ends_by_itself_leaves_nothing_and_shows_its_error() -> None:
     before = left_behind()
-    run = Run("no_such_experiment")
+    run = Run(LAB / "no_such_experiment.py")
     eventually(lambda: not run.is_running, LONG_S)
     assert "No module named" in "\n".join(run.lines)
     assert left_behind() == before
+
+
+def test_an_experiment_imports_what_is_beside_it_also_when_its_code_was_changed(tmp_path: Path) -> None:
+    (tmp_path / "_words.py").write_text('WORD = "beside"')
+    program = tmp_path / "mine.py"
+    program.write_text("from _words import WORD\ndef main(state_dir):\n    print(WORD, flush=True)")
+    runs = [Run(program), Run(program, code=program.read_text())]
+    for run in runs:
+        eventually(lambda run=run: not run.is_running, LONG_S)
+        assert run.lines == ["beside"]
+
+
+@needs_chromium
+def test_the_page_names_a_file_that_is_broken_and_serves_the_others_also_one_that_is_mended(
+    tab: Tab, tmp_path: Path
+) -> None:
+    shutil.copy(SHARING, tmp_path)
+    broken = tmp_path / "broken.py"
+    broken.write_text("def main(:")
+    with web("--lab", tmp_path) as url:
+        tab.goes_to(url)
+        tab.sees("nav", "Sharing and dependencies", f"{broken}: expected a Python program")
+        broken.write_text('"""Mended: now."""\ndef main(state_dir): ...')
+        tab.do(tab.page.reload())
+        tab.clicks("Mended")
+        tab.sees("[role=status]", "broken waits for you")
 
 
 @needs_chromium
 @pytest.mark.slow
 def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page(tab: Tab) -> None:
     before = left_behind()
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.clicks("Sharing and dependencies")
         tab.clicks("run it")
@@ -110,7 +137,7 @@ def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page
 @pytest.mark.slow
 def test_an_experiment_ends_with_the_lab(tab: Tab) -> None:
     before = left_behind()
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.clicks("A poisoned message")
         tab.clicks("run it")
@@ -138,7 +165,7 @@ def main(state_dir):
 
 def test_changed_code_runs_in_the_place_of_an_experiment_with_its_levers() -> None:
     before = left_behind()
-    run = Run("sharing_and_parts", {"number": 7}, CHANGED)
+    run = Run(SHARING, {"number": 7}, CHANGED)
     eventually(lambda: not run.is_running, LONG_S)
     assert run.lines == ["my own answer to 7"]
     assert run.has_finished
@@ -146,7 +173,7 @@ def test_changed_code_runs_in_the_place_of_an_experiment_with_its_levers() -> No
 
 
 def test_a_run_that_fails_or_is_stopped_has_not_finished() -> None:
-    failed, stopped = Run("sharing_and_parts", {}, "1 / 0"), Run("sharing_and_parts", {}, SLEEPS)
+    failed, stopped = Run(SHARING, {}, "1 / 0"), Run(SHARING, {}, SLEEPS)
     eventually(lambda: not failed.is_running, LONG_S)
     stopped.stop()
     assert not failed.has_finished
@@ -197,20 +224,19 @@ def test_each_run_shows_which_answers_to_its_question_are_right() -> None:
     for first in range(0, len(wanted), AT_ONCE):
         assert_right(wanted[first : first + AT_ONCE])
     assert left_behind() == before
-    assert {one.name for one in EXPERIMENTS} == set(RIGHT)
+    assert set(EXPERIMENTS) == set(RIGHT)
 
 
 def assert_right(wanted: Sequence[tuple[str, dict[str, Any], set[str]]]) -> None:
     """Let these experiments run side by side, and look at what each has shown."""
-    runs = [(Run(name, levers), right) for name, levers, right in wanted]
+    runs = [(Run(LAB / f"{name}.py", levers), right) for name, levers, right in wanted]
     try:
         for run, right in runs:
             eventually(lambda run=run: not run.is_running, 2 * LONG_S, run.name)
-            declared = experiment_called(run.name)
-            assert declared is not None
-            assert declared.question is not None
+            question = EXPERIMENTS[run.name].question
+            assert question is not None
             assert run.has_finished, run.lines
-            assert declared.question.right(run.seen) == right, (run.name, run.lines)
+            assert question.right(run.seen) == right, (run.name, run.lines)
     finally:
         for run, _ in runs:
             run.stop()
@@ -219,7 +245,7 @@ def assert_right(wanted: Sequence[tuple[str, dict[str, Any], set[str]]]) -> None
 @needs_chromium
 @pytest.mark.slow
 def test_the_lab_asks_runs_what_was_chosen_compares_and_plays_it_again(tab: Tab) -> None:
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.clicks("A tree of your own")
         tab.sees("body", "What will the supervisor team do?", "strategy")
@@ -248,7 +274,7 @@ def test_the_lab_asks_runs_what_was_chosen_compares_and_plays_it_again(tab: Tab)
 @needs_chromium
 @pytest.mark.slow
 def test_code_cannot_be_changed_where_other_machines_reach_the_lab(tab: Tab) -> None:
-    with web("--lab", "--host", "0.0.0.0") as url:
+    with web("--lab", LAB, "--host", "0.0.0.0") as url:
         tab.goes_to(url.replace("0.0.0.0", "127.0.0.1"))
         tab.clicks("Sharing and dependencies")
         tab.sees("body", "It can be changed where the lab listens at this machine alone.")
@@ -258,7 +284,7 @@ def test_code_cannot_be_changed_where_other_machines_reach_the_lab(tab: Tab) -> 
 @needs_chromium
 @pytest.mark.slow
 def test_a_child_is_killed_by_hand(tab: Tab) -> None:
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.do(tab.page.goto(url.partition("?")[0] + "?experiment=sharing_and_parts"))
         tab.clicks("run it")
@@ -273,7 +299,7 @@ def test_a_child_is_killed_by_hand(tab: Tab) -> None:
 @needs_chromium
 @pytest.mark.slow
 def test_ten_questions_are_answered_with_what_the_docs_say(tab: Tab) -> None:
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.clicks("Ten questions", role="link")
         tab.do(tab.page.get_by_role("radio", name="one_for_all").click())
@@ -304,7 +330,7 @@ RESULTS = {
 def test_each_button_shows_what_its_experiment_promises(button: str, tab: Tab) -> None:
     (selector, *shown), printed = RESULTS[button]
     before = left_behind()
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.clicks(button)
         tab.clicks("run it")

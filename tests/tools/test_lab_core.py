@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import inspect
 import re
+import runpy
 from pathlib import Path
 
 import nbformat
@@ -13,17 +13,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rr_actors.base.errors import ConfigError, UsageError
 from rr_actors.system.console.console_messages import Event
 from rr_actors.system.recording.timeline_lanes import Bar, Lane, Mark
 from rr_actors.system.recording.timelines import Timeline
-from rr_actors.tools.web.lab.lab_catalog import EXPERIMENTS, experiment_called
-from rr_actors.tools.web.lab.lab_declarations import Happens, LabExperiment, Lever, NothingElse, Prints, Question, Seen
+from rr_actors.tools.web.lab.lab_declarations import LabDeclaration, LabExperiment, Lever, Question, Seen, Sign
+from rr_actors.tools.web.lab.lab_folder import read_experiment, read_lab
+from rr_actors.tools.web.lab.lab_notebook import notebook_of
 from rr_actors.tools.web.lab.lab_questions import QUESTIONS
-from rr_actors.tools.web.lab.lab_texts import PACKAGE, notebook_of
 from rr_actors.tools.web.lab.playback import PACES, Playback
+from support_cli import run_cli
 
 DOCS = Path(__file__).parents[2] / "docs"
-QUESTION = Question("Which?", {"a": Happens("restarted", "root/a"), "said": Prints("hello"), "neither": NothingElse()})
+ROOT = DOCS.parent
+EXPERIMENTS = read_lab(ROOT / "examples" / "lab").experiments
+ANSWERS = {"a": Sign(event="restarted", path="root/a"), "said": Sign(prints="hello"), "neither": Sign()}
+QUESTION = Question("Which?", ANSWERS)
 A = Event(1, 1.0, "restarted", {"path": "root/a"})
 
 
@@ -56,37 +61,139 @@ def test_the_given_answers_are_compared_with_the_run(given_answers: set[str], sa
 
 
 def test_a_question_of_which_a_run_shows_nothing_says_so() -> None:
-    assert Question("Which?", {"a": Prints("a")}).verdict({"a"}, Seen()) == "This run has shown none of the answers."
+    assert (
+        Question("Which?", {"a": Sign(prints="a")}).verdict({"a"}, Seen()) == "This run has shown none of the answers."
+    )
 
 
 def test_levers_have_their_first_value_unless_another_is_chosen() -> None:
-    declared = LabExperiment("room.name", (Lever("kills", "kills", (1, 2)), Lever("child", "child", ("a", "b"))))
-    assert declared.name == "name"
-    assert declared.values({}) == {"kills": 1, "child": "a"}
-    assert declared.values({"kills": "2"}) == {"kills": 2, "child": "a"}
-    assert declared.values({"kills": "3"}) is None
-    assert declared.values({"no such lever": "1"}) is None
+    levers = (Lever("kills", "kills", (1, 2)), Lever("child", "child", ("a", "b")))
+    experiment = LabExperiment(Path("room/name.py"), "", "", "", "", LabDeclaration(levers=levers))
+    assert experiment.name == "name"
+    assert experiment.values({}) == {"kills": 1, "child": "a"}
+    assert experiment.values({"kills": "2"}) == {"kills": 2, "child": "a"}
+    assert experiment.values({"kills": "3"}) is None
+    assert experiment.values({"no such lever": "1"}) is None
 
 
-@pytest.mark.parametrize("declared", EXPERIMENTS, ids=lambda one: one.name)
-def test_the_levers_of_an_experiment_are_the_parameters_of_its_program(declared: LabExperiment) -> None:
-    program = importlib.import_module(f"{PACKAGE}.{declared.program}")
-    parameters = list(inspect.signature(program.main).parameters.values())[1:]
-    assert {one.name: one.default for one in parameters} == {one.name: one.choices[0] for one in declared.levers}
-    assert declared.question is not None
-    assert experiment_called(declared.name) is declared
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_levers_of_an_experiment_are_the_parameters_of_its_program(name: str) -> None:
+    experiment = EXPERIMENTS[name]
+    program = runpy.run_path(str(experiment.program))
+    parameters = list(inspect.signature(program["main"]).parameters.values())[1:]
+    assert {one.name: one.default for one in parameters} == {one.name: one.choices[0] for one in experiment.levers}
+    assert experiment.question is not None
+    assert experiment.code.startswith("from __future__ import annotations\n")
 
 
-def test_every_program_beside_the_others_is_declared() -> None:
-    root = Path(str(importlib.import_module(PACKAGE).__file__)).parent
-    found = {".".join(path.relative_to(root).with_suffix("").parts) for path in root.rglob("*.py")}
-    assert {one.program for one in EXPERIMENTS} == {name for name in found if "__" not in name}
+def test_every_program_of_the_examples_is_an_experiment() -> None:
+    assert read_lab(ROOT / "examples" / "lab").broken == []
 
 
-@pytest.mark.parametrize("declared", EXPERIMENTS, ids=lambda one: one.name)
-def test_a_notebook_has_the_same_code_and_the_chosen_levers(declared: LabExperiment) -> None:
-    levers = {lever.name: lever.choices[-1] for lever in declared.levers}
-    notebook = nbformat.reads(notebook_of(declared, levers), as_version=4)
+# -- a folder of one's own -------------------------------------------------------------------------------------------
+
+MINE = '''"""Mine: what it shows.
+
+More of `it`.
+
+Look for: the child.
+"""
+
+# /// lab
+# place = 2
+# question = "What becomes of it?"
+# levers = [{name = "kills", label = "how often", choices = [1, 2.5, "never"]}]
+# [answers]
+# "it runs again" = {event = "restarted", path = "root/a"}
+# neither = {}
+# ///
+
+import time
+
+
+def main(state_dir, kills=1):
+    time.sleep(kills)
+'''
+
+
+def written(folder: Path, text: str, name: str = "mine.py") -> Path:
+    file = folder / name
+    file.write_text(text)
+    return file
+
+
+def test_a_file_says_its_title_its_texts_its_levers_and_its_question(tmp_path: Path) -> None:
+    mine = read_experiment(written(tmp_path, MINE))
+
+    assert (mine.title, mine.about, mine.look_for) == ("Mine: what it shows", "More of it.", "the child.")
+    assert mine.code == "import time\n\n\ndef main(state_dir, kills=1):\n    time.sleep(kills)\n"
+    assert mine.levers == (Lever("kills", "how often", (1, 2.5, "never")),)
+    assert mine.question == Question(
+        "What becomes of it?", {"it runs again": Sign(event="restarted", path="root/a"), "neither": Sign()}
+    )
+
+
+def test_a_docstring_and_a_main_are_enough(tmp_path: Path) -> None:
+    mine = read_experiment(written(tmp_path, '"""Mine."""\ndef main(state_dir): ...'))
+
+    assert (mine.title, mine.levers, mine.question) == ("Mine", (), None)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("def main(:", r"mine\.py: expected a Python program, got: .* \(line 1\)"),
+        ("def main(state_dir): ...", r"mine\.py: expected a docstring, got none"),
+        ('"""Mine."""', r"mine\.py: expected a function main\(state_dir, \.\.\.\), got none"),
+        ('"""Mine."""\ndef main(): ...', r"mine\.py: expected a function main\(state_dir, \.\.\.\), got none"),
+        (MINE.replace("place = 2", "place = first"), r"mine\.py: lab: not valid TOML"),
+        (MINE.replace("question =", "asks ="), r"mine\.py: lab: asks: expected one of .*, got an unknown key"),
+        (MINE.replace('1, 2.5, "never"', ""), r"mine\.py: lab: levers\[0\]\.choices"),
+        (MINE.replace('name = "kills"', 'name = "kill"'), r"mine\.py: lab: levers: expected a parameter of main\(\)"),
+        (MINE.replace("prints", "print").replace("event", "evnt"), r"lab: answers\.it runs again\.evnt"),
+    ],
+)
+def test_a_file_that_is_no_experiment_is_named_with_what_is_wrong(text: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=says):
+        read_experiment(written(tmp_path, text))
+
+
+def test_a_folder_has_its_experiments_in_the_order_of_their_places_and_names_what_is_broken(tmp_path: Path) -> None:
+    written(tmp_path, MINE, "b_last.py")
+    written(tmp_path, MINE.replace("place = 2", "place = 1"), "c_first.py")
+    written(tmp_path, '"""Mine."""\ndef main(state_dir): ...', "a_without_a_place.py")
+    written(tmp_path, "not Python", "broken.py")
+    written(tmp_path, MINE, "no-module.py")
+    written(tmp_path, "not Python", "_helper.py")
+    (tmp_path / "bytes.py").write_bytes(b"\xff\xfe")
+
+    lab = read_lab(tmp_path)
+
+    assert list(lab.experiments) == ["c_first", "b_last", "a_without_a_place"]
+    assert [Path(text.partition(":")[0]).name for text in lab.broken] == ["broken.py", "bytes.py", "no-module.py"]
+
+
+def test_a_folder_that_is_not_there_or_has_none_is_refused_with_what_to_give(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(UsageError, match=r"--lab: .*expected .*experiments.*examples/lab"):
+            read_lab(folder)
+
+
+def test_without_a_folder_the_command_says_what_to_give() -> None:
+    ran = run_cli("web", "--lab")
+
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert ran.stderr == (
+        "rr-actors: Option '--lab' requires an argument: A folder with experiments to serve in place of a system: "
+        "examples/lab, say.\n"
+    )
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_a_notebook_has_the_same_code_and_the_chosen_levers(name: str) -> None:
+    experiment = EXPERIMENTS[name]
+    levers = {lever.name: lever.choices[-1] for lever in experiment.levers}
+    notebook = nbformat.reads(notebook_of(experiment, levers), as_version=4)
     nbformat.validate(notebook)
     _, code, call = [cell.source for cell in notebook.cells]
     compile(code, "cell", "exec")
@@ -110,7 +217,7 @@ def test_a_choice_is_answered_with_the_docs_answer_and_its_place_does_not_betray
     for asked in QUESTIONS:
         assert asked.verdict(asked.choices[0]) == f"Right. {asked.why}"
         assert asked.verdict(asked.choices[1]) == f"Not quite. {asked.why}"
-        assert not asked.experiment or experiment_called(asked.experiment)
+        assert not asked.experiment or asked.experiment in EXPERIMENTS
     assert {asked.shown.index(asked.choices[0]) for asked in QUESTIONS} == {0, 1, 2}
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import rr_actors as rr
 from support import serve
-from support_browser import Chromium, Tab, needs_chromium, web
+from support_browser import LAB, Chromium, Tab, needs_chromium, web
 
 pytestmark = [needs_chromium, pytest.mark.timeout(180)]
 
@@ -66,7 +66,7 @@ def test_axe_finds_no_violation_on_any_page_of_a_system(system: rr.System, tab: 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_violation_in_the_lab(tab: Tab, scheme: Any) -> None:
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.do(tab.page.emulate_media(color_scheme=scheme))
         tab.goes_to(url)
         tab.sees("body", "Escalation")
@@ -104,7 +104,7 @@ def goes_by_tab_to(tab: Tab, name: str, most: int = 80) -> None:
 
 @pytest.mark.slow
 def test_an_experiment_is_chosen_answered_run_and_paused_with_keys_alone(tab: Tab) -> None:
-    with web("--lab") as url:
+    with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.sees("body", "Escalation")
         goes_by_tab_to(tab, "A tree of your own")
@@ -226,7 +226,7 @@ def test_no_name_in_the_graph_is_cut_off_or_covered_and_no_word_is_broken(
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.slow
 def test_nothing_is_cut_off_or_covered_or_empty_in_the_lab(chromium: Chromium, width: int) -> None:
-    with web("--lab") as url, chromium.tab(width, 900) as tab:
+    with web("--lab", LAB) as url, chromium.tab(width, 900) as tab:
         tab.goes_to(url)
         tab.sees("body", "Escalation")
         found = faults(tab, width)

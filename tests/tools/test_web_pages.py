@@ -32,7 +32,7 @@ import rr_actors as rr
 from rr_actors.managers import Actions, RunGraph
 from rr_actors.system import web_process
 from support import LIMIT_S, Workshop, child, hang, kill, lives, pid_of, quickly, serve, wait_gone
-from support_browser import Chromium, Tab, needs_chromium, web
+from support_browser import LAB, Chromium, Tab, needs_chromium, web
 from support_managers import Order, Shop
 
 pytestmark = [needs_chromium, pytest.mark.timeout(120)]
@@ -882,7 +882,7 @@ def test_a_server_says_its_address_alone_and_ends_in_order(start: Start, state_d
 def test_without_a_library_of_the_extra_the_command_says_what_to_install(library: str, tmp_path: Path) -> None:
     (tmp_path / f"{library}.py").write_text(f"raise ModuleNotFoundError('No module named {library}', name='{library}')")
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-m", "rr_actors", "web", "--lab"]
+    command = [sys.executable, "-m", "rr_actors", "web", "--lab", str(LAB)]
 
     ran = subprocess.run(command, env=environment, capture_output=True, text=True)
 
@@ -927,7 +927,9 @@ def test_without_a_system_the_command_says_so_and_ends(tmp_path: Path) -> None:
 
 def test_a_host_that_is_not_this_machines_is_named() -> None:
     ran = subprocess.run(
-        [sys.executable, "-m", "rr_actors", "web", "--lab", "--host", "192.0.2.1"], capture_output=True, text=True
+        [sys.executable, "-m", "rr_actors", "web", "--lab", str(LAB), "--host", "192.0.2.1"],
+        capture_output=True,
+        text=True,
     )
     assert ran.returncode == 2
     assert ran.stderr.startswith("rr-actors: 192.0.2.1:0: cannot be listened at (")

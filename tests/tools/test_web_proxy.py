@@ -15,7 +15,7 @@ import pytest
 
 import rr_actors as rr
 from support import Workshop, eventually, pid_of
-from support_browser import Tab, needs_chromium, web
+from support_browser import LAB, Tab, needs_chromium, web
 from support_managers import Order, Shop
 
 pytestmark = pytest.mark.timeout(120)
@@ -163,7 +163,7 @@ def test_the_address_is_that_of_the_proxy_and_the_page_is_served_here_as_well(st
 
 @needs_chromium
 def test_the_lab_has_a_prefix_too(tab: Tab, proxy: Proxy) -> None:
-    with web("--lab", "--port", proxy.to, "--prefix", PREFIX, "--host-name", f"localhost:{proxy.port}",
+    with web("--lab", LAB, "--port", proxy.to, "--prefix", PREFIX, "--host-name", f"localhost:{proxy.port}",
              "--host-name", "hub.example.org") as url:  # fmt: skip
         assert url.startswith(f"http://localhost:{proxy.port}{PREFIX}/lab?token=")
         tab.goes_to(url)

@@ -11,7 +11,7 @@ import typer
 
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_table
-from rr_actors.tools.random_kills import Plan, RandomKills, Report
+from rr_actors.tools.random_kills import KillPlan, KillReport, RandomKills
 from rr_actors.tools.verbs.console_verbs import DryRun, Timeout, complete_child
 
 app = typer.Typer()
@@ -51,7 +51,7 @@ def chaos(
     of their own and temporary ones are left alone. What is wrong ends the run.
     """
     chosen = random.SystemRandom().randrange(_SEEDS) if seed is None else seed
-    plan = Plan(kills, chosen, seconds, tuple(only or ()), regardless, timeout_s)
+    plan = KillPlan(kills, chosen, seconds, tuple(only or ()), regardless, timeout_s)
     with ConsoleClient(find_console(state)) as client:
         run = RandomKills(client, plan, lambda line: say(line, err=True))
         if dry_run:
@@ -67,7 +67,7 @@ def chaos(
         raise typer.Exit(1)
 
 
-def _say_plan(run: RandomKills, plan: Plan, as_json: bool) -> None:
+def _say_plan(run: RandomKills, plan: KillPlan, as_json: bool) -> None:
     victims = run.victims()
     if as_json:
         say_json({"kills": plan.kills, "seed": plan.seed, "children": victims, "left_alone": run.report.left_alone})
@@ -77,12 +77,12 @@ def _say_plan(run: RandomKills, plan: Plan, as_json: bool) -> None:
     _say_left_alone(run.report)
 
 
-def _say_left_alone(report: Report) -> None:
+def _say_left_alone(report: KillReport) -> None:
     for path, why in report.left_alone.items():
         say(f"left alone: {path}: {why}")
 
 
-def _say_report(report: Report) -> None:
+def _say_report(report: KillReport) -> None:
     times: defaultdict[str, list[float]] = defaultdict(list)
     for kill in report.kills:
         times[kill.path] += [] if kill.back_s is None else [kill.back_s]

@@ -633,7 +633,12 @@ def web(
     host: Annotated[str, typer.Option(help="The address to listen at; a browser needs the token, too.")] = "127.0.0.1",
     prefix: Annotated[str, typer.Option(help="The path at which a proxy serves the page; {port} is its port.")] = "",
     host_name: Annotated[list[str] | None, typer.Option(help="A host at which a proxy serves the page.")] = None,
-    lab: Annotated[bool, typer.Option("--lab", help="Serve experiments to learn from, and no system.")] = False,
+    lab: Annotated[
+        Path | None,
+        typer.Option(
+            "--lab", metavar="DIR", help="A folder with experiments to serve in place of a system: examples/lab, say."
+        ),
+    ] = None,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
 ) -> None:
     """Serve a live web page of a running system: its tree, its resources, the last minutes; print its address."""

@@ -201,7 +201,14 @@ class Verb(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         _convert_no_more_than_needed(self, ctx)
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if type(error).__name__ != "BadOptionUsage":  # click's: an option without its value
+                raise
+            wrong: Any = error
+            option: Any = next(param for param in self.get_params(ctx) if wrong.option_name in param.opts)
+            raise UsageError(f"{wrong.message.rstrip('.')}: {option.help}") from error
 
 
 class _Verbs(TyperGroup):

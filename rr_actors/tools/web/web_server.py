@@ -14,6 +14,7 @@ import socket
 import sys
 from collections.abc import Callable, Collection
 from functools import partial
+from pathlib import Path
 
 import uvicorn
 from fastapi import FastAPI
@@ -46,7 +47,7 @@ A browser that is slow may leave a ping unanswered for 0.4 times as long. A run 
 def serve(
     state_dir: str | os.PathLike[str] | None,
     *,
-    lab: bool,
+    lab: Path | None,
     host: str,
     port: int,
     prefix: str = "",
@@ -58,7 +59,7 @@ def serve(
 
     Args:
         state_dir: the directory of the system that is shown; None for the one that runs.
-        lab: serve the experiments in place of a system.
+        lab: serve the experiments of this folder in place of a system.
         port: the port, or 0 for a free one.
         prefix: the path before all paths, by which browsers reach this server through a proxy.
         names: of the hosts that they reach it at through a proxy.
@@ -68,7 +69,7 @@ def serve(
     Raises:
         NotRunning: no system runs in the directory, or none at all.
         UsageError: several systems run, and no state directory was given; or the address cannot be used, or the prefix
-            or a name is none.
+            or a name is none; or the folder has no experiments.
     """
     check_proxy("web", prefix, names)
     if is_child:
@@ -77,8 +78,8 @@ def serve(
     port = listening.getsockname()[1]
     prefix = prefix.replace("{port}", str(port)).rstrip("/")
     keys = Keys()
-    if lab:
-        add_lab(takes_code=is_loopback(host) and not names)
+    if lab is not None:
+        add_lab(lab.expanduser().absolute(), takes_code=is_loopback(host) and not names)
     else:
         watch = Watch(state_dir)
         recorder = Recorder(watch)
@@ -100,7 +101,7 @@ def serve(
     shown = f"[{host}]" if ":" in host else host
     name = next(iter(names), f"{shown}:{port}")
     server = f"{'http' if is_loopback(name.partition(':')[0]) or not names else 'https'}://{name}"
-    app.on_startup(lambda: say(f"{server}{prefix}/{'lab' if lab else ''}?token={keys.token}"))
+    app.on_startup(lambda: say(f"{server}{prefix}/{'' if lab is None else 'lab'}?token={keys.token}"))
     served = FastAPI(openapi_url=None)
     binding.MAX_PROPAGATION_TIME = math.inf  # it prints a warning where the machine is busy
     ui.run_with(
@@ -110,7 +111,7 @@ def serve(
         dark=None,
         language="en-US",
         show_welcome_message=False,
-        reconnect_timeout=_LAB_AWAY_S if lab else _AWAY_S,
+        reconnect_timeout=_AWAY_S if lab is None else _LAB_AWAY_S,
     )
     config = uvicorn.Config(
         Access(served, keys, host, port, prefix, names),

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TypeAlias
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import msgspec
 
 from rr_actors.system.console.console_messages import Event
 
 Value: TypeAlias = str | int | float
 
 
-@dataclass(frozen=True)
-class Lever:
+class Lever(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A parameter of an experiment's main().
 
     Attributes:
@@ -23,7 +26,7 @@ class Lever:
 
     name: str
     label: str
-    choices: tuple[Value, ...]
+    choices: Annotated[tuple[Value, ...], msgspec.Meta(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -34,36 +37,32 @@ class Seen:
     lines: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
-class Happens:
-    """A sign: this event has happened to the child at this path."""
+class Sign(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What makes an answer right: a printed line with a text, or an event of a child. An empty sign: no other is right.
 
-    event: str
-    path: str
+    Attributes:
+        prints: a text that is in a line which the program has printed.
+        event, path: an event, and the path of the child to which it has happened.
+    """
+
+    prints: str = ""
+    event: str = ""
+    path: str = ""
 
     def is_in(self, seen: Seen) -> bool:
         """Return whether a run has shown it."""
+        if self.prints:
+            return any(self.prints in line for line in seen.lines)
         return any(one.event == self.event and one.facts.get("path") == self.path for one in seen.events)
 
 
-@dataclass(frozen=True)
-class Prints:
-    """A sign: the program has printed a line with this text."""
+class LabDeclaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What an experiment's file declares: its place on the page, its levers, and its question."""
 
-    text: str
-
-    def is_in(self, seen: Seen) -> bool:
-        """Return whether a run has shown it."""
-        return any(self.text in line for line in seen.lines)
-
-
-@dataclass(frozen=True)
-class NothingElse:
-    """The sign of an answer that is right if no other one is."""
-
-    def is_in(self, seen: Seen) -> bool:
-        """Return False: the question looks at the other answers."""
-        return False
+    place: float = math.inf
+    levers: tuple[Lever, ...] = ()
+    question: str = ""
+    answers: dict[str, Sign] = {}
 
 
 @dataclass(frozen=True)
@@ -76,12 +75,12 @@ class Question:
     """
 
     text: str
-    answers: Mapping[str, Happens | Prints | NothingElse]
+    answers: Mapping[str, Sign]
 
     def right(self, seen: Seen) -> frozenset[str]:
         """Return the answers that a run has shown to be right."""
         found = frozenset(answer for answer, sign in self.answers.items() if sign.is_in(seen))
-        return found or frozenset(answer for answer, sign in self.answers.items() if isinstance(sign, NothingElse))
+        return found or frozenset(answer for answer, sign in self.answers.items() if sign == Sign())
 
     def verdict(self, given: Collection[str], seen: Seen) -> str:
         """Return a sentence that compares the given answers with what a run has shown."""
@@ -102,19 +101,33 @@ class LabExperiment:
     """An experiment of the lab.
 
     Attributes:
-        program: its module, below rr_actors.tools.experiments.
-        levers: the parameters of its main() that the page offers.
-        question: what is asked before it runs; None asks nothing.
+        program: its file.
+        title, about, look_for: texts for people, from its docstring.
+        code: its text after that.
+        declared: what the file declares.
     """
 
-    program: str
-    levers: tuple[Lever, ...] = field(default=())
-    question: Question | None = None
+    program: Path
+    title: str
+    about: str
+    look_for: str
+    code: str
+    declared: LabDeclaration
 
     @property
     def name(self) -> str:
-        """The module's own name."""
-        return self.program.rpartition(".")[2]
+        """The name of its file, without the ending."""
+        return self.program.stem
+
+    @property
+    def question(self) -> Question | None:
+        """What is asked before it runs; None asks nothing."""
+        return Question(self.declared.question, self.declared.answers) if self.declared.question else None
+
+    @property
+    def levers(self) -> tuple[Lever, ...]:
+        """The parameters of its main() that the page offers."""
+        return self.declared.levers
 
     def values(self, chosen: Mapping[str, str]) -> dict[str, Value] | None:
         """Return the values of all levers, with the texts of the chosen ones; None if one is no choice."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from functools import partial
+from pathlib import Path
 from urllib.parse import urlencode
 
 from fastapi import Request
@@ -15,12 +16,12 @@ from nicegui import app, ui
 
 from rr_actors.base.errors import RrError
 from rr_actors.system.console import console_commands as commands
-from rr_actors.tools.web.lab.lab_catalog import EXPERIMENTS, experiment_called
 from rr_actors.tools.web.lab.lab_declarations import LabExperiment
+from rr_actors.tools.web.lab.lab_folder import Lab, read_lab
+from rr_actors.tools.web.lab.lab_notebook import notebook_of
 from rr_actors.tools.web.lab.lab_player import Player
 from rr_actors.tools.web.lab.lab_questions import QUESTIONS, Asked
 from rr_actors.tools.web.lab.lab_runs import AT_ONCE, Place, Run
-from rr_actors.tools.web.lab.lab_texts import notebook_of, texts_of
 from rr_actors.tools.web.web_pages import CSS
 
 _LOOK_S = 0.2
@@ -39,12 +40,17 @@ _CSS = (
 )
 
 
-def add_lab(*, takes_code: bool) -> None:
+def add_lab(folder: Path, *, takes_code: bool) -> None:
     """Add the pages of the lab to NiceGUI's application.
 
     Args:
+        folder: has the experiments; each page reads it anew.
         takes_code: the page's reader may change an experiment's code, and run that.
+
+    Raises:
+        UsageError: the folder has no experiments.
     """
+    read_lab(folder)
     runs: set[Run] = set()
 
     def stop_all() -> None:
@@ -53,20 +59,23 @@ def add_lab(*, takes_code: bool) -> None:
 
     @app.get("/lab/{name}.ipynb")
     def _(name: str, request: Request) -> Response:
-        declared = experiment_called(name)
-        levers = declared.values(request.query_params) if declared is not None else None
-        if declared is None or levers is None:
+        chosen = read_lab(folder).experiments.get(name)
+        levers = chosen.values(request.query_params) if chosen is not None else None
+        if chosen is None or levers is None:
             return PlainTextResponse(f"{name}: no such experiment, or no such value of a lever\n", 404)
         headers = {"Content-Disposition": f'attachment; filename="{name}.ipynb"'}
-        return Response(notebook_of(declared, levers), media_type="application/x-ipynb+json", headers=headers)
+        return Response(notebook_of(chosen, levers), media_type="application/x-ipynb+json", headers=headers)
 
     @ui.page("/lab", title="rr-actors: lab")
     async def _(experiment: str = "") -> None:
-        page = LabPage(runs, takes_code)
-        if declared := experiment_called(experiment):
-            await page.choose(declared)
+        page = LabPage(lab := await asyncio.to_thread(read_lab, folder), runs, takes_code)
+        if chosen := lab.experiments.get(experiment):
+            await page.choose(chosen)
 
-    ui.page("/lab/questions", title="rr-actors: ten questions")(QuestionsPage)
+    @ui.page("/lab/questions", title="rr-actors: ten questions")
+    async def _() -> None:
+        QuestionsPage(await asyncio.to_thread(read_lab, folder))
+
     ui.page("/", title="rr-actors: lab")(lambda: ui.navigate.to("/lab"))
     app.on_shutdown(lambda: asyncio.to_thread(stop_all))
 
@@ -89,21 +98,24 @@ class LabPage:
     """The page with the experiments. A page runs one at a time, and ends it when it is closed.
 
     Args:
+        lab: the experiments, and what is wrong with other files.
         runs: the runs of all pages.
         takes_code: the reader may change the code, and run that.
     """
 
-    def __init__(self, runs: set[Run], takes_code: bool) -> None:
+    def __init__(self, lab: Lab, runs: set[Run], takes_code: bool) -> None:
         self._place = Place(runs)
         self._takes_code = takes_code
-        self._declared: LabExperiment | None = None
+        self._experiment: LabExperiment | None = None
         self._chosen = ""  # the path of a child
         self._status = _bar("/lab")
         self._status.text = "choose an experiment"
         with ui.element("main").classes("rr-lab"):
             with ui.element("nav").props('aria-label="experiments"').classes("column gap-2"):
-                for one in EXPERIMENTS:
+                for one in lab.experiments.values():
                     self._button(one)
+                for text in lab.broken:
+                    ui.label(text).classes("rr-note").props('role="alert"')
             with ui.column().classes("gap-2").style("min-width: 0"):
                 self._build()
         ui.context.client.on_delete(self._place.leave)
@@ -140,26 +152,27 @@ class LabPage:
         run = self._place.run
         return "/" in self._chosen and run is not None and run.is_running and self._player.is_live
 
-    def _button(self, declared: LabExperiment) -> None:
-        title = texts_of(declared).title.partition(":")[0]
-        ui.button(title, on_click=partial(self.choose, declared)).props("outline no-caps align=left").classes("w-full")
+    def _button(self, experiment: LabExperiment) -> None:
+        title = experiment.title.partition(":")[0]
+        ui.button(title, on_click=partial(self.choose, experiment)).props("outline no-caps align=left").classes(
+            "w-full"
+        )
 
-    async def choose(self, declared: LabExperiment) -> None:
+    async def choose(self, experiment: LabExperiment) -> None:
         """Show an experiment that waits to be run."""
         await self._place.stop()
         self._player.show(None)
-        texts = texts_of(declared)
-        self._declared, self._chosen = declared, ""
-        self._title.text, self._about.text = texts.title, texts.about
-        self._look_for.text = f"Look for: {texts.look_for}"
-        self._original = self._code.value = texts.code
+        self._experiment, self._chosen = experiment, ""
+        self._title.text, self._about.text = experiment.title, experiment.about
+        self._look_for.text = f"Look for: {experiment.look_for}" if experiment.look_for else ""
+        self._original = self._code.value = experiment.code
         self._verdict.set_visibility(False)
-        self._status.text = f"{declared.name} waits for you"
-        self._levers = {lever.name: str(lever.choices[0]) for lever in declared.levers}
-        self._answers: dict[str, bool] = dict.fromkeys(declared.question.answers, False) if declared.question else {}
+        self._status.text = f"{experiment.name} waits for you"
+        self._levers = {lever.name: str(lever.choices[0]) for lever in experiment.levers}
+        self._answers: dict[str, bool] = dict.fromkeys(experiment.declared.answers, False)
         self._setup.clear()
         with self._setup:
-            self._show_setup(declared)
+            self._show_setup(experiment)
         self._code_hint.text = (
             "Change it, and run it: your text runs in the place of this one, as your own program would."
             if self._takes_code
@@ -170,31 +183,31 @@ class LabPage:
         for part in (self._run_row, self._code_part):
             part.set_visibility(True)
 
-    def _show_setup(self, declared: LabExperiment) -> None:
+    def _show_setup(self, experiment: LabExperiment) -> None:
         with ui.row().classes("gap-4"):
-            for lever in declared.levers:
+            for lever in experiment.levers:
                 select = ui.select([str(choice) for choice in lever.choices], label=lever.label)
                 select.props("dense outlined").style("min-width: 13rem")
                 select.bind_value(self._levers, lever.name).on_value_change(self._link)
-        if declared.question is not None:
-            _heading(declared.question.text, 2)
+        if experiment.question is not None:
+            _heading(experiment.question.text, 2)
             with ui.row().classes("gap-4"):
                 for answer in self._answers:
                     ui.checkbox(answer).bind_value(self._answers, answer)
 
     def _link(self) -> None:
-        assert self._declared is not None
-        self._notebook.props(f'href="/lab/{self._declared.name}.ipynb?{urlencode(self._levers)}"')
+        assert self._experiment is not None
+        self._notebook.props(f'href="/lab/{self._experiment.name}.ipynb?{urlencode(self._levers)}"')
 
     async def _start(self) -> None:
-        declared = self._declared
-        if declared is None:
+        experiment = self._experiment
+        if experiment is None:
             return
         text = self._code.value or ""
         code = text if self._takes_code and text != self._original else ""
         self._verdict.set_visibility(False)
         self._asked = frozenset(answer for answer, is_given in self._answers.items() if is_given)
-        if not await self._place.start(declared.name, declared.values(self._levers), code):
+        if not await self._place.start(experiment.program, experiment.values(self._levers), code):
             ui.notify(f"{AT_ONCE} experiments run already: stop one, or wait for its end", type="warning")
             return
         self._chosen = ""
@@ -226,7 +239,7 @@ class LabPage:
 
     def _compare(self, run: Run) -> None:
         """Say what the run has shown of its question."""
-        question = self._declared.question if self._declared is not None else None
+        question = self._experiment.question if self._experiment is not None else None
         if question is None:
             return
         said = question.verdict(self._asked, run.seen) if run.has_finished else "It did not come to its end."
@@ -237,24 +250,24 @@ class LabPage:
 class QuestionsPage:
     """The lab's last page: ten questions, each with three choices, and the docs' answer after a choice."""
 
-    def __init__(self) -> None:
+    def __init__(self, lab: Lab) -> None:
         self._status = _bar("/lab/questions")
         self._right: dict[int, bool] = {}
         with ui.element("main").classes("rr-page column"):
             _heading("Ten questions", 1)
             ui.label("The page docs/let-it-crash.md, and the experiments, answer them.")
             for number, asked in enumerate(QUESTIONS, 1):
-                self._ask(number, asked)
+                self._ask(number, asked, lab)
         self._count()
 
-    def _ask(self, number: int, asked: Asked) -> None:
+    def _ask(self, number: int, asked: Asked, lab: Lab) -> None:
         text = asked.text.replace("`", "")
         with ui.element("section").classes("rr-panel w-full").props(f'aria-label="question {number}"'):
             ui.label(f"{number}. {text}").classes("text-bold")
             choices = ui.radio(asked.shown).props(f'inline aria-label="answers to question {number}"')
             said = ui.label().props('role="status"')
-            if declared := experiment_called(asked.experiment):
-                ui.link("the experiment that shows it", f"/lab?experiment={declared.name}")
+            if asked.experiment in lab.experiments:
+                ui.link("the experiment that shows it", f"/lab?experiment={asked.experiment}")
 
         def choose() -> None:
             said.text = asked.verdict(str(choices.value)).replace("`", "")

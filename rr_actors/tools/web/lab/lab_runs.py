@@ -18,13 +18,12 @@ from typing import IO
 
 from rr_actors.base.errors import RrError
 from rr_actors.runtime.processes.lifeline import kill_group
-from rr_actors.tools.web.lab.lab_catalog import experiment_called
 from rr_actors.tools.web.lab.lab_declarations import Seen, Value
-from rr_actors.tools.web.lab.lab_texts import PACKAGE
 from rr_actors.tools.web.watch import Watch
 
 AT_ONCE = 4
 """How many experiments may run at a time, of all browsers together."""
+_PROGRAM = "rr_actors.tools.web.lab"
 _CHANGED = "changed_experiment.py"
 _STOP_S = 15.0  # what is killed may leave programs that run on
 _LOOK_S = 0.1
@@ -35,30 +34,30 @@ class Run:
     """A run of an experiment, from its start to its end. Any thread may use it.
 
     Args:
-        name: of the experiment.
+        program: the file of the experiment.
         levers: the arguments of its main().
         code: a text that is run in the place of its program; "" runs that.
 
     Attributes:
+        name: of the experiment.
         began: seconds since the epoch.
         said: the lines that it has printed, each with its time.
         watch: the watch of the system that it has started; None until that is reached.
     """
 
-    def __init__(self, name: str, levers: Mapping[str, Value] | None = None, code: str = "") -> None:
-        self.name = name
+    def __init__(self, program: Path, levers: Mapping[str, Value] | None = None, code: str = "") -> None:
+        self.name = program.stem
         self.began = time.time()
         self.said: deque[tuple[float, str]] = deque(maxlen=_LINES)
         self.watch: Watch | None = None
         self._place = Path(tempfile.mkdtemp(prefix="rr-lab-"))
         self._state = str(self._place / "state")
         self._stopping = threading.Event()
-        declared = experiment_called(name)
-        program = declared.program if declared is not None else name
+        folder = program.parent
         if code:
-            program = str(self._place / _CHANGED)
-            Path(program).write_text(code)
-        command = [sys.executable, "-m", PACKAGE, program, self._state, json.dumps(dict(levers or {}))]
+            program = self._place / _CHANGED
+            program.write_text(code)
+        command = [sys.executable, "-m", _PROGRAM, program, folder, self._state, json.dumps(dict(levers or {}))]
         self._program = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, process_group=0
         )
@@ -145,7 +144,7 @@ class Place:
         self._lock = asyncio.Lock()  # stopping takes a while, and another click may come meanwhile
         self._has_left = False
 
-    async def start(self, name: str, levers: Mapping[str, Value] | None = None, code: str = "") -> bool:
+    async def start(self, program: Path, levers: Mapping[str, Value] | None = None, code: str = "") -> bool:
         """Stop the page's experiment and start another; return False if too many run on other pages."""
         async with self._lock:
             await self._stop()
@@ -153,7 +152,7 @@ class Place:
                 return True
             if sum(one.is_running for one in self._runs) >= AT_ONCE:
                 return False
-            self.run = Run(name, levers, code)
+            self.run = Run(program, levers, code)
             self._runs.add(self.run)
             return True
 

@@ -6,6 +6,15 @@ processes, and this load fails at once.
 Look for: the two resources that are still loading, and then fail; the error, which names all loads of the ring.
 """
 
+# /// lab
+# place = 11
+# question = "The map loads the camera, and the camera loads the map. What will the consumer get?"
+# [answers]
+# "nothing: it waits for ever" = {}
+# "an error that names the ring" = {prints = "refused: "}
+# "the map" = {prints = "loaded: the map"}
+# ///
+
 from __future__ import annotations
 
 import time

@@ -6,6 +6,19 @@ program by hand: one that nobody holds is idle, and its manager does what was ch
 Look for: the programs that are there when the guide does not drive, and how soon they answer when it drives again.
 """
 
+# /// lab
+# place = 15
+# question = "The guide has driven, and now explains. What has become of the laser's program?"
+# levers = [
+#     {name = "idle", label = "what becomes of an idle program", choices = ["pause", "unload"]},
+#     {name = "linger_s", label = "seconds until that", choices = [0.5, 30.0]},
+# ]
+# [answers]
+# "it is paused" = {prints = "explain: laser is paused"}
+# "it has been ended" = {prints = "explain: laser is not there"}
+# "it runs on" = {prints = "explain: laser is loaded"}
+# ///
+
 from __future__ import annotations
 
 import time

@@ -7,6 +7,14 @@ Look for: one camera with two holders, and one lens; the warning about the lens,
 there to both consumers; the camera that stays until the second consumer releases it, and takes its lens along.
 """
 
+# /// lab
+# place = 8
+# question = "Two consumers load the same camera. How many cameras will be loaded?"
+# [answers]
+# one = {prints = "one resource: True"}
+# two = {prints = "one resource: False"}
+# ///
+
 from __future__ import annotations
 
 import time

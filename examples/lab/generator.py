@@ -7,6 +7,18 @@ Look for: the generator, which loads for two seconds while the pump waits; what 
 needs 40 W more, and there is no second generator.
 """
 
+# /// lab
+# place = 14
+# question = "All 100 W are used, and the pump needs 40 more. What will happen?"
+# levers = [
+#     {name = "fuel", label = "the generator has fuel", choices = ["yes", "no"]},
+# ]
+# [answers]
+# "the generator starts, and nobody is switched off" = {prints = "the generator runs"}
+# "the arm, of the highest priority, is switched off" = {prints = "arm is switched off for the pump"}
+# "the radio and the lamp are switched off" = {prints = "lamp is switched off for the pump"}
+# ///
+
 from __future__ import annotations
 
 import functools

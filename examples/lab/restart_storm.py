@@ -7,6 +7,18 @@ Look for: the squares in the box of `branch`, which fill up; its innocent child,
 squares of `root`. In the end nothing runs.
 """
 
+# /// lab
+# place = 3
+# question = "The child broken fails again and again. Which of them will give up?"
+# levers = [
+#     {name = "max_restarts", label = "intensity: restarts within 15 s", choices = [3, 1, 2]},
+# ]
+# [answers]
+# branch = {event = "restarted", path = "root/branch"}
+# "root, too" = {prints = "the tree has ended: shutdown"}
+# "none of them" = {}
+# ///
+
 from __future__ import annotations
 
 import time

@@ -6,6 +6,18 @@ Look for: first the motor alone starts again. At the second kill its supervisor 
 battery and the wheel again. At the fourth kill `base` gives up, too, and `root` starts everything again.
 """
 
+# /// lab
+# place = 4
+# question = "The motor is killed. Which supervisors will be started again in the end?"
+# levers = [
+#     {name = "kills", label = "kills", choices = [4, 1, 2, 3]},
+# ]
+# [answers]
+# wheel = {event = "restarted", path = "root/base/wheel"}
+# base = {event = "restarted", path = "root/base"}
+# "none: the motor alone" = {}
+# ///
+
 from __future__ import annotations
 
 import os

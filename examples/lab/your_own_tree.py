@@ -7,6 +7,22 @@ Look for: the children that start again with the killed one; the squares in the 
 at `team` itself if it gives up.
 """
 
+# /// lab
+# place = 2
+# question = "What will the supervisor team do?"
+# levers = [
+#     {name = "strategy", label = "strategy", choices = ["one_for_one", "one_for_all", "rest_for_one"]},
+#     {name = "max_restarts", label = "intensity: restarts within 60 s", choices = [2, 0, 1, 3]},
+#     {name = "kills", label = "kills", choices = [1, 2, 3, 4]},
+#     {name = "child", label = "killed child", choices = ["b", "a", "c"]},
+# ]
+# [answers]
+# "restart a" = {event = "restarted", path = "root/team/a"}
+# "restart b" = {event = "restarted", path = "root/team/b"}
+# "restart c" = {event = "restarted", path = "root/team/c"}
+# "give up" = {event = "restarted", path = "root/team"}
+# ///
+
 from __future__ import annotations
 
 import os

@@ -7,6 +7,19 @@ Look for: the choice, whose part changes while its holder keeps it; the camera's
 settling time before the choice returns to it.
 """
 
+# /// lab
+# place = 16
+# question = "A loop reads the camera, until that is killed. What will the loop read then?"
+# levers = [
+#     {name = "settle_s", label = "seconds that the camera must be well before it is used", choices = [3.0, 30.0]},
+#     {name = "at_least_hz", label = "readings in a second that the consumer needs", choices = [10, 50]},
+# ]
+# [answers]
+# "the lidar, and later the camera again" = {prints = "it has read: camera, lidar, camera."}
+# "the lidar, to the end" = {prints = "it has read: camera, lidar."}
+# "nothing: it ends with an error" = {prints = "the loop ends: "}
+# ///
+
 from __future__ import annotations
 
 import os

@@ -6,6 +6,15 @@ callback again. So an unload callback may find that a part of its work is done.
 Look for: the resource that is still there after the kill, as "unloading"; the manager's new process, and attempt 2.
 """
 
+# /// lab
+# place = 12
+# question = "The manager is killed while it closes a file. What will become of the file?"
+# [answers]
+# "its unload runs again" = {prints = "closes the file, attempt 2"}
+# "it stays open" = {}
+# "the consumer holds it again" = {prints = "held again"}
+# ///
+
 from __future__ import annotations
 
 import os

@@ -7,6 +7,20 @@ Look for: the graph's parts, one for each action that runs; if the manager of th
 runs again, and the ones that do not.
 """
 
+# /// lab
+# place = 18
+# question = "A picture is to be taken with the arm's camera, or else with the spare one. What will happen?"
+# levers = [
+#     {name = "broken", label = "the broken camera", choices = ["arm", "none", "spare"]},
+#     {name = "killed", label = "what is killed during a picture", choices = ["nobody", "actions"]},
+# ]
+# [answers]
+# "the spare camera takes it" = {prints = "TakePicture_1 is FINISHED"}
+# "the graph ends with an error" = {prints = "the graph ends with on_error"}
+# "the drive runs again" = {prints = "Drive begins, attempt 2"}
+# "the spare camera begins again, as attempt 2" = {prints = "the camera spare, attempt 2"}
+# ///
+
 from __future__ import annotations
 
 import os

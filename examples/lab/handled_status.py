@@ -6,6 +6,17 @@ A status goes from a part to the resource that stands on it, and from there to i
 Look for: the warning at the lens, and whether the camera gets it, too; who prints that it heard.
 """
 
+# /// lab
+# place = 10
+# question = "The lens becomes dirty. Who will hear of it?"
+# levers = [
+#     {name = "handled", label = "the cameras' manager handles the status", choices = ["yes", "no"]},
+# ]
+# [answers]
+# "the cameras' manager" = {prints = "the cameras' manager hears"}
+# "the consumer" = {prints = "the consumer hears"}
+# ///
+
 from __future__ import annotations
 
 import time

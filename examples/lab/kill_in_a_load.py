@@ -6,6 +6,14 @@ again. The consumer has asked once, and gets one answer.
 Look for: the resource that is still loading after the kill, the manager's new process, and attempt 2.
 """
 
+# /// lab
+# place = 9
+# question = "The manager is killed while it loads. What will the consumer get?"
+# [answers]
+# "the map, a little later" = {prints = "loaded: the map"}
+# "an error" = {}
+# ///
+
 from __future__ import annotations
 
 import os

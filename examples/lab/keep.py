@@ -6,6 +6,20 @@ is wanted, whenever something happens, and loads what is missing. In the end ano
 Look for: the radio that fails, and the wait before it is loaded again; which radios are left when fewer are wanted.
 """
 
+# /// lab
+# place = 17
+# question = "Three radios are wanted, and radio 0 fails. What will be there eight seconds later?"
+# levers = [
+#     {name = "fault", label = "what becomes of radio 0", choices = ["killed", "silent"]},
+#     {name = "delay_s", label = "seconds before what was lost is loaded again", choices = [2.0, 20.0]},
+#     {name = "then_wanted", label = "then so many radios are wanted", choices = [1, 5]},
+# ]
+# [answers]
+# "radio 0, radio 1 and radio 2" = {prints = "later: radio 0, radio 1, radio 2"}
+# "radio 1, radio 2, and radio 3 as a new one" = {prints = "later: radio 1, radio 2, radio 3"}
+# "radio 1 and radio 2" = {prints = "later: radio 1, radio 2 ("}
+# ///
+
 from __future__ import annotations
 
 import os

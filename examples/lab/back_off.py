@@ -7,6 +7,19 @@ Look for: the state "restarting", which lasts longer each time; with a jitter, t
 long although they failed together.
 """
 
+# /// lab
+# place = 5
+# question = "The first wait is 1 s. How long will the third one be?"
+# levers = [
+#     {name = "factor", label = "factor", choices = [2.0, 1.0]},
+#     {name = "jitter", label = "jitter", choices = [0.0, 0.5]},
+# ]
+# [answers]
+# "about 1 s" = {prints = "wait 3: about 1 s"}
+# "2 to 3 s" = {prints = "wait 3: 2 to 3 s"}
+# "about 4 s" = {prints = "wait 3: about 4 s"}
+# ///
+
 from __future__ import annotations
 
 import threading

@@ -6,6 +6,18 @@ Look for: a number in the box of each child that was started again. One of three
 one_for_all, the killed one and the one after it under rest_for_one, one under simple_one_for_one.
 """
 
+# /// lab
+# place = 1
+# question = "Which children will start again under rest_for_one?"
+# levers = [
+#     {name = "child", label = "killed child", choices = ["b", "a", "c"]},
+# ]
+# [answers]
+# a = {event = "restarted", path = "root/rest_for_one/a"}
+# b = {event = "restarted", path = "root/rest_for_one/b"}
+# c = {event = "restarted", path = "root/rest_for_one/c"}
+# ///
+
 from __future__ import annotations
 
 import time

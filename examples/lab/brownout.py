@@ -7,6 +7,21 @@ Look for: the resources that are unloaded before the pump is on; the ones that c
 there is power again.
 """
 
+# /// lab
+# place = 13
+# question = "Five devices of priorities 1 to 5 use all there is, 20 W each. Which are switched off for the pump?"
+# levers = [
+#     {name = "priority", label = "priority of the pump, which needs 40 W", choices = [9, 2]},
+#     {name = "capacity", label = "then as much is left, in W", choices = [60, 80, 40]},
+# ]
+# [answers]
+# radio = {prints = "radio is switched off for the pump"}
+# lamp = {prints = "lamp is switched off for the pump"}
+# camera = {prints = "camera is switched off for the pump"}
+# arm = {prints = "arm is switched off for the pump"}
+# "nobody: the pump waits" = {}
+# ///
+
 from __future__ import annotations
 
 import time

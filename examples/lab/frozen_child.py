@@ -7,6 +7,17 @@ Look for: the new process number if the heartbeat is shorter than the pause; the
 answer if it is not.
 """
 
+# /// lab
+# place = 7
+# question = "The process stands still for 6 s. What will become of it?"
+# levers = [
+#     {name = "heartbeat_s", label = "heartbeat in seconds; 0 is none", choices = [1.0, 3.0, 0.0]},
+# ]
+# [answers]
+# "another process takes its place" = {event = "restarted", path = "root/lidar"}
+# "it goes on after that" = {}
+# ///
+
 from __future__ import annotations
 
 import os

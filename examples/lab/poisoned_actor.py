@@ -6,6 +6,14 @@ sender decides: a sender that asks gets an error. A message to an actor that is 
 Look for: the parser's new process after the poison, with no message left over; and the dead letter in the events.
 """
 
+# /// lab
+# place = 6
+# question = "The parser's process ends at the poison. What will its new process do with this message?"
+# [answers]
+# "get it again, and end again" = {prints = "two: no answer"}
+# "never see it" = {prints = "two: TWO"}
+# ///
+
 from __future__ import annotations
 
 import os

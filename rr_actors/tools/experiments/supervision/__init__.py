@@ -1,1 +1,0 @@
-"""Experiments about supervision: crashes, restarts, and when a supervisor gives up."""
