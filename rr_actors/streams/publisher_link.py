@@ -227,7 +227,8 @@ class PublisherLink:
         except Exception:
             self.is_taken = True  # no other call could make it
             raise
-        missed = 0 if self.last is None else max(0, packet.number - self.last - 1)
+        last = 0 if self.last and packet.number <= self.last else self.last  # a manager in a thread has crashed
+        missed = 0 if last is None else packet.number - last - 1
         frame = StreamFrame(value, packet.number, packet.published_at, missed, self._stream)
         self._offered_to = threading.get_ident()
         return frame

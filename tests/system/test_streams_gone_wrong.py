@@ -212,13 +212,18 @@ async def first_within(reader: rr.StreamReader, limit_s: float) -> rr.StreamFram
         return None
 
 
-def test_frames_of_the_next_process_that_a_busy_reader_did_not_get_are_missed(system: rr.System, boards: Any) -> None:
-    with load(system, "a").stream("a", keep="all", timeout_s=20) as reader:
+@pytest.mark.parametrize("placement", ["process", "thread"])
+def test_frames_of_the_next_manager_that_a_busy_reader_did_not_get_are_missed(start: Start, placement: Any) -> None:
+    system = start(rr.ChildSpec(Boards, id="boards", placement=placement))
+    boards = system.ref("boards").proxy()
+    with load(system, "a").stream("a", keep="all", timeout_s=20, depth=5) as reader:
         when_wanted(boards)
-        boards.publish("a", "before").get()
-        assert next(reader).value == "before"
-        pid = boards.pid().get()
-        os.kill(pid, signal.SIGKILL)
+        boards.publish("a", *["before"] * 5).get()
+        assert [next(reader).number for _ in range(5)] == [1, 2, 3, 4, 5]
+        if placement == "process":
+            kill(system, "boards")
+        else:
+            system.ref("boards").tell("crash")
         eventually(lambda: when_back(lambda: boards.publish("a", 1, 2, 3).get()) == [0, 0, 0])
         reading = threading.Thread(target=lambda: frames.append(next(reader)))
         frames: list[rr.StreamFrame] = []
