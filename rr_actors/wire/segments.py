@@ -309,14 +309,16 @@ class Parcels:
         """
         if type(value) is bytes:
             return value
+        large = cast(Large, value)
         try:
-            parcel = self._parcel(cast(Large, value))
-            why = None
+            parcel = self._parcel(large)
         except (OSError, AttributeError, ValueError, OverflowError) as error:  # AttributeError: another system
-            parcel, why = None, error
-        if parcel is not None:
-            return parcel
-        body = cast(Large, value).whole()
+            return self._whole(large, error)
+        return parcel if parcel is not None else self._whole(large, None)
+
+    def _whole(self, value: Large, why: Exception | None) -> bytes:
+        """Return all bytes of a value for which there is no room in a segment, or there can be none: `why`."""
+        body = value.whole()
         if len(body) <= self._segments.frame_limit_bytes or (why is not None and not wanted_by(why)):
             return body
         if why is not None:

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from rr_actors.base.errors import InvalidRequest, NotSerializable
 from rr_actors.base.values.canonical import Codec, encode
+from support_cycles import leaves_cycle
 
 
 class Mode(enum.Enum):
@@ -431,3 +432,11 @@ def test_a_type_that_no_plain_data_can_be_of_is_refused_when_the_codec_is_made(t
 @pytest.mark.parametrize("type_", [Any, object, None, type(None)])
 def test_any_object_and_none_are_types_too(type_: Any) -> None:
     assert Codec(type_).decode(encode(None)) is None
+
+
+def test_a_value_that_names_classes_within_its_type_leaves_nothing_to_the_collector() -> None:
+    codec = Codec(dict[str, Pose])
+    raw = encode({"base": Pose(1.0)})
+    assert codec.decode(raw) == {"base": Pose(1.0)}
+    assert not leaves_cycle(lambda: codec.decode(raw))
+    assert not leaves_cycle(lambda: Codec(None).show(raw))

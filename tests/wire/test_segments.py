@@ -23,6 +23,7 @@ from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, Unavailable
 from rr_actors.wire.segment_slots import PAGE_BYTES
 from rr_actors.wire.segments import Lie, Parcel, Parcels, Segments
+from support_cycles import leaves_cycle
 
 LARGE = pickling.LARGE_BYTES
 
@@ -485,3 +486,8 @@ def test_nothing_is_left_when_both_ends_are_closed_and_the_values_dropped() -> N
     assert memfds() == before
     closed: Parcels = ends.here
     assert type(closed.pack(pickling.dumps_large(box(2**18), "value"))) is bytes
+
+
+def test_a_value_that_goes_through_the_connection_leaves_nothing_to_the_collector() -> None:
+    ends = Ends(limit=0)
+    assert not leaves_cycle(lambda: ends.send(box(2**18)))

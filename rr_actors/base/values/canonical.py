@@ -129,8 +129,11 @@ class Codec:
         try:
             return self._read(bare(raw) if self._has_class else raw)
         except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
-            first = error
-        try:  # perhaps the only reason is that the bytes name classes inside of declared types
+            return self._decode_fitted(raw, server, what, error)
+
+    def _decode_fitted(self, raw: bytes, server: str, what: str, first: Exception) -> Any:
+        """Decode bytes that name classes inside of declared types: perhaps that is the only reason for an error."""
+        try:
             fitted = write_tree(fit(read_tree(raw), self.shape, what))
         except Misfit as misfit:
             _refuse(misfit, server, what, first)
