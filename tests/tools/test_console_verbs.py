@@ -1131,7 +1131,10 @@ def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Regis
     assert any("load shop/thing returned" in line for line in lines)
     entries = [json.loads(line) for line in said("sequence", query.id, "--file", file, "--json").splitlines()]
     assert entries[0]["name"] == "Load"
-    assert "no query or resource" in refused(2, "sequence", "ffffffff", "--file", file)
+    assert "no query, resource or message" in refused(2, "sequence", "ffffffff", "--file", file)
+    assert "Load shop/thing" in said("sequence", "--file", file)
+    assert "Load shop/thing" in said("sequence", "app", "shop", "--file", file)
+    assert "'nobody': the recording has no message of an actor" in refused(2, "sequence", "nobody", "--file", file)
     picture = said("timeline", file)
     assert picture.startswith("<svg")
     assert "loaded  shop/thing {" in picture

@@ -36,7 +36,7 @@ def record(
     ] = None,
     state: StateOption = None,
 ) -> None:
-    """Record the events, exits and callbacks of the system, and the messages between its actors and registrars."""
+    """Record the events, exits, callbacks and messages of the system: of its actors and registrars."""
     count = missed = 0
     with ConsoleClient(find_console(state)) as client:
         sink = RecordingFile(file, client.welcome.system, time.time())
@@ -68,10 +68,7 @@ def sequence(
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw the trace of a load or a message, over all processes, or the messages of actors, as a Mermaid diagram.
-
-    With --json, print the entries.
-    """
+    """Draw a load, a message, or the messages of actors as a Mermaid sequence diagram; with --json, print entries."""
     recording = _recorded(state, seconds) if file is None else read_recording(file)
     if recording.missed:
         say(f"{recording.missed} entries were missed, and are not in it", err=True)

@@ -159,10 +159,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
     },
     "Record what happens": {
         _recording: {
-            "record": "Record the events, exits and callbacks of the system, and the messages between its registrars",
+            "record": "Record the events, exits, callbacks and messages of the system: of its actors and registrars",
             "sequence": (
-                "Draw the trace of a load, over all processes, as a Mermaid sequence diagram; with "
-                "--json, print its entries"
+                "Draw a load, a message, or the messages of actors as a Mermaid sequence diagram; with "
+                "--json, print entries"
             ),
             "timeline": (
                 "Draw what happened: a lane for each child, a bar for each life, marks for events and their reasons"
