@@ -261,6 +261,26 @@ def test_the_checks_go_on_after_the_managers_crash(start: Start, talker: RunProg
         assert not lives(program.response.pid)
 
 
+def test_a_probe_that_ends_its_process_each_time_loses_its_program_alone(start: Start, tmp_path: Path) -> None:
+    sign = tmp_path / "sign"
+
+    def kill_oneself(pid: int) -> bool:
+        if sign.exists():
+            os._exit(3)
+        return True
+
+    health = ProgramHealth(probe="deadly", **OFTEN)
+    _, app = begin(start, probes={"deadly": kill_oneself})
+    deadly = app.load("programs/program", RunProgram("sleep", ("600",), health=health))
+    other = app.load("programs/program", RunProgram("sleep", ("601",)))
+    sign.touch()
+    assert "health" in deadly.wait_status(FATAL, timeout_s=45).message
+    assert (lives(other.response.pid), other.state) == (True, OK)
+    deadly.unload()
+    assert list(running_programs()) == [other.response.pid]
+    other.unload()
+
+
 def test_a_silent_program_is_ended_and_heard_of_whatever_moment_its_manager_is_killed_at(start: Start) -> None:
     """The manager dies while it ends the program: the grace is not over yet."""
     code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True)\n"
