@@ -241,6 +241,7 @@ class TimeLimits:
 # key has a period and a limit of its own: a round has the keys that are due.
 
 _PART_S = 0.05  # between the parts of a round
+_EARLY = 0.1  # of its period: a key that is due so soon is in this round. Thus few rounds have all keys of one period.
 _FEW = 8  # probes that begin together, without being spread
 _SOON_S = 0.005
 
@@ -366,7 +367,8 @@ class Probes:
 
     def _begin_round(self, now: float) -> None:
         self._times = self._keys()
-        due = [key for key in self._times if now >= self._due_at.get(key, now)]
+        early = ((key, now + times.every_s * _EARLY) for key, times in self._times.items())
+        due = [key for key, until in early if until >= self._due_at.get(key, now)]
         self._due_at = {key: self._due_at.get(key, now) for key in self._times}
         self._due_at.update((key, now + self._times[key].every_s) for key in due)
         self._round_s = min(self._look_s, min(self._due_at.values(), default=math.inf) - now)
