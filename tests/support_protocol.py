@@ -53,7 +53,7 @@ class Side:
         self.epoch = 0
         self.timers: dict[str, Any] = {}
         self.told: dict[str, Notice] = {}  # by query: what its listeners were told last
-        self.statuses: dict[str, e.StartStatus] = {}  # by resource: the status callback that runs
+        self.statuses: dict[str, e.StartCallback] = {}  # by resource: the status callback that runs
         self.start()
 
     def start(self) -> None:
@@ -162,14 +162,14 @@ class Script:
                 self.connect(name, registrar)
             case e.Receive(sender, message):
                 self.waiting.append((name, (message, sender)))
-            case e.StartLoad(resource):
+            case e.StartCallback("load", resource):
                 self.say(name, f"runs the load callback of {resource.id}, attempt {resource.attempt}")
-            case e.StartUnload(resource):
+            case e.StartCallback("unload", resource):
                 given = "" if resource.response is None else f" with {resource.response.decode()}"
                 self.say(name, f"runs the unload callback of {resource.id}{given}, try {resource.tries}")
-            case e.StartRecover(resource, reload):
+            case e.StartCallback("recover", resource, reload=reload):
                 self.say(name, f"runs the {'load' if reload else 'recover'} callback of {resource.id} again")
-            case e.StartStatus(resource, notice, _):
+            case e.StartCallback("status", resource, notice) if notice is not None:
                 side.statuses[resource.id] = effect
                 self.say(name, f"runs the status callback of {resource.id}: {status_text(notice)}")
             case e.SetTimer(key, None, _):
@@ -356,25 +356,25 @@ def _finds_gone(script: Script, name: str, other: str) -> None:
 def _load_ends(script: Script, name: str, id: str, how: str, text: str) -> None:
     attempt = script.side(name).catalog.resources[id].attempt
     if how == "returns":
-        script.post(name, c.LoadDone(id, attempt, text.encode()))
+        script.post(name, c.CallbackEnded("load", id, attempt, response=text.encode()))
     else:
-        script.post(name, c.LoadErred(id, attempt, Failure("LoadFailed", text)))
+        script.post(name, c.CallbackEnded("load", id, attempt, Failure("LoadFailed", text)))
 
 
 def _unload_ends(script: Script, name: str, id: str, how: str, text: str | None) -> None:
     tries = script.side(name).catalog.resources[id].tries
     if how == "returns":
-        script.post(name, c.UnloadDone(id, tries))
+        script.post(name, c.CallbackEnded("unload", id, tries))
     else:
-        script.post(name, c.UnloadErred(id, tries, Failure("UnloadFailed", text or "")))
+        script.post(name, c.CallbackEnded("unload", id, tries, Failure("UnloadFailed", text or "")))
 
 
 def _recover_ends(script: Script, name: str, id: str, how: str, text: str) -> None:
     attempt, event = script.side(name).catalog.resources[id].attempt, script.event()
     if how == "returns":
-        script.post(name, c.RecoverDone(id, attempt, text.encode(), event))
+        script.post(name, c.CallbackEnded("recover", id, attempt, response=text.encode(), event=event))
     else:
-        script.post(name, c.RecoverErred(id, attempt, Failure("LoadFailed", text), event))
+        script.post(name, c.CallbackEnded("recover", id, attempt, Failure("LoadFailed", text), event=event))
 
 
 def _says(script: Script, name: str, id: str, state: str, text: str) -> None:
@@ -391,7 +391,7 @@ def _heard(script: Script, name: str, id: str, verb: str) -> None:
 
 def _status_done(script: Script, name: str, id: str, verb: str) -> None:
     start = script.side(name).statuses.pop(id)
-    script.post(name, c.StatusDone(id, start.notice, handled=verb == "handles it"))
+    script.post(name, c.CallbackEnded("status", id, notice=start.notice, handled=verb == "handles it"))
 
 
 def _fires(script: Script, name: str, key: str) -> None:

@@ -373,7 +373,7 @@ def test_the_thread_that_forked_decides_nothing_in_the_child_and_waits_for_nobod
     if child == 0:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(10)  # it would wait for ever
-        os._exit(actor.decide_here(c.LoadDone(id, 1, b"")))
+        os._exit(actor.decide_here(c.CallbackEnded("load", id, 1, response=b"")))
     forked.set()
     holder.join()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

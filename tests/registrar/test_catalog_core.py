@@ -91,8 +91,11 @@ class Registrar:
     def replies(self) -> list[Any]:
         return [effect.message for effect in self.effects if isinstance(effect, e.SendReply)]
 
-    def started(self, kind: type) -> list[str]:
-        return [effect.resource.id for effect in self.effects if isinstance(effect, kind)]
+    def starts(self, role: str) -> list[Any]:
+        return [effect for effect in self.effects if isinstance(effect, e.StartCallback) and effect.role == role]
+
+    def started(self, role: str) -> list[str]:
+        return [start.resource.id for start in self.starts(role)]
 
     def phase(self, id: str = "q") -> Phase | None:
         resource = self.catalog.resources.get(id)
@@ -110,18 +113,18 @@ def provider(phase: str, **server: Any) -> Registrar:
     registrar.decide(Fetch("app", True))
     if phase == "queued":
         registrar.decide(load("old", "other"))
-        registrar.obey(c.LoadDone("old", 1, b"1"))
+        registrar.obey(c.CallbackEnded("load", "old", 1, response=b"1"))
         registrar.decide(Unload("old", "other"))
     registrar.decide(load())
     if phase in ("queued", "loading"):
         return registrar
-    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    registrar.obey(c.CallbackEnded("load", "q", 1, response=b"feed"))
     match phase:
         case "unloading":
             registrar.decide(Unload("q", "app"))
         case "unload_failed":
             registrar.decide(Unload("q", "app"))
-            registrar.obey(c.UnloadErred("q", 1, FAILURE))
+            registrar.obey(c.CallbackEnded("unload", "q", 1, FAILURE))
         case "fatal":
             registrar.obey(c.SetStatus("q", "e", State.FATAL, "", None))
             registrar.decide(NoticesHandled(["e:q"]))
@@ -155,7 +158,7 @@ def test_a_load_sent_again_is_the_same_query(phase: str, answer: Any) -> None:
 
     assert registrar.replies == ([answer] if answer else [])
     assert registrar.catalog.queries == before
-    assert registrar.started(e.StartLoad) == []
+    assert registrar.started("load") == []
 
 
 @pytest.mark.parametrize(
@@ -177,7 +180,7 @@ def test_an_identical_request_of_another_joins_or_begins(phase: str, resource: s
 
     query = registrar.catalog.queries.get("r")
     assert (query.resource_id if query else None) == resource
-    assert bool(registrar.started(e.StartLoad)) is begins
+    assert bool(registrar.started("load")) is begins
 
 
 @pytest.mark.parametrize(
@@ -247,11 +250,11 @@ def test_unregistering_ends_every_phase_and_answers_once(phase: str) -> None:
         for resource in list(registrar.catalog.resources.values()):
             match resource.phase:
                 case Phase.LOADING:
-                    registrar.obey(c.LoadDone(resource.id, resource.attempt, b"x"))
+                    registrar.obey(c.CallbackEnded("load", resource.id, resource.attempt, response=b"x"))
                 case Phase.UNLOADING:
-                    registrar.obey(c.UnloadDone(resource.id, resource.tries))
+                    registrar.obey(c.CallbackEnded("unload", resource.id, resource.tries))
                 case _:
-                    registrar.obey(c.RecoverDone(resource.id, resource.attempt, None, "r"))
+                    registrar.obey(c.CallbackEnded("recover", resource.id, resource.attempt, event="r"))
             answers += [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)]
 
     assert answers == [e.AnswerCall("ticket", None)]
@@ -266,7 +269,7 @@ def test_a_stored_server_goes_with_the_decision_that_answers_its_unregistration(
     registrar.obey(c.Unregister("cam", "event", "ticket"))
     assert "cam" in registrar.catalog.stored_servers
     (resource,) = registrar.catalog.resources.values()
-    registrar.obey(c.UnloadDone(resource.id, resource.tries))
+    registrar.obey(c.CallbackEnded("unload", resource.id, resource.tries))
 
     assert [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)] == [
         e.AnswerCall("ticket", None)
@@ -299,12 +302,7 @@ def test_a_status_is_on_disk_and_on_its_way_in_each_phase(phase: str) -> None:
 
 @pytest.mark.parametrize(
     ("phase", "begins", "attempt", "tries"),
-    [
-        ("loading", e.StartLoad, 2, 0),
-        ("loaded", None, 1, 0),
-        ("unloading", e.StartUnload, 1, 2),
-        ("unload_failed", None, 1, 1),
-    ],
+    [("loading", "load", 2, 0), ("loaded", None, 1, 0), ("unloading", "unload", 1, 2), ("unload_failed", None, 1, 1)],
 )
 def test_what_a_crash_interrupted_runs_again_under_the_next_number(
     phase: str, begins: Any, attempt: int, tries: int
@@ -312,7 +310,7 @@ def test_what_a_crash_interrupted_runs_again_under_the_next_number(
     registrar = provider(phase).again(Server("cam"))
 
     resource = registrar.catalog.resources["q"]
-    assert [type(effect) for effect in registrar.effects if hasattr(effect, "resource")] == ([begins] if begins else [])
+    assert [effect.role for effect in registrar.effects if hasattr(effect, "resource")] == ([begins] if begins else [])
     assert (resource.attempt, resource.tries) == (attempt, tries)
 
 
@@ -321,11 +319,11 @@ def test_a_health_callback_in_whose_runs_three_processes_have_died_loses_its_res
     server = Server("cam", recovery=recovery)
     registrar = provider("loaded", recovery=recovery)
     for deaths in (1, 2, 3):
-        registrar.obey(c.BeginRun("health", "q", "cam"))
+        registrar.obey(c.BeginRun("health", registrar.catalog.resources["q"]))
         if deaths > 1:  # it waits, as it may be innocent
             (timer,) = registrar.effects
             registrar.obey(timer.command)
-        assert [effect.resource_id for effect in registrar.effects if isinstance(effect, e.StartRun)] == ["q"]
+        assert registrar.started("health") == ["q"]
         registrar = registrar.again(server)
         assert registrar.catalog.callback_runs["health:q"].deaths == deaths
 
@@ -335,8 +333,8 @@ def test_a_health_callback_in_whose_runs_three_processes_have_died_loses_its_res
 def test_a_health_callback_that_has_returned_is_not_blamed_for_the_death_of_its_process() -> None:
     registrar = provider("loaded")
     for _ in range(5):
-        registrar.obey(c.BeginRun("health", "q", "cam"))
-        registrar.obey(c.RunEnded("health", "q"))
+        registrar.obey(c.BeginRun("health", registrar.catalog.resources["q"]))
+        registrar.obey(c.CallbackEnded("health", "q"))
         registrar = registrar.again(Server("cam"))
 
     assert registrar.catalog.callback_runs == {}
@@ -345,10 +343,10 @@ def test_a_health_callback_that_has_returned_is_not_blamed_for_the_death_of_its_
 
 def test_a_health_callback_is_innocent_if_the_process_dies_without_it() -> None:
     registrar = provider("loaded")
-    registrar.obey(c.BeginRun("health", "q", "cam"))
+    registrar.obey(c.BeginRun("health", registrar.catalog.resources["q"]))
     registrar = registrar.again(Server("cam"))
     assert registrar.catalog.callback_runs["health:q"].deaths == 1
-    (timer,) = registrar.obey(c.BeginRun("health", "q", "cam"))
+    (timer,) = registrar.obey(c.BeginRun("health", registrar.catalog.resources["q"]))
     assert isinstance(timer, e.SetTimer)
     registrar = registrar.again(Server("cam"))  # it dies while the callback waits
     assert registrar.catalog.callback_runs == {}
@@ -357,30 +355,32 @@ def test_a_health_callback_is_innocent_if_the_process_dies_without_it() -> None:
 def test_a_death_counts_when_all_callbacks_that_ran_have_ended_in_the_next_process() -> None:
     registrar = provider("loaded")
     registrar.decide(Load("r", "cam", b"rear", "app", "", 0, 2))
-    registrar.obey(c.BeginRun("usage", "q", "cam"))
+    registrar.obey(c.BeginRun("usage", registrar.catalog.resources["q"]))
     registrar = registrar.again(Server("cam"))
-    assert e.Acquitted() not in registrar.obey(c.LoadDone("r", 2, b"feed"))
-    registrar.obey(c.BeginRun("usage", "q", "cam"))
-    assert e.Acquitted() in registrar.obey(c.RunEnded("usage", "q"))
+    assert e.Acquitted() not in registrar.obey(c.CallbackEnded("load", "r", 2, response=b"feed"))
+    registrar.obey(c.BeginRun("usage", registrar.catalog.resources["q"]))
+    assert e.Acquitted() in registrar.obey(c.CallbackEnded("usage", "q"))
 
 
-BOTH_PROBED = [(c.BeginRun("health", id, "cam", waited=True), None) for id in "qr"]
+def both_probed(registrar: Registrar) -> list[Item]:
+    resources = registrar.catalog.resources.values()
+    return [(c.BeginRun("health", resource, waited=True), None) for resource in resources]
 
 
 def test_after_two_deaths_health_callbacks_run_one_after_another_until_the_one_that_kills_is_found() -> None:
     registrar = provider("loaded")
     registrar.decide(Load("r", "cam", b"rear", "app", "", 0, 2))
-    registrar.obey(c.LoadDone("r", 1, b"feed"))
+    registrar.obey(c.CallbackEnded("load", "r", 1, response=b"feed"))
     for _ in range(2):
-        registrar.together(*BOTH_PROBED)
-        assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartRun)] == ["q", "r"]
+        registrar.together(*both_probed(registrar))
+        assert registrar.started("health") == ["q", "r"]
         registrar = registrar.again(Server("cam"))
 
-    registrar.together(*BOTH_PROBED)
-    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartRun)] == ["q"]
-    registrar.obey(c.RunEnded("health", "q"))
+    registrar.together(*both_probed(registrar))
+    assert registrar.started("health") == ["q"]
+    registrar.obey(c.CallbackEnded("health", "q"))
     registrar.obey(c.BeginTrial("health:r"))
-    assert [it.resource_id for it in registrar.effects if isinstance(it, e.StartRun)] == ["r"]
+    assert registrar.started("health") == ["r"]
     registrar = registrar.again(Server("cam"))
 
     states = {id: resource.state for id, resource in registrar.catalog.resources.items()}
@@ -397,28 +397,28 @@ def test_what_an_interrupted_reload_had_loaded_goes_with_a_resource_that_is_fata
 
     registrar = registrar.again(server)
 
-    assert registrar.started(e.StartRecover) == []
+    assert registrar.started("recover") == []
     assert registrar.catalog.parts_of("q") == ["part"]
     registrar.decide(Unload("q", "app"))
-    registrar.obey(c.UnloadDone("q", 1))
+    registrar.obey(c.CallbackEnded("unload", "q", 1))
     assert registrar.catalog.held["part"].hold is Hold.OWED
 
 
 def test_the_end_of_an_interrupted_run_is_not_taken_for_the_present_ones() -> None:
     registrar = provider("loading").again(Server("cam"))
 
-    assert registrar.obey(c.LoadDone("q", 1, b"stale")) == []
+    assert registrar.obey(c.CallbackEnded("load", "q", 1, response=b"stale")) == []
     assert registrar.phase() is Phase.LOADING
 
 
 def test_a_refused_load_is_refused_again_and_does_not_run_again() -> None:
     registrar = provider("loading")
-    registrar.obey(c.LoadErred("q", 1, FAILURE))
+    registrar.obey(c.CallbackEnded("load", "q", 1, FAILURE))
 
     registrar.decide(load())
 
     assert registrar.replies == [LoadRefused("q", FAILURE)]
-    assert registrar.started(e.StartLoad) == []
+    assert registrar.started("load") == []
 
 
 def test_a_load_that_comes_behind_its_own_withdrawal_is_refused() -> None:
@@ -436,9 +436,9 @@ def test_a_queued_load_that_became_fatal_still_begins_when_its_turn_comes() -> N
     registrar = provider("queued")
     registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
 
-    registrar.obey(c.UnloadDone("old", 1))
+    registrar.obey(c.CallbackEnded("unload", "old", 1))
 
-    assert registrar.started(e.StartLoad) == ["q"]
+    assert registrar.started("load") == ["q"]
 
 
 def test_a_resource_that_takes_an_id_in_use_gets_one_of_its_own() -> None:
@@ -1029,7 +1029,7 @@ def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
     registrar.begin_again()
     refusals = registrar.replies
     registrar.together((c.Register(Server("cam"), "event"), None), (c.BeginServing("event"), None))
-    assert registrar.started(e.StartUnload) == ["q"]
+    assert registrar.started("unload") == ["q"]
     part = FetchedQuery("part", "zoom", "res", b"", b"x", "q", asked.attempt, asked.seq, "OK")
     registrar.obey(c.Reconcile("lens", [part], "r"))
 
@@ -1130,11 +1130,11 @@ def test_own_statuses_wait_for_a_status_callback_up_to_a_bound_also_while_the_re
     behind = said_to(registrar, "WWWFWWWWW")
     assert [start.notice.event for start in registrar.catalog.deferred["q"]] == ["s0", "s1"]
     assert [effect.dropped for effect in behind] == [1, 1, 1]
-    registrar.obey(c.RecoverDone("q", 1, None, "r"))
-    runs = [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    registrar.obey(c.CallbackEnded("recover", "q", 1, event="r"))
+    runs = [start.notice for start in registrar.starts("status")]
     for notice in runs:  # it grows
-        registrar.obey(c.StatusDone("q", notice, handled=False))
-        runs += [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+        registrar.obey(c.CallbackEnded("status", "q", notice=notice, handled=False))
+        runs += [start.notice for start in registrar.starts("status")]
     assert [notice.event for notice in runs] == ["s0", "s1", "s3", "s6", "s7", "s8"]
     assert registrar.catalog.late == registrar.catalog.deferred == registrar.catalog.own_notices == {}
 
@@ -1161,7 +1161,7 @@ def test_a_status_that_a_part_brings_again_takes_no_second_place_in_the_window()
     registrar.decide(load())
     registrar.ask("part", "lens", "zoom", b"", "q")
     registrar.decide(Loaded("part", "res", b"x"), "lens")
-    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    registrar.obey(c.CallbackEnded("load", "q", 1, response=b"feed"))
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
     registrar.obey(c.SetStatus("q", "t", State.ERROR, "hotter", None))
 
@@ -1196,7 +1196,7 @@ def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not
     registrar.decide(load())
     registrar.ask("part", "lens", "zoom", b"", "q")
     registrar.decide(Loaded("part", "res", b"x"), "lens")
-    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    registrar.obey(c.CallbackEnded("load", "q", 1, response=b"feed"))
     if listened:
         registrar.catalog.listened.add(listened)
     notice = Notice("s:part", "part", "p", "res", "s", State.WARNING, "hot", "lens/zoom")
@@ -1204,17 +1204,17 @@ def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not
     registrar.decide(Noticed(notice), "lens")
     if listened is None:
         assert [reply.notice.query_id for reply in registrar.replies] == ["q"]
-        assert registrar.started(e.StartStatus) == []
+        assert registrar.started("status") == []
         return
     assert [type(effect) for effect in registrar.effects] == [e.Hear]
 
     registrar.obey(c.Heard("part", "s", handled))
     if handled:
-        assert registrar.started(e.StartStatus) == []
+        assert registrar.started("status") == []
     else:
         assert requests(registrar) == []
-        assert registrar.started(e.StartStatus) == ["q"]
-        registrar.obey(c.StatusDone("q", notice, handled=False))
+        assert registrar.started("status") == ["q"]
+        registrar.obey(c.CallbackEnded("status", "q", notice=notice, handled=False))
     assert [reply.notice.query_id for reply in registrar.replies] == ([] if handled else ["q"])
     assert requests(registrar) == [NoticesHandled(["s:part"])]
 
@@ -1239,19 +1239,19 @@ def test_a_status_goes_to_the_status_callback_of_its_own_server_first_and_then_t
 
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", "ticket"))
     assert registrar.effects[-2:] == [
-        e.StartStatus(registrar.catalog.resources["q"], own(), repeated=False),
+        e.StartCallback("status", registrar.catalog.resources["q"], own()),
         e.AnswerCall("ticket", None),
     ]
     assert Put(own()) in registrar.changes
     assert told(registrar) == []
     assert registrar.catalog.resources["q"].state is State.WARNING
 
-    registrar.obey(c.StatusDone("q", own(), handled))
+    registrar.obey(c.CallbackEnded("status", "q", notice=own(), handled=handled))
     assert told(registrar) == ([] if handled else [("q", State.WARNING)])
     assert Drop("notices", "s:") in registrar.changes
     assert registrar.catalog.own_notices == {}
 
-    registrar.obey(c.StatusDone("q", own(), handled=False))
+    registrar.obey(c.CallbackEnded("status", "q", notice=own(), handled=False))
     assert registrar.effects == []
 
 
@@ -1259,18 +1259,18 @@ def test_what_a_status_callback_says_of_its_own_resource_goes_to_the_holders_at_
     registrar = provider("loaded", has_status=True)
     registrar.obey(c.SetStatus("q", "s", State.OK, "again", None, callback_of="q"))
     assert told(registrar) == [("q", State.OK)]
-    assert registrar.started(e.StartStatus) == []
+    assert registrar.started("status") == []
     registrar.obey(c.SetResponse("q", "r", b"new", "", None, callback_of="q"))
     assert told(registrar) == [("q", State.UPDATE)]
     registrar.obey(c.SetStatus("q", "t", State.OK, "", None, callback_of="another"))
-    assert registrar.started(e.StartStatus) == ["q"]
+    assert registrar.started("status") == ["q"]
 
 
 def test_a_new_response_reaches_the_holders_whatever_the_status_callback_says_of_it() -> None:
     registrar = provider("loaded", has_status=True)
     registrar.obey(c.SetResponse("q", "r", b"new", "", None))
     registrar.obey(c.SetResponse("q", "later", b"newest", "", None, callback_of="q"))
-    registrar.obey(c.StatusDone("q", own("r", State.UPDATE, "", b"new"), handled=True))
+    registrar.obey(c.CallbackEnded("status", "q", notice=own("r", State.UPDATE, "", b"new"), handled=True))
     (noticed,) = registrar.replies
     assert noticed.notice.response == b"newest"
     assert registrar.catalog.resources["q"].response == b"newest"
@@ -1297,15 +1297,15 @@ def test_what_never_had_a_response_is_not_given_one_by_its_owner(phase: str) -> 
 def test_after_a_crash_a_status_callback_that_had_not_run_to_its_end_runs_again(phase: str) -> None:
     registrar = provider(phase, has_status=True)
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
-    assert registrar.started(e.StartStatus) == (["q"] if phase == "loaded" else [])
+    assert registrar.started("status") == (["q"] if phase == "loaded" else [])
 
     again = registrar.again(Server("cam", has_status=True))
 
     if phase == "loaded":
-        (start,) = [effect for effect in again.effects if isinstance(effect, e.StartStatus)]
+        (start,) = again.starts("status")
         assert (start.notice, start.repeated) == (own(), True)
     else:
-        assert again.started(e.StartStatus) == []
+        assert again.started("status") == []
         assert list(again.catalog.deferred) == ["q"]
 
 
@@ -1317,7 +1317,7 @@ def test_a_window_of_own_statuses_is_given_to_the_status_callback_and_the_next_f
     registrar = provider("loaded", has_status=True)
 
     def started() -> list[Notice]:
-        return [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+        return [start.notice for start in registrar.starts("status")]
 
     runs: list[Notice] = []
     for number in range(9):
@@ -1330,7 +1330,7 @@ def test_a_window_of_own_statuses_is_given_to_the_status_callback_and_the_next_f
         assert [notice.event for notice in runs] == ["s0", "s1", "s2", "s3"]
     for done in range(9):
         assert len(runs) - done <= 4
-        registrar.obey(c.StatusDone("q", runs[done], handled=False))
+        registrar.obey(c.CallbackEnded("status", "q", notice=runs[done], handled=False))
         runs += started()
     assert [notice.event for notice in runs] == [f"s{number}" for number in range(9)]
     assert registrar.catalog.late == registrar.catalog.statuses == registrar.catalog.own_notices == {}
@@ -1342,15 +1342,15 @@ def test_a_status_callback_that_runs_while_its_server_is_registered_anew_is_not_
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
     if crash:
         registrar = registrar.again(Server("cam", has_status=True))
-    assert registrar.started(e.StartStatus) == ["q"]
+    assert registrar.started("status") == ["q"]
     registrar.obey(c.Unregister("cam", "event", None))
-    registrar.obey(c.UnloadErred("q", registrar.catalog.resources["q"].tries, FAILURE))
+    registrar.obey(c.CallbackEnded("unload", "q", registrar.catalog.resources["q"].tries, FAILURE))
     assert "cam" not in registrar.catalog.servers
 
     registrar.obey(c.Register(Server("cam", has_status=True), "event"))
-    assert registrar.started(e.StartStatus) == []
+    assert registrar.started("status") == []
     assert list(registrar.catalog.own_notices) == ["q"]
-    registrar.obey(c.StatusDone("q", own(), handled=False))
+    registrar.obey(c.CallbackEnded("status", "q", notice=own(), handled=False))
     assert registrar.catalog.own_notices == {}
 
 
@@ -1363,7 +1363,7 @@ def test_who_releases_a_resource_whose_server_is_missing_hears_how_the_unload_en
 
     registrar.obey(c.Register(Server("cam"), "event"))
     tries = registrar.catalog.resources["q"].tries
-    registrar.obey(c.UnloadErred("q", tries, FAILURE) if fails else c.UnloadDone("q", tries))
+    registrar.obey(c.CallbackEnded("unload", "q", tries, FAILURE) if fails else c.CallbackEnded("unload", "q", tries))
     assert registrar.replies == [UnloadRefused("q", FAILURE) if fails else Unloaded("q")]
     assert registrar.catalog.unanswered == {}
 
@@ -1384,16 +1384,16 @@ def test_what_a_holder_passed_over_does_not_wait_before_the_word_that_its_query_
 def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
     registrar = provider(phase, has_status=True)
     if phase == "fatal":
-        registrar.obey(c.StatusDone("q", own("e", State.FATAL, ""), handled=False))
+        registrar.obey(c.CallbackEnded("status", "q", notice=own("e", State.FATAL, ""), handled=False))
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
     assert list(registrar.catalog.own_notices) == ["q"]
     registrar.obey(c.ForceUnload("q", "f", None))
     for _ in range(3):  # what runs comes to its end
         resource = registrar.catalog.resources.get("q")
         if resource is not None:
-            registrar.obey(c.RecoverDone("q", resource.attempt, None, "r"))
-            registrar.obey(c.LoadDone("q", resource.attempt, b"feed"))
-            registrar.obey(c.UnloadDone("q", registrar.catalog.resources["q"].tries))
+            registrar.obey(c.CallbackEnded("recover", "q", resource.attempt, event="r"))
+            registrar.obey(c.CallbackEnded("load", "q", resource.attempt, response=b"feed"))
+            registrar.obey(c.CallbackEnded("unload", "q", registrar.catalog.resources["q"].tries))
     assert registrar.phase() is None
     assert registrar.catalog.own_notices == {}
     assert registrar.catalog.deferred == {}
@@ -1427,11 +1427,15 @@ def test_what_a_part_says_waits_until_the_load_or_recover_callback_has_returned(
     assert (requests(registrar), told(registrar)) == ([], [])
 
     attempt = registrar.catalog.resources["q"].attempt
-    registrar.obey(c.LoadDone("q", attempt, b"feed") if phase == "loading" else c.RecoverDone("q", attempt, None, "r"))
+    registrar.obey(
+        c.CallbackEnded("load", "q", attempt, response=b"feed")
+        if phase == "loading"
+        else c.CallbackEnded("recover", "q", attempt, event="r")
+    )
 
-    started = [effect.notice.event for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    started = [start.notice.event for start in registrar.starts("status")]
     assert started == ["s", "later"]
-    registrar.obey(c.StatusDone("q", of_part().notice, handled=False))
+    registrar.obey(c.CallbackEnded("status", "q", notice=of_part().notice, handled=False))
     assert told(registrar) == [("q", State.WARNING)]
     assert requests(registrar) == [NoticesHandled(["s:part"])]
 
@@ -1443,8 +1447,8 @@ def test_who_listens_to_a_part_hears_at_once_and_may_deal_with_it_for_the_resour
     assert [type(effect) for effect in registrar.effects] == [e.Hear]
     registrar.obey(c.Heard("part", "s", handled=True))
     assert requests(registrar) == [NoticesHandled(["s:part"])]
-    registrar.obey(c.LoadDone("q", 1, b"feed"))
-    assert registrar.started(e.StartStatus) == []
+    registrar.obey(c.CallbackEnded("load", "q", 1, response=b"feed"))
+    assert registrar.started("status") == []
 
 
 def test_what_a_part_has_said_to_a_load_that_fails_is_acknowledged() -> None:
@@ -1452,7 +1456,7 @@ def test_what_a_part_has_said_to_a_load_that_fails_is_acknowledged() -> None:
     registrar.decide(of_part(), "lens")
     registrar.obey(c.Heard("part", "s"))
     registrar.obey(c.SetStatus("q", "own", State.WARNING, "hot", None))
-    registrar.obey(c.LoadErred("q", 1, FAILURE))
+    registrar.obey(c.CallbackEnded("load", "q", 1, FAILURE))
     assert NoticesHandled(["s:part"]) in requests(registrar)
     assert registrar.catalog.hearing == registrar.catalog.deferred == registrar.catalog.own_notices == {}
 
@@ -1464,8 +1468,8 @@ def test_a_part_that_is_taken_away_while_the_whole_loads_is_dropped_when_the_who
     registrar.decide(gone, "lens")
     registrar.obey(c.Heard("part", "s"))
     assert "part" in registrar.catalog.held
-    registrar.obey(c.LoadDone("q", 1, b"feed"))
-    registrar.obey(c.StatusDone("q", gone.notice, handled=True))
+    registrar.obey(c.CallbackEnded("load", "q", 1, response=b"feed"))
+    registrar.obey(c.CallbackEnded("status", "q", notice=gone.notice, handled=True))
     assert "part" not in registrar.catalog.held
     assert requests(registrar) == [NoticesHandled(["s:part"])]
 
@@ -1485,23 +1489,23 @@ def test_an_interrupted_load_that_was_withdrawn_is_cleaned_up_and_not_run_again(
 
     registrar.obey(c.Register(Server("cam"), "event"))
 
-    (start,) = [effect for effect in registrar.effects if isinstance(effect, (e.StartLoad, e.StartUnload))]
-    assert isinstance(start, e.StartUnload)
+    (start,) = [effect for effect in registrar.effects if isinstance(effect, e.StartCallback)]
+    assert start.role == "unload"
     assert (start.resource.response, start.resource.attempt, start.resource.tries) == (None, 2, 1)
     registrar.decide(load("new", "other"), "other")
     assert registrar.phase("new.2") is Phase.QUEUED
-    registrar.obey(c.UnloadDone("q", 1))
-    assert registrar.started(e.StartLoad) == ["new.2"]
+    registrar.obey(c.CallbackEnded("unload", "q", 1))
+    assert registrar.started("load") == ["new.2"]
 
 
 def test_an_interrupted_load_that_somebody_holds_is_run_again_once() -> None:
     registrar = provider("loading").again(Server("cam"))
-    assert registrar.started(e.StartLoad) == ["q"]
+    assert registrar.started("load") == ["q"]
     assert registrar.catalog.resources["q"].attempt == 2
 
     registrar.decide(load(), "app")
     registrar.decide(load("s", "other"), "other")
-    assert registrar.started(e.StartLoad) == []
+    assert registrar.started("load") == []
 
 
 def test_a_crash_before_an_interrupted_load_has_begun_again_is_not_an_attempt() -> None:
@@ -1527,9 +1531,9 @@ def test_an_interrupted_load_whose_last_holder_goes_before_its_server_is_there_i
         case _:
             registrar.obey(c.ForceUnload("q", "f", "ticket"))
     registrar.obey(c.Register(Server("cam"), "event"))
-    assert registrar.started(e.StartUnload) == ["q"]
+    assert registrar.started("unload") == ["q"]
     assert registrar.catalog.resources["q"].response is None
-    registrar.obey(c.UnloadDone("q", 1))
+    registrar.obey(c.CallbackEnded("unload", "q", 1))
     assert registrar.catalog.resources == {}
     answers = [effect for effect in registrar.effects if isinstance(effect, e.AnswerCall)]
     assert len(answers) == (1 if how == "forced" else 0)
@@ -1712,7 +1716,7 @@ def test_a_swap_is_one_commit_and_the_holders_hear_the_new_response_from_it() ->
     assert registrar.catalog.parts_of("q") == ["spare"]
     assert requests(registrar) == [Unload("part", "p"), Unload("older", "p")]
     assert told(registrar) == [("q", State.UPDATE)]
-    assert registrar.started(e.StartStatus) == []  # it is the callback that says so
+    assert registrar.started("status") == []  # it is the callback that says so
     assert registrar.effects[-1] == e.AnswerCall("ticket", None)
 
 
@@ -1723,7 +1727,7 @@ def called_lost() -> Registrar:
 
 
 def own_fatal(registrar: Registrar) -> Notice:
-    (notice,) = [effect.notice for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    (notice,) = [start.notice for start in registrar.starts("status")]
     return notice
 
 
@@ -1732,7 +1736,7 @@ def test_a_resource_whose_part_is_swapped_while_its_callback_hears_its_fatal_is_
     notice = own_fatal(registrar)
     assert registrar.catalog.joinable("cam", b"front") is None
     registrar.obey(SWAP)
-    registrar.obey(c.StatusDone("q", notice, handled=True))
+    registrar.obey(c.CallbackEnded("status", "q", notice=notice, handled=True))
     assert registrar.catalog.resources["q"].state is State.UPDATE
     assert registrar.catalog.joinable("cam", b"front") == "q"
     assert told(registrar) == []
@@ -1742,14 +1746,14 @@ def test_a_fatal_that_its_callback_does_not_handle_after_a_swap_is_final() -> No
     registrar = called_lost()
     notice = own_fatal(registrar)
     registrar.obey(SWAP)
-    registrar.obey(c.StatusDone("q", notice, handled=False))
+    registrar.obey(c.CallbackEnded("status", "q", notice=notice, handled=False))
     assert registrar.catalog.resources["q"].state is State.FATAL
     assert told(registrar) == [("q", State.FATAL)]
 
 
 def test_a_resource_whose_holders_have_heard_fatal_stays_fatal_when_its_part_is_swapped() -> None:
     registrar = called_lost()
-    registrar.obey(c.StatusDone("q", own_fatal(registrar), handled=False))
+    registrar.obey(c.CallbackEnded("status", "q", notice=own_fatal(registrar), handled=False))
     registrar.obey(SWAP)
     assert registrar.catalog.resources["q"].state is State.FATAL
 
@@ -1774,7 +1778,7 @@ def test_what_is_said_of_a_part_that_was_swapped_concerns_nobody() -> None:
     registrar = with_spares()
     registrar.obey(SWAP)
     registrar.decide(Noticed(Notice("n", "part", "p", "res part", "f", State.FATAL, "", "lens/zoom"), True), "lens")
-    assert [effect for effect in registrar.effects if isinstance(effect, (e.Hear, e.StartStatus))] == []
+    assert [effect for effect in registrar.effects if isinstance(effect, (e.Hear, e.StartCallback))] == []
 
 
 @pytest.mark.parametrize("gone", ["part", "spare", "q"])
@@ -1809,7 +1813,7 @@ def test_after_a_crash_the_provider_answers_a_spare_that_is_asked_for_again_with
     lens = Registrar("lens", Server("zoom"))
     ask = Load("spare", "zoom", b"", "p", "q", 1, 1)
     lens.decide(ask, "p")
-    lens.obey(c.LoadDone("spare", 1, b"x"))
+    lens.obey(c.CallbackEnded("load", "spare", 1, response=b"x"))
     lens.decide(msgspec.structs.replace(ask, seq=99), "p")
     assert lens.replies == [Loaded("spare", "spare", b"x")]
     assert list(lens.catalog.queries) == ["spare"]
@@ -1839,7 +1843,7 @@ def test_a_part_that_a_thread_holds_by_the_fast_path_is_the_part_that_is_decided
 
 def test_a_callback_that_raises_withdraws_what_is_in_flight_and_its_late_answer_brings_nothing_back() -> None:
     registrar = building()
-    registrar.obey(c.LoadErred("r", 1, FAILURE))
+    registrar.obey(c.CallbackEnded("load", "r", 1, FAILURE))
     assert registrar.catalog.in_flight == {}
     assert hold_of(registrar) is Hold.OWED
     assert Put(registrar.catalog.held["q"]) in registrar.changes
@@ -1914,7 +1918,7 @@ def test_a_resource_that_could_not_be_unloaded_wants_the_same_of_its_parts_witho
     cam = Server("cam", pauses=True)
     registrar = provider("loaded", pauses=True)
     registrar.obey(c.Unregister("cam", "event", 1))
-    registrar.obey(c.UnloadErred("q", 1, FAILURE))
+    registrar.obey(c.CallbackEnded("unload", "q", 1, FAILURE))
     assert registrar.phase() is Phase.UNLOAD_FAILED
     without = registrar.catalog.inherited("q")
     registrar.obey(c.Register(cam, "event"))

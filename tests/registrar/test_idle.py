@@ -487,10 +487,10 @@ class Resting:
         self.obey(c.Reconcile("parts", [], "event"))
         self.obey(c.AskProvider("part", "parts", "lens", b"", "q", 2))
         self.tell(Loaded("part", "lens", b"glass"), "parts")
-        self.obey(c.LoadDone("q", 1, b"feed"))
+        self.obey(c.CallbackEnded("load", "q", 1, response=b"feed"))
         self.tell(Reprioritise("q", "app", STANDBY))
         self.obey(c.LingerOver("q"))
-        self.obey(c.PauseDone("q", 1))
+        self.obey(c.CallbackEnded("pause", "q", 1))
         self.effects = self.tell(Load("next", "cam", b"front", "app", "", 0, 3))
 
     def obey(self, command: c.Command) -> list[Any]:
@@ -532,7 +532,8 @@ def test_a_resumption_that_waits_for_a_part_does_not_begin_for_what_is_lost(comm
         it.message.query_id for it in effects if isinstance(it, e.SendReply) and isinstance(it.message, LoadRefused)
     ]
     assert (world.phase(), refused) == (phase, ["next"])
-    assert not any(isinstance(it, e.StartResume) for it in effects + world.tell(Reprioritised("part", 0), "parts"))
+    after = effects + world.tell(Reprioritised("part", 0), "parts")
+    assert "resume" not in [it.role for it in after if isinstance(it, e.StartCallback)]
 
 
 def test_a_load_that_waits_for_a_resumption_is_answered_after_it_also_over_a_new_link() -> None:

@@ -33,7 +33,7 @@ def whole_of(parts: int) -> tuple[Catalog, list[Any]]:
     catalog = Catalog("shop", content_of(rows))
     catalog.up["parts"] = 1
     decide(catalog, [(c.Register(Server("car"), "event"), None)])
-    return catalog, decide(catalog, [(c.UnloadDone("r", 1), None)]).effects
+    return catalog, decide(catalog, [(c.CallbackEnded("unload", "r", 1), None)]).effects
 
 
 def release_next(catalog: Catalog, effects: list[Any]) -> list[Any]:

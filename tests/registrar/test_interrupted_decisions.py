@@ -70,24 +70,22 @@ ASKED = tell(c.AskProvider("mine", "p", "cam", b"front", "", (1 << 32) + 1))
 UP = tell(c.Reconcile("p", [], "event", [], 1))
 HELD = tell(Loaded("mine", "r", b"feed"), "p")
 NOTICE = Notice("n", "mine", "me", "r", "event", State.ERROR, "", "p/cam")
-ERRED = c.LoadErred("q", 1, Failure("LoadFailed", "no such device"))
+LOADED = c.CallbackEnded("load", "q", 1, response=b"feed")
+ERRED = c.CallbackEnded("load", "q", 1, Failure("LoadFailed", "no such device"))
 
 # What had happened before, and what is interrupted.
 SCENES: dict[str, tuple[list[Item], Item]] = {
     "a first load": ([CAM], tell(load("q"), "app")),
-    "a load that has succeeded": ([CAM, tell(load("q"), "app")], tell(c.LoadDone("q", 1, b"feed"))),
+    "a load that has succeeded": ([CAM, tell(load("q"), "app")], tell(LOADED)),
     "a load that has failed": ([CAM, tell(load("q"), "app")], tell(ERRED)),
-    "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], tell(load("r"), "app")),
-    "a last unload": (
-        [CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))],
-        tell(Unload("q", "app"), "app"),
-    ),
+    "a join": ([CAM, tell(load("q"), "app"), tell(LOADED)], tell(load("r"), "app")),
+    "a last unload": ([CAM, tell(load("q"), "app"), tell(LOADED)], tell(Unload("q", "app"), "app")),
     "an unload that is done": (
-        [CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed")), tell(Unload("q", "app"), "app")],
-        tell(c.UnloadDone("q", 1)),
+        [CAM, tell(load("q"), "app"), tell(LOADED), tell(Unload("q", "app"), "app")],
+        tell(c.CallbackEnded("unload", "q", 1)),
     ),
     "a status": (
-        [CAM, tell(Fetch("app", True), "app"), tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))],
+        [CAM, tell(Fetch("app", True), "app"), tell(load("q"), "app"), tell(LOADED)],
         tell(c.SetStatus("q", "e", State.FATAL, "", "ticket")),
     ),
     "a load of its own": ([UP], ASKED),
@@ -272,8 +270,8 @@ def leaves(state: RegistrarState) -> None:
 
 # What had happened before by decisions, and by threads; and what is interrupted.
 QUICK: dict[str, tuple[list[Any], list[Any], Callable[[RegistrarState], None]]] = {
-    "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [], joins),
-    "an unload that leaves others": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [joins], leaves),
+    "a join": ([CAM, tell(load("q"), "app"), tell(LOADED)], [], joins),
+    "an unload that leaves others": ([CAM, tell(load("q"), "app"), tell(LOADED)], [joins], leaves),
     "a load by line": ([UP], [begins], holds),
     "a release by line": ([UP], [begins, holds], owes),
     "a release by line of what is on disk": ([UP], [begins, holds, saves], owes),

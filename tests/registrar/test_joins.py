@@ -48,7 +48,7 @@ def catalog(*servers: Server) -> Catalog:
     for server in servers or (Server("cam"),):
         decide(catalog, [(c.Register(server, "event"), None)])
     decide(catalog, [(ask("q"), "app")])
-    decide(catalog, [(c.LoadDone("q", 1, b"feed"), None)])
+    decide(catalog, [(c.CallbackEnded("load", "q", 1, response=b"feed"), None)])
     return catalog
 
 
@@ -70,8 +70,8 @@ STEPS = st.lists(
             st.just(1),
         ),
         st.builds(Unload, st.sampled_from("abcd"), st.sampled_from(("app", "bpp"))),
-        st.builds(c.LoadDone, st.sampled_from("abcd"), st.just(1), st.just(b"feed")),
-        st.builds(c.UnloadDone, st.sampled_from("abcd"), st.sampled_from((1, 2))),
+        st.builds(c.CallbackEnded, st.just("load"), st.sampled_from("abcd"), st.just(1), response=st.just(b"feed")),
+        st.builds(c.CallbackEnded, st.just("unload"), st.sampled_from("abcd"), st.sampled_from((1, 2))),
         st.builds(
             c.SetStatus, st.sampled_from("abcd"), st.just("e"), st.sampled_from(rr.State), st.just(""), st.just("t")
         ),
@@ -130,7 +130,7 @@ def leaving(provider: Catalog) -> None:
 
 def not_to_be_unloaded(provider: Catalog) -> None:
     let_go(provider)
-    decide(provider, [(c.UnloadErred("q", 1, Failure("UnloadFailed", "busy")), None)])
+    decide(provider, [(c.CallbackEnded("unload", "q", 1, Failure("UnloadFailed", "busy")), None)])
 
 
 @pytest.mark.parametrize("meanwhile", [let_go, fatal, leaving, not_to_be_unloaded])

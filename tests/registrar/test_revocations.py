@@ -113,7 +113,7 @@ class Served:
         self.obey(c.Register(Server("cam"), "event"))
         self.tell(Fetch("app", True))
         self.tell(load("q"))
-        self.obey(c.LoadDone("q", 1, b"feed"))
+        self.obey(c.CallbackEnded("load", "q", 1, response=b"feed"))
 
     def obey(self, command: c.Command) -> list[Any]:
         return self._decide(command, None)
@@ -146,7 +146,7 @@ def test_a_request_for_what_is_revoked_waits_until_it_is_gone() -> None:
     assert (registrar.phase(), registrar.phase("next")) == (Phase.LOADED, Phase.QUEUED)
     registrar.tell(Unload("q", "app"))
     assert registrar.phase("next") is Phase.QUEUED
-    registrar.obey(c.UnloadDone("q", 1))
+    registrar.obey(c.CallbackEnded("unload", "q", 1))
     assert (registrar.phase(), registrar.phase("next")) == (None, Phase.LOADING)
     assert not registrar.catalog.revocations
 
@@ -187,7 +187,7 @@ def test_an_unload_that_fails_ends_the_revocation_and_is_the_answer() -> None:
     registrar.obey(REVOKE)
     registrar.tell(Unload("q", "app"))
     failure = Failure("UnloadFailed", "stuck")
-    effects = registrar.obey(c.UnloadErred("q", 1, failure))
+    effects = registrar.obey(c.CallbackEnded("unload", "q", 1, failure))
     assert e.AnswerCall("ticket", failure) in effects
     assert not registrar.catalog.revocations
     assert registrar.phase() is Phase.UNLOAD_FAILED
@@ -207,9 +207,9 @@ def test_a_release_that_failed_is_sent_again_when_its_resource_is_revoked() -> N
 def test_what_nobody_holds_and_could_not_be_unloaded_is_tried_again() -> None:
     registrar = Served()
     registrar.tell(Unload("q", "app"))
-    registrar.obey(c.UnloadErred("q", 1, Failure("UnloadFailed", "stuck")))
+    registrar.obey(c.CallbackEnded("unload", "q", 1, Failure("UnloadFailed", "stuck")))
     registrar.tell(Gone("app"))
-    registrar.obey(c.UnloadErred("q", 2, Failure("UnloadFailed", "stuck")))
+    registrar.obey(c.CallbackEnded("unload", "q", 2, Failure("UnloadFailed", "stuck")))
     assert registrar.phase() is Phase.UNLOAD_FAILED
     registrar.obey(REVOKE)
     assert registrar.phase() is Phase.UNLOADING

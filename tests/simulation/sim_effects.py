@@ -52,31 +52,24 @@ def _load_resolved(shell: SimShell, effect: e.LoadResolved) -> None:
         shell.load_ended(effect.held.id, effect.failure)
 
 
-def _start_load(shell: SimShell, effect: e.StartLoad) -> None:
-    if effect.resource.server in shell.registered:
-        shell.start_run("load", effect.resource.id, effect.resource.attempt, effect.resource)
+def _start_callback(shell: SimShell, effect: e.StartCallback) -> None:
+    resource = effect.resource
+    match effect.role:
+        case "status":
+            _start_status(shell, effect)
+        case "health" | "usage":
+            shell.world.note(f"{shell.name}: runs the {effect.role} callback of {resource.id}")
+        case "load" | "unload":
+            if resource.server in shell.registered:
+                number = resource.attempt if effect.role == "load" else resource.tries
+                shell.start_run(effect.role, resource.id, number, resource)
+        case role:
+            shell.start_run("reload" if effect.reload else role, resource.id, resource.attempt, resource)
 
 
-def _start_unload(shell: SimShell, effect: e.StartUnload) -> None:
-    if effect.resource.server in shell.registered:
-        shell.start_run("unload", effect.resource.id, effect.resource.tries, effect.resource)
-
-
-def _start_recover(shell: SimShell, effect: e.StartRecover) -> None:
-    kind = "reload" if effect.reload else "recover"
-    shell.start_run(kind, effect.resource.id, effect.resource.attempt, effect.resource)
-
-
-def _start_pause(shell: SimShell, effect: e.StartPause) -> None:
-    shell.start_run("pause", effect.resource.id, effect.resource.attempt, effect.resource)
-
-
-def _start_resume(shell: SimShell, effect: e.StartResume) -> None:
-    shell.start_run("resume", effect.resource.id, effect.resource.attempt, effect.resource)
-
-
-def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
+def _start_status(shell: SimShell, effect: e.StartCallback) -> None:
     resource, notice = effect.resource, effect.notice
+    assert notice is not None
     now = shell.catalog.resources.get(resource.id)
     if now is not None and is_busy(shell.catalog, now):
         raise Violation("statuses", f"{resource.id} hears {notice} before its load has returned")
@@ -86,7 +79,7 @@ def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
         shell.world.ledger.hear_own(notice, shell.epoch, effect.repeated)
     server = shell.catalog.servers.get(resource.server)
     if server is None or not server.has_status:
-        shell.post(c.StatusDone(resource.id, notice, handled=False))
+        shell.post(c.CallbackEnded("status", resource.id, notice=notice, handled=False))
         return
     run = shell.start_run("status", resource.id, notice.event, resource)
     run.notice = notice
@@ -164,10 +157,6 @@ def _happened(shell: SimShell, effect: e.Happened) -> None:
     shell.world.note(f"{shell.name}: {effect.what} {effect.resource.id} {effect.detail}")
 
 
-def _start_run(shell: SimShell, effect: e.StartRun) -> None:
-    shell.world.note(f"{shell.name}: runs the {effect.role} callback of {effect.resource_id}")
-
-
 def _died(shell: SimShell, effect: e.Died) -> None:
     shell.world.note(f"{shell.name}: its last process died in {'; '.join(effect.runs)}")
 
@@ -184,13 +173,7 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.SendReply: _reply,
     e.SendRequest: _request,
     e.Connect: _connect,
-    e.StartLoad: _start_load,
-    e.StartUnload: _start_unload,
-    e.StartRecover: _start_recover,
-    e.StartRun: _start_run,
-    e.StartPause: _start_pause,
-    e.StartResume: _start_resume,
-    e.StartStatus: _start_status,
+    e.StartCallback: _start_callback,
     e.SetTimer: _set_timer,
     e.LoadResolved: _load_resolved,
     e.UnloadResolved: _unload_resolved,

@@ -142,7 +142,7 @@ class World(Lives):
     def _tell(self, registrar: SimRegistrar, done: c.Command, fault: str) -> bool:
         """The callback's own thread tells how it ended, if that is one of those that can."""
         told = False
-        if isinstance(done, (c.LoadDone, c.UnloadDone)):
+        if isinstance(done, c.CallbackEnded) and done.role in ("load", "unload") and done.failure is None:
             try:
                 told = registrar.tell(done, fault)
             except Killed:
@@ -155,40 +155,35 @@ class World(Lives):
     def _outcome(self, registrar: SimShell, run: Run, *, ok: bool, with_change: bool) -> c.Command:
         name, ledger = registrar.name, self.ledger
         ledger.callback_ended(name, run.kind, run.id)
+        place = run.id, run.number
         match run.kind:
             case "load":
                 ledger.run_ended(name, run.id, "loaded" if ok else "gone")
-                response = f"{run.id}:{run.number}".encode()
-                return c.LoadDone(run.id, run.number, response) if ok else c.LoadErred(run.id, run.number, RAISED)
+                response = f"{run.id}:{run.number}".encode() if ok else None
+                return c.CallbackEnded("load", *place, None if ok else RAISED, response)
             case "unload":
                 ledger.run_ended(name, run.id, "gone" if ok else "unload_failed")
-                return c.UnloadDone(run.id, run.number) if ok else c.UnloadErred(run.id, run.number, STUCK)
+                return c.CallbackEnded("unload", *place, None if ok else STUCK)
             case "hear":
-                ledger.dealt_with(run.id, run.number)
+                ledger.dealt_with(*place)
                 handled = bool(run.listener) and not ok
                 if handled:
                     ledger.handled.add((run.listener, run.number))
-                return c.Heard(run.id, run.number, handled, run.notice is not None and is_revocation(run.notice))
+                return c.Heard(*place, handled, run.notice is not None and is_revocation(run.notice))
             case "status":
                 assert run.notice is not None
-                ledger.own_heard.add((run.id, run.number))
+                ledger.own_heard.add(place)
                 if not ok:
-                    ledger.handled.add((run.id, run.number))
-                return c.StatusDone(run.id, run.notice, not ok)
+                    ledger.handled.add(place)
+                return c.CallbackEnded("status", run.id, notice=run.notice, handled=not ok)
             case "pause":
-                return c.PauseDone(run.id, run.number) if ok else c.PauseErred(run.id, run.number, RAISED)
-            case "resume":
+                return c.CallbackEnded("pause", *place, None if ok else RAISED)
+            case kind:
                 event = self.new_event()
-                if not ok:
-                    return c.ResumeErred(run.id, run.number, RAISED, event)
-                new = f"{run.id}:{run.number}:{event}".encode() if with_change else None
-                return c.ResumeDone(run.id, run.number, new, event)
-            case _:
-                event = self.new_event()
-                if not ok:
-                    return c.RecoverErred(run.id, run.number, RAISED, event)
-                new = f"{run.id}:{run.number}:{event}".encode() if with_change or run.kind == "reload" else None
-                return c.RecoverDone(run.id, run.number, new, event)
+                changed = with_change or kind == "reload"
+                response = f"{run.id}:{run.number}:{event}".encode() if ok and changed else None
+                role = "resume" if kind == "resume" else "recover"
+                return c.CallbackEnded(role, *place, None if ok else RAISED, response, event)
 
 
 _STEPS = (

@@ -22,8 +22,9 @@ from msgspec.structs import replace
 
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.commands import BeginTrial, LoadOverdue, RefusalOver, TrialOver
-from rr_actors.registrar.model.effects import Acquitted, SetTimer, StartLoad, StartUnload
+from rr_actors.registrar.model.commands import BeginTrial, CallbackOverdue, RefusalOver, TrialOver
+from rr_actors.registrar.model.effects import Acquitted, SetTimer, StartCallback
+from rr_actors.registrar.model.roles import BEGUN
 from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, CallbackRun, Phase, Resource, State
 
 ATTEMPTS = 3
@@ -37,7 +38,7 @@ _HEALTH_WAITS_S = (1.0, 4.0)
 _REFUSED_S = 5.0
 _REFUSED_AT_MOST_S = 600.0
 
-ROLES = ("recover", "status", "unload", "pause", "resume", "health", "usage")
+ROLES = tuple(name for name in BEGUN if name != "load")
 """The callbacks whose runs have rows of their own."""
 
 
@@ -45,21 +46,21 @@ def start_load(decision: Decision, resource: Resource) -> None:
     """Run the load callback; if the server is not registered (yet), the resource waits for it."""
     decision.forget(decision.catalog.early, resource.id)
     if resource.server in decision.catalog.servers:
-        decision.cause(StartLoad(resource))
+        decision.cause(StartCallback("load", resource))
         limit_load(decision, resource)
 
 
 def limit_load(decision: Decision, resource: Resource) -> None:
-    """Set a timer for LoadOverdue, if the server limits its loads."""
+    """Set a timer for the end of the load callback's time, if the server limits its loads."""
     server = decision.catalog.servers.get(resource.server)
     if server is not None and server.load_timeout_s is not None:
         failure = failures.overdue(decision.catalog, resource, server.load_timeout_s)
-        overdue = LoadOverdue(resource.id, resource.attempt, failure)
+        overdue = CallbackOverdue("load", resource.id, resource.attempt, failure)
         decision.cause(SetTimer("load:" + resource.id, server.load_timeout_s, overdue))
 
 
 def end_limit(decision: Decision, resource: Resource) -> None:
-    """Cancel the timer for LoadOverdue, as the load callback has ended."""
+    """Cancel the timer of the load callback, as that has ended."""
     server = decision.catalog.servers.get(resource.server)
     if server is not None and server.load_timeout_s is not None:
         decision.cause(SetTimer("load:" + resource.id, None, None))
@@ -74,7 +75,7 @@ def start_unload(decision: Decision, resource: Resource) -> None:
         return
     if decision.catalog.callback_runs and run_id("unload", resource.id) in decision.catalog.callback_runs:
         note_begun(decision, "unload", resource.id)
-    decision.cause(StartUnload(resource))
+    decision.cause(StartCallback("unload", resource))
 
 
 def start_queued(decision: Decision, resource: Resource) -> None:

@@ -75,10 +75,11 @@ def _describe(decision: Decision, sender: str, message: m.Describe) -> None:
         decision.cause(SendReply(sender, m.Described(message.server, server.types)))
 
 
-def _unload_erred(decision: Decision, command: c.UnloadErred) -> None:
-    unloading.unload_erred(decision, command)
-    # Those that waited for a load which was not run again. A resource that stays hears them all the same.
-    status_delivery.start_deferred(decision, command.resource_id)
+def _unload_ended(decision: Decision, ended: c.CallbackEnded) -> None:
+    unloading.unload_ended(decision, ended)
+    if ended.failure is not None:
+        # Those that waited for a load which was not run again. A resource that stays hears them all the same.
+        status_delivery.start_deferred(decision, ended.resource_id)
 
 
 def _set_rows(decision: Decision, command: c.SetRows) -> None:
@@ -110,6 +111,23 @@ _MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
 }
 """The messages that do not name their sender, and whose function needs it."""
 
+_ENDS: dict[str, Callable[[Decision, c.CallbackEnded], None]] = {
+    "load": loading.load_ended,
+    "unload": _unload_ended,
+    "recover": recovery.recover_ended,
+    "status": status_delivery.status_ended,
+    "pause": recovery.pause_ended,
+    "resume": recovery.resume_ended,
+    "health": recovery.run_ended,
+    "usage": recovery.run_ended,
+}
+"""By role (model/roles.py): what follows from the end of its callback."""
+
+_LIMITS: dict[str, Callable[[Decision, c.CallbackOverdue], None]] = {
+    "load": loading.load_overdue,
+    "recover": recovery.recover_overdue,
+}
+
 _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.BeginAgain: lambda decision, _: recovery.begin_again(decision),
     c.BeginServing: recovery.begin_serving,
@@ -119,20 +137,9 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.RefuseLoad: lambda decision, it: decision.cause(refuse(decision, it.origin, it.query_id, it.failure)),
     c.Register: recovery.register,
     c.Unregister: unloading.unregister,
-    c.LoadDone: loading.load_done,
-    c.LoadErred: loading.load_erred,
-    c.LoadOverdue: loading.load_overdue,
-    c.UnloadDone: unloading.unload_done,
-    c.UnloadErred: _unload_erred,
-    c.RecoverDone: recovery.recover_done,
-    c.RecoverErred: recovery.recover_erred,
-    c.RecoverOverdue: recovery.recover_overdue,
-    c.PauseDone: recovery.pause_ended,
-    c.PauseErred: recovery.pause_ended,
-    c.ResumeDone: recovery.resume_ended,
-    c.ResumeErred: recovery.resume_ended,
+    c.CallbackEnded: lambda decision, it: _ENDS[it.role](decision, it),
+    c.CallbackOverdue: lambda decision, it: _LIMITS[it.role](decision, it),
     c.BeginRun: recovery.begin_run,
-    c.RunEnded: recovery.run_ended,
     c.BeginTrial: recovery.begin_trial,
     c.TrialOver: recovery.trial_over,
     c.RefusalOver: callback_runs.refusal_over,
@@ -152,7 +159,6 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.AddInFlight: lambda decision, _: releasing.add_all_in_flight(decision),
     c.ReleaseOverdue: holding.release_overdue,
     c.Heard: status_delivery.heard,
-    c.StatusDone: status_delivery.status_done,
     c.Reconcile: reconciliation.reconcile,
     c.ConsumerLost: reconciliation.consumer_lost,
     c.LinkLost: reconciliation.link_lost,

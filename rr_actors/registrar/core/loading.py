@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
+from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core.callback_runs import (
     acquit,
     end_limit,
@@ -37,7 +38,7 @@ from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, balance, retire, settle
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.commands import LoadDone, LoadErred, LoadOverdue
+from rr_actors.registrar.model.commands import CallbackEnded, CallbackOverdue
 from rr_actors.registrar.model.effects import Effect, Happened, SendReply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.registrar.model.rows import (
@@ -222,13 +223,16 @@ def _query_of(message: Load, resource_id: str) -> ServedQuery:
     )
 
 
-def load_done(decision: Decision, done: LoadDone) -> None:
+def load_ended(decision: Decision, ended: CallbackEnded) -> None:
     """Answer all consumers that wait; unload the resource if nobody holds it any more."""
     catalog = decision.catalog
-    resource = running(catalog, done.resource_id, LOADING, done.attempt)
+    resource = running(catalog, ended.resource_id, LOADING, ended.run)
     if resource is None:
         return
-    resource = replace(resource, phase=LOADED, response=done.response)
+    if ended.failure is not None:
+        _load_failed(decision, resource, ended.failure)
+        return
+    resource = replace(resource, phase=LOADED, response=ended.response)
     decision.put(resource)
     decision.cause(Happened("loaded", resource, ""))
     end_limit(decision, resource)
@@ -250,16 +254,13 @@ def load_done(decision: Decision, done: LoadDone) -> None:
         start_deferred(decision, resource.id)
 
 
-def load_erred(decision: Decision, erred: LoadErred) -> None:
+def _load_failed(decision: Decision, resource: Resource, failure: Failure) -> None:
     """Remove the resource and its queries, release what the callback had loaded, and only then answer all that wait."""
-    resource = running(decision.catalog, erred.resource_id, LOADING, erred.attempt)
-    if resource is None:
-        return
-    after: list[Effect] = [*refuse_all(decision, resource, erred.failure), *answers_to_owners(decision, resource, None)]
+    after: list[Effect] = [*refuse_all(decision, resource, failure), *answers_to_owners(decision, resource, None)]
     drop_resource(decision, resource)
     end_limit(decision, resource)
     _ended(decision, resource)
-    decision.cause(Happened("load_failed", resource, erred.failure.message))
+    decision.cause(Happened("load_failed", resource, failure.message))
     release_parts(decision, resource.id, after)
     settle(decision, resource.server)
 
@@ -272,9 +273,9 @@ def _ended(decision: Decision, resource: Resource) -> None:
     forget_request(decision, resource)
 
 
-def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
+def load_overdue(decision: Decision, overdue: CallbackOverdue) -> None:
     """Refuse all consumers that wait. The callback goes on; the resource is unloaded when it returns."""
-    resource = running(decision.catalog, overdue.resource_id, LOADING, overdue.attempt)
+    resource = running(decision.catalog, overdue.resource_id, LOADING, overdue.run)
     if resource is not None:
         decision.effects += refuse_all(decision, resource, overdue.failure)
 

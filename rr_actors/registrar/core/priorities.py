@@ -20,7 +20,7 @@ from rr_actors.registrar.core.releasing import add_in_flight, parts_of
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import SetPriority
-from rr_actors.registrar.model.effects import AnswerCall, Happened, SendReply, SendRequest, StartResume
+from rr_actors.registrar.model.effects import AnswerCall, Happened, SendReply, SendRequest, StartCallback
 from rr_actors.registrar.model.messages import Reprioritise, Reprioritised
 from rr_actors.registrar.model.rows import HELD, QUEUED, RESTING, STANDBY, UNLOADING, Held, State, shown_priority
 
@@ -113,7 +113,7 @@ def rise(decision: Decision) -> None:
             decision.note(catalog.rising, resource_id, left)
         else:
             decision.forget(catalog.rising, resource_id)
-            decision.cause(StartResume(resource))
+            decision.cause(StartCallback("resume", resource))
 
 
 def _follows(catalog: Catalog, query_id: str) -> bool:

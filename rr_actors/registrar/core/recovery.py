@@ -58,21 +58,15 @@ from rr_actors.registrar.model.commands import (
     BeginRun,
     BeginServing,
     BeginTrial,
+    CallbackEnded,
+    CallbackOverdue,
     ForceUnload,
-    PauseDone,
-    PauseErred,
-    RecoverDone,
-    RecoverErred,
-    RecoverOverdue,
     Register,
     Reread,
-    ResumeDone,
-    ResumeErred,
-    RunEnded,
     TrialOver,
     Unregister,
 )
-from rr_actors.registrar.model.effects import Acquitted, Died, Happened, SendReply, SetTimer, StartRecover, StartRun
+from rr_actors.registrar.model.effects import Acquitted, Died, Happened, SendReply, SetTimer, StartCallback
 from rr_actors.registrar.model.messages import Load, Unload
 from rr_actors.registrar.model.rows import (
     NOT_BEGUN,
@@ -372,15 +366,15 @@ def _run_recover(decision: Decision, resource: Resource, server: Server) -> None
     """Run the recover callback; without one, load the resource again, when the parts of its last load are released."""
     note_begun(decision, "recover", resource.id)
     if server.has_recover:
-        decision.cause(StartRecover(resource, reload=False))
+        decision.cause(StartCallback("recover", resource))
     else:
         resource = replace(resource, attempt=resource.attempt + 1, phase=Phase.LOADED)
         decision.put(resource)
-        again = StartRecover(resource, reload=True)
+        again = StartCallback("recover", resource, reload=True)
         release_parts(decision, resource.id, (again,), keep_attempt=resource.attempt)
     if server.recover_timeout_s is not None:
         failure = failures.recover_overdue(decision.catalog, resource, server.recover_timeout_s)
-        overdue = RecoverOverdue(resource.id, resource.attempt, failure)
+        overdue = CallbackOverdue("recover", resource.id, resource.attempt, failure)
         decision.cause(SetTimer("recover:" + resource.id, server.recover_timeout_s, overdue))
 
 
@@ -414,16 +408,16 @@ def _rest(decision: Decision, resource: Resource, event: str) -> None:
         balance(decision, resource.id)
 
 
-def pause_ended(decision: Decision, ended: PauseDone | PauseErred) -> None:
+def pause_ended(decision: Decision, ended: CallbackEnded) -> None:
     """Note that the resource is paused; it is resumed if it is needed by now. If the callback raised, it runs on.
 
     An idle one that nobody holds is unloaded then; one on standby is not paused again before it was needed once.
     """
-    resource = running(decision.catalog, ended.resource_id, PAUSING, ended.attempt)
+    resource = running(decision.catalog, ended.resource_id, PAUSING, ended.run)
     if resource is None:
         return
     note_ended(decision, "pause", resource.id)
-    if isinstance(ended, PauseErred):
+    if ended.failure is not None:
         decision.cause(Happened("pause_failed", resource, ended.failure.message))
         _runs(decision, resource)
         return
@@ -448,14 +442,14 @@ def _runs(decision: Decision, resource: Resource) -> None:
         begin_unload(decision, resource)
 
 
-def resume_ended(decision: Decision, ended: ResumeDone | ResumeErred) -> None:
+def resume_ended(decision: Decision, ended: CallbackEnded) -> None:
     """Answer all that wait for a resource that runs again; one that could not be resumed is lost."""
     catalog = decision.catalog
-    resource = running(catalog, ended.resource_id, RESUMING, ended.attempt)
+    resource = running(catalog, ended.resource_id, RESUMING, ended.run)
     if resource is None:
         return
     note_ended(decision, "resume", resource.id)
-    if isinstance(ended, ResumeErred):
+    if ended.failure is not None:
         _not_resumed(decision, resource, ended.event, ended.failure)
         return
     touch(decision, resource.id)
@@ -502,23 +496,23 @@ def _not_resumed(decision: Decision, resource: Resource, event: str, failure: Fa
 
 def begin_run(decision: Decision, command: BeginRun) -> None:
     """Run a health callback in which the process before may have died, or a usage callback."""
-    role, id = command.role, command.resource_id
+    role, id = command.role, command.resource.id
     wait_s = health_waits_s(deaths_of(decision.catalog, role, id)) if role == "health" and not command.waited else 0.0
     if wait_s:
         decision.cause(SetTimer(run_id(role, id), wait_s, replace(command, waited=True)))
     elif not awaits_trial(decision, role, id):
-        _run(decision, command.role, id, command.server)
+        _run(decision, role, command.resource)
 
 
-def _run(decision: Decision, role: str, resource_id: str, server: str) -> None:
-    if resource_id in decision.catalog.resources:
-        note_begun(decision, role, resource_id)
-    decision.cause(StartRun(role, resource_id, server))
+def _run(decision: Decision, role: str, resource: Resource) -> None:
+    if resource.id in decision.catalog.resources:
+        note_begun(decision, role, resource.id)
+    decision.cause(StartCallback(role, resource))
 
 
-def run_ended(decision: Decision, command: RunEnded) -> None:
+def run_ended(decision: Decision, ended: CallbackEnded) -> None:
     """Note that the process lives after the callback."""
-    note_ended(decision, command.role, command.resource_id)
+    note_ended(decision, ended.role, ended.resource_id)
 
 
 # -- callbacks that run alone ------------------------------------------------------------------------------------------
@@ -546,7 +540,7 @@ def begin_trial(decision: Decision, command: BeginTrial) -> None:
         case "pause" | "resume" if resource.phase in (PAUSING, RESUMING):
             go_on(decision, resource)
         case "health" | "usage":
-            _run(decision, role, id, server.name)
+            _run(decision, role, resource)
         case "status" if catalog.deferred.get(id) and not is_busy(catalog, resource):
             start_deferred(decision, id)
         case _:
@@ -561,32 +555,24 @@ def trial_over(decision: Decision, command: TrialOver) -> None:
 # -- ends --------------------------------------------------------------------------------------------------------------
 
 
-def recover_done(decision: Decision, done: RecoverDone) -> None:
-    """Keep a resource that lives; send its holders an UPDATE if its response has changed."""
-    note_ended(decision, "recover", done.resource_id)
-    resource = _asked_after(decision, done.resource_id, done.attempt)
-    if resource is None:
-        return
-    if done.response is not None and done.response != resource.response:
-        source = decision.catalog.origin_of(resource)
-        spread(decision, resource, done.event, State.UPDATE, "recovered with a new response", source, done.response)
-    _go_on(decision, resource.id)
-
-
-def recover_erred(decision: Decision, erred: RecoverErred) -> None:
-    """Send the holders of a lost resource a FATAL status."""
-    note_ended(decision, "recover", erred.resource_id)
-    resource = _asked_after(decision, erred.resource_id, erred.attempt)
+def recover_ended(decision: Decision, ended: CallbackEnded) -> None:
+    """Keep a resource that lives; its holders hear an UPDATE if its response has changed, and FATAL if it is lost."""
+    note_ended(decision, "recover", ended.resource_id)
+    resource = _asked_after(decision, ended.resource_id, ended.run)
     if resource is None:
         return
     source = decision.catalog.origin_of(resource)
-    spread(decision, resource, erred.event, State.FATAL, erred.failure.message, source)
+    if ended.failure is not None:
+        spread(decision, resource, ended.event, State.FATAL, ended.failure.message, source)
+    elif ended.response is not None and ended.response != resource.response:
+        text = "recovered with a new response"
+        spread(decision, resource, ended.event, State.UPDATE, text, source, ended.response)
     _go_on(decision, resource.id)
 
 
-def recover_overdue(decision: Decision, overdue: RecoverOverdue) -> None:
+def recover_overdue(decision: Decision, overdue: CallbackOverdue) -> None:
     """Send the holders of a resource whose recover callback takes too long a FATAL status. The callback goes on."""
-    resource = _asked_after(decision, overdue.resource_id, overdue.attempt)
+    resource = _asked_after(decision, overdue.resource_id, overdue.run)
     if resource is None:
         return
     end_trial(decision, run_id("recover", resource.id))

@@ -22,9 +22,9 @@ from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import owe
 from rr_actors.registrar.core.unloading import begin_unload, stay_lost
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog, Decision
+from rr_actors.registrar.model.catalog import Catalog, Decision, DueStatus
 from rr_actors.registrar.model.commands import GraceOver, Revoke, SetResponse, SetStatus, Swap
-from rr_actors.registrar.model.effects import AnswerCall, Happened, SetTimer, StartStatus
+from rr_actors.registrar.model.effects import AnswerCall, Happened, SetTimer, StartCallback
 from rr_actors.registrar.model.messages import Unload
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -159,32 +159,32 @@ def let_go(decision: Decision, held: Held) -> None:
 # -- to the server of the resource ---------------------------------------------------------------------------------
 
 
-def start_status(decision: Decision, start: StartStatus) -> None:
+def start_status(decision: Decision, due: DueStatus) -> None:
     """Run the status callback of the resource; defer it while the load or recover callback runs, or until its turn."""
     catalog = decision.catalog
-    resource = catalog.resources[start.resource.id]
+    resource = catalog.resources[due.resource.id]
     if is_busy(catalog, resource) or awaits_trial(decision, "status", resource.id):
         deferred = catalog.deferred
-        decision.note(deferred, resource.id, (*deferred.get(resource.id, ()), start))
+        decision.note(deferred, resource.id, (*deferred.get(resource.id, ()), due))
         return
     if is_heard_by(catalog, resource):
         if resource.id not in catalog.statuses:
             note_begun(decision, "status", resource.id)
         decision.note(catalog.statuses, resource.id, catalog.statuses.get(resource.id, 0) + 1)
-    decision.cause(replace(start, resource=resource))
+    decision.cause(StartCallback("status", resource, due.notice, due.repeated))
 
 
-def start_in_turn(decision: Decision, start: StartStatus) -> None:
+def start_in_turn(decision: Decision, due: DueStatus) -> None:
     """Run the status callback for a status of its own resource; if a window of runs has been caused, when these end."""
-    catalog, id = decision.catalog, start.resource.id
+    catalog, id = decision.catalog, due.resource.id
     late = catalog.late.get(id)
     if late is None and catalog.statuses.get(id, 0) + len(catalog.deferred.get(id, ())) < catalog.window:
-        start_status(decision, start)
+        start_status(decision, due)
         return
     if late is None:
         late = {}
         decision.note(catalog.late, id, late)
-    decision.note(late, start.notice.id, start)
+    decision.note(late, due.notice.id, due)
     if len(late) > catalog.backlog:
         oldest = list(islice(late, catalog.window))
         drop_superseded(decision, [catalog.notices[old] for old in oldest])
@@ -220,7 +220,7 @@ def start_own(decision: Decision, server: str) -> None:
                 if is_given_up(catalog, "status", resource_id):
                     own_done(decision, notice, handled=False)
                 else:
-                    start_in_turn(decision, StartStatus(resource, notice, repeated=True))
+                    start_in_turn(decision, DueStatus(resource, notice, repeated=True))
 
 
 def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
@@ -326,4 +326,4 @@ def _say(
         _tell_holders(decision, resource, said)
     else:
         decision.put(said)
-        start_in_turn(decision, StartStatus(resource, said, repeated=False))
+        start_in_turn(decision, DueStatus(resource, said, repeated=False))

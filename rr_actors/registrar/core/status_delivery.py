@@ -25,9 +25,9 @@ from rr_actors.registrar.core.status_changes import (
     spread,
     start_status,
 )
-from rr_actors.registrar.model.catalog import Catalog, Decision, DeliveredNotice
-from rr_actors.registrar.model.commands import Heard, StatusDone
-from rr_actors.registrar.model.effects import Hear, StartStatus
+from rr_actors.registrar.model.catalog import Catalog, Decision, DeliveredNotice, DueStatus
+from rr_actors.registrar.model.commands import CallbackEnded, Heard
+from rr_actors.registrar.model.effects import Hear
 from rr_actors.registrar.model.messages import Noticed, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Resource, State, is_own, is_revocation
 
@@ -89,7 +89,7 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
         decision.cause(Hear(held, notice, repeated))
     resource = catalog.resources.get(held.parent)
     if resource is not None:
-        receivers += _concerns(decision, StartStatus(resource, notice, repeated), listened=listened)
+        receivers += _concerns(decision, DueStatus(resource, notice, repeated), listened=listened)
     ends = held.id if notice.released else ""
     if receivers:
         decision.note(catalog.hearing, notice.id, DeliveredNotice(provider, receivers, repeated, ends))
@@ -98,9 +98,9 @@ def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeate
         acknowledge(decision, provider, notice.id)
 
 
-def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool:
+def _concerns(decision: Decision, due: DueStatus, *, listened: bool) -> bool:
     """Have the resource hear each event once, after listeners that hear it now; return whether the notice waits."""
-    catalog, resource, notice = decision.catalog, start.resource, start.notice
+    catalog, resource, notice = decision.catalog, due.resource, due.notice
     place = ("resource", resource.id, notice.event)
     waiting = catalog.heard.get(place)
     if waiting is not None:  # the event has come by another part before, or the notice is sent again
@@ -110,22 +110,22 @@ def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool
     known = resource.server in catalog.servers
     if not known or not (is_heard_by(catalog, resource) or listened or is_busy(catalog, resource)):
         remember_heard(decision, place)
-        _pass_on(decision, resource, notice, handled=False, repeated=start.repeated)
+        _pass_on(decision, resource, notice, handled=False, repeated=due.repeated)
         return False
     decision.note(catalog.heard, place, (notice.id,))
     if listened:
-        decision.note(catalog.next_to_hear, notice.id, start)
+        decision.note(catalog.next_to_hear, notice.id, due)
     else:
-        _start(decision, start)
+        _start(decision, due)
     return True
 
 
-def _start(decision: Decision, start: StartStatus) -> None:
+def _start(decision: Decision, due: DueStatus) -> None:
     """Have the resource hear a status now; without its callback, if that has ended the process too often."""
-    if is_given_up(decision.catalog, "status", start.resource.id):
-        _heard_it(decision, start.resource.id, start.notice, handled=False)
+    if is_given_up(decision.catalog, "status", due.resource.id):
+        _heard_it(decision, due.resource.id, due.notice, handled=False)
     else:
-        start_status(decision, start)
+        start_status(decision, due)
 
 
 def is_listened(catalog: Catalog, held: Held) -> bool:
@@ -138,13 +138,13 @@ def heard(decision: Decision, command: Heard) -> None:
     catalog = decision.catalog
     place = ("query", command.query_id, command.event)
     for notice_id in catalog.heard.get(place, ()):
-        start = decision.forget(catalog.next_to_hear, notice_id)
-        if start is not None and not command.handled and start.resource.id in catalog.resources:
-            _start(decision, start)
-        elif start is not None:
-            if command.handled and (resource := catalog.resources.get(start.resource.id)) is not None:
-                _pass_on(decision, resource, start.notice, handled=True, repeated=False)
-            dealt_with(decision, ("resource", start.resource.id, command.event))
+        due = decision.forget(catalog.next_to_hear, notice_id)
+        if due is not None and not command.handled and due.resource.id in catalog.resources:
+            _start(decision, due)
+        elif due is not None:
+            if command.handled and (resource := catalog.resources.get(due.resource.id)) is not None:
+                _pass_on(decision, resource, due.notice, handled=True, repeated=False)
+            dealt_with(decision, ("resource", due.resource.id, command.event))
     held = catalog.held.get(command.query_id)
     if command.revoked and held is not None and held.hold is not Hold.OWED and not held.parent:
         let_go(decision, held)
@@ -154,18 +154,18 @@ def heard(decision: Decision, command: Heard) -> None:
 def start_deferred(decision: Decision, resource_id: str) -> None:
     """Have the resource hear the deferred statuses, as its load or recover callback has returned."""
     catalog = decision.catalog
-    for start in decision.forget(catalog.deferred, resource_id) or ():
+    for due in decision.forget(catalog.deferred, resource_id) or ():
         resource = catalog.resources.get(resource_id)
         if resource is None or resource.server not in catalog.servers:
-            _heard_it(decision, resource_id, start.notice, handled=False)
+            _heard_it(decision, resource_id, due.notice, handled=False)
         else:
-            _start(decision, start)
+            _start(decision, due)
     _start_late(decision, resource_id)
 
 
-def status_done(decision: Decision, done: StatusDone) -> None:
+def status_ended(decision: Decision, ended: CallbackEnded) -> None:
     """Note that the status callback has run for a status, or that the server has none."""
-    statuses, id = decision.catalog.statuses, done.resource_id
+    statuses, id = decision.catalog.statuses, ended.resource_id
     if (left := statuses.get(id, 0)) > 1:
         decision.note(statuses, id, left - 1)
     elif decision.forget(statuses, id):
@@ -173,7 +173,8 @@ def status_done(decision: Decision, done: StatusDone) -> None:
         resource = decision.catalog.resources.get(id)
         if decision.catalog.deferred and resource is not None and not is_busy(decision.catalog, resource):
             start_deferred(decision, id)  # it awaited its trial, and has not died this time
-    _heard_it(decision, id, done.notice, handled=done.handled)
+    if ended.notice is not None:
+        _heard_it(decision, id, ended.notice, handled=ended.handled)
     if decision.catalog.late:
         _start_late(decision, id)
 
@@ -186,8 +187,8 @@ def _start_late(decision: Decision, resource_id: str) -> None:
     if late is None or resource is None or free * 2 < catalog.window:
         return
     for notice_id in list(islice(late, free)):
-        start = decision.forget(late, notice_id)
-        _start(decision, replace(start, resource=resource))
+        due = decision.forget(late, notice_id)
+        _start(decision, replace(due, resource=resource))
     if not late:
         decision.forget(catalog.late, resource_id)
 

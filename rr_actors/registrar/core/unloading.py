@@ -33,8 +33,8 @@ from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.commands import ForceUnload, GraceOver, LingerOver, UnloadDone, UnloadErred, Unregister
-from rr_actors.registrar.model.effects import AnswerCall, Effect, Happened, SendReply, SetTimer, StartPause
+from rr_actors.registrar.model.commands import CallbackEnded, ForceUnload, GraceOver, LingerOver, Unregister
+from rr_actors.registrar.model.effects import AnswerCall, Effect, Happened, SendReply, SetTimer, StartCallback
 from rr_actors.registrar.model.messages import Gone, Reprioritised, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -253,7 +253,7 @@ def go_on(decision: Decision, resource: Resource) -> None:
         return
     note_begun(decision, role, resource.id)
     if resource.phase is PAUSING:
-        decision.cause(StartPause(resource))
+        decision.cause(StartCallback("pause", resource))
     else:
         decision.note(catalog.rising, resource.id, None)
 
@@ -278,10 +278,17 @@ def run_unload(decision: Decision, resource: Resource) -> None:
         start_unload(decision, resource)
 
 
-def unload_done(decision: Decision, done: UnloadDone) -> None:
-    """Remove the resource, release its parts, answer all that wait, and start a queued load of the same request."""
-    resource = running(decision.catalog, done.resource_id, UNLOADING, done.tries)
-    if resource is not None:
+def unload_ended(decision: Decision, ended: CallbackEnded) -> None:
+    """Remove the resource, release its parts, answer all that wait, and start a queued load of the same request.
+
+    If the callback raised, the resource may still be running: it is kept as unload_failed, and the Unloads that wait
+    are refused.
+    """
+    resource = running(decision.catalog, ended.resource_id, UNLOADING, ended.run)
+    if resource is not None and ended.failure is not None:
+        note_ended(decision, "unload", resource.id)
+        _keep(decision, resource, ended.failure)
+    elif resource is not None:
         _remove(decision, resource)
 
 
@@ -296,14 +303,6 @@ def _remove(decision: Decision, resource: Resource) -> None:
     release_parts(decision, resource.id, after)
     _next_in_queue(decision, resource)
     settle(decision, resource.server)
-
-
-def unload_erred(decision: Decision, erred: UnloadErred) -> None:
-    """Keep the resource as unload_failed, as it may still be running, and refuse the Unloads that wait."""
-    resource = running(decision.catalog, erred.resource_id, UNLOADING, erred.tries)
-    if resource is not None:
-        note_ended(decision, "unload", resource.id)
-        _keep(decision, resource, erred.failure)
 
 
 def _keep(decision: Decision, resource: Resource, failure: Failure) -> None:

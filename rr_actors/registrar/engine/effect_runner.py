@@ -15,7 +15,8 @@ from rr_actors.registrar.links.provider_link import ProviderLink, ProviderLinks
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.effects import Effect
-from rr_actors.registrar.model.rows import OWED, Resource, is_revocation
+from rr_actors.registrar.model.roles import BEGUN
+from rr_actors.registrar.model.rows import OWED, is_revocation
 from rr_actors.registrar.servers.registered_servers import Servers
 from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
 from rr_actors.runtime.time_limits import RunningTimers
@@ -24,7 +25,7 @@ logger = Log("rr_actors.registrar")
 
 _SAID_AGAIN_S = 60.0
 _NAMED = 3  # callbacks that a message names
-_CALLBACKS = frozenset((e.StartLoad, e.StartUnload, e.StartRecover, e.StartPause, e.StartResume, e.StartStatus, e.Hear))
+_CALLBACKS = frozenset((e.StartCallback, e.Hear))
 
 
 @on_loop
@@ -45,13 +46,7 @@ class EffectRunner:
             e.SendReply: self._reply,
             e.SendRequest: self._request,
             e.Connect: self._connect,
-            e.StartLoad: self._start_load,
-            e.StartUnload: self._start_unload,
-            e.StartRecover: self._start_recover,
-            e.StartRun: self._start_run,
-            e.StartPause: self._start_pause,
-            e.StartResume: self._start_resume,
-            e.StartStatus: self._start_status,
+            e.StartCallback: self._start_callback,
             e.SetTimer: self._set_timer,
             e.LoadResolved: self._load_resolved,
             e.UnloadResolved: self._unload_resolved,
@@ -127,59 +122,12 @@ class EffectRunner:
 
     # -- callbacks -----------------------------------------------------------------------------------------------
 
-    def _before(self, role: str, resource: Resource) -> None:
-        """Say which callback goes on with work of before the last crash: it may end this process during its start."""
-        registrar = self._registrar
-        if not registrar.serving:
-            origin = registrar.catalog.origin_of(resource)
-            registrar.node.on_resumed(f"the {role} callback of {origin} for resource {resource.id}")
-
-    def _start_load(self, effect: e.StartLoad) -> None:
+    def _start_callback(self, effect: e.StartCallback) -> None:
         server = self._servers.get(effect.resource.server)
         if server is not None:
-            self._before("load", effect.resource)
-            server.start_load(effect.resource)
-
-    def _start_unload(self, effect: e.StartUnload) -> None:
-        server = self._servers.get(effect.resource.server)
-        if server is not None:
-            self._before("unload", effect.resource)
-            server.start_unload(effect.resource)
-
-    def _start_recover(self, effect: e.StartRecover) -> None:
-        server = self._servers.get(effect.resource.server)
-        if server is not None:
-            self._before("recover", effect.resource)
-            server.start_recover(effect.resource, effect.reload)
-
-    def _start_run(self, effect: e.StartRun) -> None:
-        server = self._servers.get(effect.server)
-        if server is None:
-            self._registrar.post(c.RunEnded(effect.role, effect.resource_id))
-        elif effect.role == "usage":
-            server.usage.start(effect.resource_id)
-        else:
-            server.health.start(effect.resource_id)
-
-    def _start_pause(self, effect: e.StartPause) -> None:
-        server = self._servers.get(effect.resource.server)
-        if server is not None:
-            self._before("pause", effect.resource)
-            server.start_pause(effect.resource)
-
-    def _start_resume(self, effect: e.StartResume) -> None:
-        server = self._servers.get(effect.resource.server)
-        if server is not None:
-            self._before("resume", effect.resource)
-            server.start_resume(effect.resource)
-
-    def _start_status(self, effect: e.StartStatus) -> None:
-        server = self._servers.get(effect.resource.server)
-        if server is None or server.spec.status is None:
-            self._registrar.post(c.StatusDone(effect.resource.id, effect.notice, handled=False))
-        else:
-            self._before("status", effect.resource)
-            server.start_status(effect.resource, effect.notice, repeated=effect.repeated)
+            server.start(effect)
+        elif BEGUN[effect.role].phase is None:
+            self._registrar.post(c.CallbackEnded(effect.role, effect.resource.id, notice=effect.notice))
 
     # -- timers --------------------------------------------------------------------------------------------------
 

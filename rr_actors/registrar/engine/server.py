@@ -70,8 +70,8 @@ def checked_callback(callback: Callback, role: Role, request_type: Any, who: str
     """
     names = field_names(request_type)
     if names is not None:
-        return by_fields(callback, role.name, role.arguments, names, who)
-    check_takes(callback, role.arguments, who, role.name)
+        return by_fields(callback, role.option, role.arguments, names, who)
+    check_takes(callback, role.arguments, who, role.option)
     return callback
 
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.model.effects import Connect, Effect, SendRequest, StartStatus
+from rr_actors.registrar.model.effects import Connect, Effect, SendRequest
 from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import (
     HELD,
@@ -88,6 +88,14 @@ class Closing(msgspec.Struct, frozen=True):
     ids: tuple[str, ...]
     sent: int
     after: tuple[Effect, ...]
+
+
+class DueStatus(msgspec.Struct, frozen=True):
+    """A status that the status callback of a resource has to hear: one about the resource, or about a part of it."""
+
+    resource: Resource
+    notice: Notice
+    repeated: bool
 
 
 class DeliveredNotice(msgspec.Struct, frozen=True):
@@ -209,8 +217,8 @@ class Catalog:
         self.behind: dict[str, int] = {}
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.hearing: dict[str, DeliveredNotice] = {}
-        self.deferred: dict[str, tuple[StartStatus, ...]] = {}
-        self.next_to_hear: dict[str, StartStatus] = {}
+        self.deferred: dict[str, tuple[DueStatus, ...]] = {}
+        self.next_to_hear: dict[str, DueStatus] = {}
         self.listened: set[str] = set()  # queries and server ids with a listener, which may deal with a status
         self.ending: dict[str, bool] = {}
         self.doubted: dict[str, bool] = {}
@@ -230,7 +238,7 @@ class Catalog:
         self.waited: dict[str, int] = {}
         self.leaving: dict[str, Any] = {}
         self.statuses: dict[str, int] = {}
-        self.late: dict[str, dict[str, StartStatus]] = {}
+        self.late: dict[str, dict[str, DueStatus]] = {}
         self.suspects: dict[str, bool] = {}
         self.trial: dict[str, bool] = {}
         self.refusing: dict[str, bool] = {}

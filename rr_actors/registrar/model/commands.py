@@ -13,7 +13,7 @@ import msgspec
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.messages import FetchedQuery
-from rr_actors.registrar.model.rows import Change, Notice, State
+from rr_actors.registrar.model.rows import Change, Notice, Resource, State
 
 
 class Command(msgspec.Struct, frozen=True):
@@ -87,102 +87,34 @@ class Unregister(Command, frozen=True):
     ticket: Any
 
 
-class LoadDone(Command, frozen=True, gc=False):
-    """The load callback returned."""
+class CallbackEnded(Command, frozen=True, gc=False):
+    """The callback of a role (model/roles.py) has returned, or raised; or it did not have to run.
 
+    Attributes:
+        run: the number of the run: an attempt; of an unload, its `tries`.
+        failure: why it raised; None: it returned. A status, usage or health callback has none.
+        response: what it returned; None: no response, or no new one.
+        event: the id of a status that may follow from that.
+        notice: of a status callback: what it heard; `handled`: it has dealt with the notice.
+    """
+
+    role: str
     resource_id: str
-    attempt: int
-    response: bytes
+    run: int = 0
+    failure: Failure | None = None
+    response: bytes | None = None
+    event: str = ""
+    notice: Notice | None = None
+    handled: bool = False
 
 
-class LoadErred(Command, frozen=True):
-    """The load callback raised."""
+class CallbackOverdue(Command, frozen=True):
+    """The load or recover callback has run for longer than its server's load_timeout_s or recover_timeout_s."""
 
+    role: str
     resource_id: str
-    attempt: int
+    run: int
     failure: Failure
-
-
-class LoadOverdue(Command, frozen=True):
-    """The load callback has run for longer than the server's load_timeout_s."""
-
-    resource_id: str
-    attempt: int
-    failure: Failure
-
-
-class UnloadDone(Command, frozen=True, gc=False):
-    """The unload callback returned."""
-
-    resource_id: str
-    tries: int
-
-
-class UnloadErred(Command, frozen=True):
-    """The unload callback raised."""
-
-    resource_id: str
-    tries: int
-    failure: Failure
-
-
-class RecoverDone(Command, frozen=True):
-    """The resource lives; `response` is None if it has not changed."""
-
-    resource_id: str
-    attempt: int
-    response: bytes | None
-    event: str
-
-
-class RecoverErred(Command, frozen=True):
-    """The resource is lost."""
-
-    resource_id: str
-    attempt: int
-    failure: Failure
-    event: str
-
-
-class RecoverOverdue(Command, frozen=True):
-    """The recover callback has run for longer than the server's recover_timeout_s."""
-
-    resource_id: str
-    attempt: int
-    failure: Failure
-
-
-class PauseDone(Command, frozen=True):
-    """The pause callback returned."""
-
-    resource_id: str
-    attempt: int
-
-
-class PauseErred(Command, frozen=True):
-    """The pause callback raised."""
-
-    resource_id: str
-    attempt: int
-    failure: Failure
-
-
-class ResumeDone(Command, frozen=True):
-    """The resource runs again; `response` is None if it has not changed."""
-
-    resource_id: str
-    attempt: int
-    response: bytes | None
-    event: str
-
-
-class ResumeErred(Command, frozen=True):
-    """The resume callback raised: the resource is lost."""
-
-    resource_id: str
-    attempt: int
-    failure: Failure
-    event: str
 
 
 class BeginRun(Command, frozen=True):
@@ -192,16 +124,8 @@ class BeginRun(Command, frozen=True):
     """
 
     role: str
-    resource_id: str
-    server: str
+    resource: Resource
     waited: bool = False
-
-
-class RunEnded(Command, frozen=True):
-    """That callback has ended."""
-
-    role: str
-    resource_id: str
 
 
 class BeginTrial(Command, frozen=True):
@@ -384,17 +308,6 @@ class Heard(Command, frozen=True, gc=False):
     event: str
     handled: bool = False
     revoked: bool = False
-
-
-class StatusDone(Command, frozen=True):
-    """A server's status callback has run for a notice, or did not have to. `handled`: it has dealt with the notice.
-
-    The notice is about a part, or about the resource itself (rows.is_own).
-    """
-
-    resource_id: str
-    notice: Notice
-    handled: bool
 
 
 class Reconcile(Command, frozen=True):

@@ -39,54 +39,22 @@ class Connect(Effect, frozen=True):
     registrar: str
 
 
-class StartLoad(Effect, frozen=True):
-    """Run the load callback."""
+class StartCallback(Effect, frozen=True):
+    """Run the callback of a role (model/roles.py) for a resource, if it still is there; then post CallbackEnded.
 
-    resource: Resource
+    Without a server, a callback with a phase waits: the resource goes on when its server is registered.
 
-
-class StartUnload(Effect, frozen=True):
-    """Run the unload callback."""
-
-    resource: Resource
-
-
-class StartRecover(Effect, frozen=True):
-    """Run the recover callback, or the load callback again if the policy is reload."""
-
-    resource: Resource
-    reload: bool
-
-
-class StartRun(Effect, frozen=True):
-    """Run the health or usage callback of a resource, if it still is there; then post RunEnded."""
-
-    role: str
-    resource_id: str
-    server: str
-
-
-class StartPause(Effect, frozen=True):
-    """Run the pause callback."""
-
-    resource: Resource
-
-
-class StartResume(Effect, frozen=True):
-    """Run the resume callback."""
-
-    resource: Resource
-
-
-class StartStatus(Effect, frozen=True):
-    """Run the status callback of the resource for a notice about it, or about a part of it; then post StatusDone.
-
-    Without a status callback, StatusDone is posted at once.
+    Attributes:
+        notice: of a status callback: what it hears, about the resource or about a part of it.
+        repeated: whether it may have heard that before.
+        reload: of a recover callback: the load callback runs in its place, as the policy says.
     """
 
+    role: str
     resource: Resource
-    notice: Notice
-    repeated: bool
+    notice: Notice | None = None
+    repeated: bool = False
+    reload: bool = False
 
 
 class SetTimer(Effect, frozen=True):

@@ -23,7 +23,7 @@ from rr_actors.registrar.model.health import (
     first_counts,
     judged,
 )
-from rr_actors.registrar.model.roles import PROBE
+from rr_actors.registrar.model.roles import HEALTH
 from rr_actors.registrar.model.rows import LOADED, Resource, State
 from rr_actors.registrar.servers.callback_failures import said
 from rr_actors.registrar.servers.server_base import ServerBase, nothing
@@ -51,7 +51,7 @@ class HealthCallbacks:
         self._counts = dict[str, ProbeCounts]()  # by resource
         self._inherited = self._held_before() if server.spec.health else frozenset[str]()
         self._careful_until = math.inf
-        server.add(PROBE, self._probe_arguments, self._found)
+        server.add(HEALTH, self._probe_arguments, self._found)
 
     @on_loop
     def open(self) -> None:
@@ -87,11 +87,11 @@ class HealthCallbacks:
             for id in ids:
                 resource = self._registrar.catalog.resources.get(id)
                 if resource is not None and self._is_suspect(id):
-                    self._registrar.post(c.BeginRun("health", id, self._server.spec.name))
+                    self._registrar.post(c.BeginRun("health", resource))
                 elif resource is None:
                     self.probes.ended(id)
                 else:
-                    self._server.submit(PROBE, resource, resource.attempt, functools.partial(self._probe_ended, id))
+                    self._server.submit(HEALTH, resource, resource.attempt, functools.partial(self._probe_ended, id))
         finally:
             self._registrar.workers.threads.go()
 
@@ -112,15 +112,15 @@ class HealthCallbacks:
         """Run a health callback that the disk has."""
         resource = self._registrar.catalog.resources.get(resource_id)
         if not self.probes.is_waiting(resource_id):  # for a server of this name that was here before
-            self._registrar.post(c.RunEnded("health", resource_id))
+            self._registrar.post(c.CallbackEnded("health", resource_id))
         elif resource is None:
             self.probes.ended(resource_id)
         else:
             done = functools.partial(self._suspect_ended, resource_id)
-            self._server.submit(PROBE, resource, resource.attempt, done)
+            self._server.submit(HEALTH, resource, resource.attempt, done)
 
     def _suspect_ended(self, resource_id: str, found: ProbeResult | None, error: BaseException | None) -> None:
-        self._registrar.post(c.RunEnded("health", resource_id))
+        self._registrar.post(c.CallbackEnded("health", resource_id))
         self._probe_ended(resource_id, found, error)
 
     def _probe_arguments(self, resource: Resource) -> tuple[Any, Any]:

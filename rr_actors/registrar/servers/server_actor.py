@@ -43,16 +43,18 @@ from rr_actors.registrar.engine.status import StatusMessage, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
+from rr_actors.registrar.model.commands import CallbackEnded
+from rr_actors.registrar.model.effects import StartCallback
 from rr_actors.registrar.model.messages import Load
-from rr_actors.registrar.model.roles import LOAD, PAUSE, RECOVER, RESUME, STATUS, UNLOAD, Role
+from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, STATUS, UNLOAD, USAGE, Role
 from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
 from rr_actors.registrar.servers import stream_events
 from rr_actors.registrar.servers.callback_context import Current, enter
-from rr_actors.registrar.servers.callback_failures import load_failure, said
+from rr_actors.registrar.servers.callback_failures import failure_of_callback, load_failure, said
 from rr_actors.registrar.servers.health_callbacks import HealthCallbacks
 from rr_actors.registrar.servers.server_base import nothing
 from rr_actors.registrar.servers.usage_callbacks import UsageCallbacks
-from rr_actors.runtime.callback_errors import Raised, described_error, log_raised
+from rr_actors.runtime.callback_errors import Raised, described_error
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.user_loop import COROUTINE, Done, closing
 from rr_actors.runtime.workers import Gate, is_async
@@ -96,10 +98,26 @@ class LoadTimes:
         return newest[math.ceil(0.95 * len(newest)) - 1] if newest else 0.0
 
 
+class Run(msgspec.Struct, frozen=True, gc=False):
+    """One run of a callback.
+
+    Attributes:
+        number: its number, as decisions count it.
+        heard: of a status callback: the status.
+        began_s: when it began, by the monotonic clock.
+    """
+
+    role: Role
+    effect: StartCallback
+    number: int
+    heard: StatusMessage | None
+    began_s: float
+
+
 class ServerActor:
     """One server of a registrar: starts its callbacks, and says how they ended.
 
-    The registrar tells it which callback to start; it posts LoadDone, LoadErred and so on back.
+    The registrar tells it which callback to start (StartCallback); it posts CallbackEnded back.
 
     Attributes:
         facts: what decisions know of it.
@@ -130,15 +148,12 @@ class ServerActor:
         self.digest = digest_of((self.request.shape, self.response.shape))
         self._gate = registrar.gate or (None if spec.at_once is None else Gate(spec.at_once))
         self._runs: dict[Role, Callback] = {}
-        one, both = self.request_of, self.request_and_response_of
-        self.add(LOAD, one, self.response.encode)
-        self.add(UNLOAD, both, nothing)
-        self.add(RECOVER, both, self.response.encode)
-        self.add(STATUS, one, nothing)
-        self.add(PAUSE, both, nothing)
-        self.add(RESUME, both, self._new_response)
+        for role in BEGUN.values():
+            if not role.on_demand:
+                self.add(role, self._arguments_of(role), self._result_of(role))
         self.usage = UsageCallbacks(self)
         self.health = HealthCallbacks(self)
+        self._on_demand = {USAGE.name: self.usage, HEALTH.name: self.health}
         self.load_times = LoadTimes()
 
     def add(self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]) -> None:
@@ -151,18 +166,30 @@ class ServerActor:
         Raises:
             InvalidSpec: the callback has attributes that cannot be read.
         """
-        what = f"{self.origin}: {role.name}"
-        callback = getattr(self.spec, role.name) or nothing
+        what = f"{self.origin}: {role.option}"
+        callback = getattr(self.spec, role.option) or nothing
         try:
             taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
             self._runs[role] = self._wrapped(taking, arguments, result)
         except Exception as error:
             expected = "a callable whose attributes can be read"
             text = f"{what}: expected {expected}, got {shown(callback)}: {text_of(error)}"
-            raise InvalidSpec(text, field=role.name, expected=expected, got=callback) from None
+            raise InvalidSpec(text, field=role.option, expected=expected, got=callback) from None
 
-    def request_of(self, resource: Resource) -> tuple[Any]:
-        """Return the request, as the argument of a callback. In a worker."""
+    def _arguments_of(self, role: Role) -> Callable[[Resource], tuple[Any, ...]]:
+        return self.request_and_response_of if "response" in role.arguments else self._request_of
+
+    def _result_of(self, role: Role) -> Callable[[Any], Any]:
+        """Return the function that makes the answer of a callback what CallbackEnded takes. It runs in the worker."""
+        match role.answer:
+            case "response":
+                return self.response.encode
+            case "new response":
+                return lambda answer: None if answer is None else self.response.encode(answer, self.origin)
+            case _:
+                return nothing
+
+    def _request_of(self, resource: Resource) -> tuple[Any]:
         return (self.request.decode(resource.request, self.origin),)
 
     def request_and_response_of(self, resource: Resource) -> tuple[Any, Any]:
@@ -171,8 +198,6 @@ class ServerActor:
         if resource.response is None:
             return request, None
         return request, self.response.decode(resource.response, self.origin, "response")
-
-    # -- load ----------------------------------------------------------------------------------------------------
 
     def readable(self, load: Load) -> Load | c.RefuseLoad:
         """Return a consumer's Load with its request in canonical form, or the refusal of a request that cannot be read.
@@ -185,41 +210,6 @@ class ServerActor:
             return c.RefuseLoad(load.origin, load.query_id, failure_of(error))
         return load if canonical == load.request else msgspec.structs.replace(load, request=canonical)
 
-    @on_loop
-    def start_load(self, resource: Resource) -> None:
-        """Run the load callback."""
-        began_s = time.monotonic()
-        done = functools.partial(self._load_ended, resource, began_s)
-        at_once = functools.partial(self._loaded, resource, began_s)
-        self.submit(LOAD, resource, resource.attempt, done, at_once=at_once)
-
-    def _loaded(self, resource: Resource, began_s: float, response: bytes) -> bool:
-        """Decide LoadDone in the thread that ran the callback; return False if the loop has to."""
-        reports = self.registrar.progress
-        if self.too_long(resource, response) is not None or (reports.loads and not reports.forget_sent(resource.id)):
-            return False
-        self._let_in(resource)
-        is_decided = self.registrar.decide_here(c.LoadDone(resource.id, resource.attempt, response))
-        if is_decided:
-            self.load_times.take(began_s, failed=False)
-        return is_decided
-
-    def _load_ended(self, resource: Resource, began_s: float, response: bytes, error: BaseException | None) -> None:
-        self.registrar.progress.end(resource.id)
-        error = error or self.too_long(resource, response)
-        self.load_times.take(began_s, failed=error is not None)
-        if error is None:
-            self._let_in(resource)
-            self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
-        else:
-            self.registrar.publishers.close(resource.id)
-            self.registrar.post(c.LoadErred(resource.id, resource.attempt, load_failure(error, self.origin)))
-
-    def _let_in(self, resource: Resource) -> None:
-        """Let readers in to the streams that a callback has opened."""
-        if self.registrar.publishers.streams:  # most registrars have none
-            self.registrar.publishers.let_in(resource.id, functools.partial(stream_events.tell, self, resource))
-
     def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
         """Return the error for a response that, with its request, is too long for a frame; None if it is not."""
         limit = self.registrar.node.config.frame_limit_bytes
@@ -229,111 +219,86 @@ class ServerActor:
         why = f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
         return NotSerializable(f"{why}: {ADVICE}", path="response")
 
-    # -- unload --------------------------------------------------------------------------------------------------
+    # -- start and end -------------------------------------------------------------------------------------------
 
     @on_loop
-    def start_unload(self, resource: Resource) -> None:
-        """Run the unload callback; without one, the resource counts as unloaded at once."""
-        if self.spec.unload is None:
-            self.registrar.publishers.close(resource.id)
-            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+    def start(self, effect: StartCallback) -> None:
+        """Run the callback of a role for a resource, and post CallbackEnded.
+
+        A missing unload or status callback has ended at once. Before on_start has returned, a callback goes on with
+        work of before the last crash.
+        """
+        role, resource = BEGUN[effect.role], effect.resource
+        if role.on_demand:
+            self._on_demand[effect.role].start(resource.id)
             return
-
-        def at_once(_result: None) -> bool:
-            self.registrar.publishers.close(resource.id)
-            return self.registrar.decide_here(c.UnloadDone(resource.id, resource.tries))
-
-        done = functools.partial(self._unload_ended, resource)
-        start = functools.partial(self.submit, UNLOAD, resource, resource.tries, done, at_once=at_once)
-        self.health.probes.when_free(resource.id, start)
-
-    def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
-        if error is None:
-            self.registrar.publishers.close(resource.id)
-            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+        heard = None if effect.notice is None else self._received(effect.notice, repeated=effect.repeated)
+        number = resource.tries if role is UNLOAD else resource.attempt
+        run = Run(role, effect, number, heard, time.monotonic())
+        if role in (UNLOAD, STATUS) and getattr(self.spec, role.option) is None:
+            self._ended(run, None, None)
             return
-        trace = error.details[1] if type(error) is Raised else failure_of(error, self.origin).trace
-        text = readable(f"{self.origin}: {said(error)}")
-        log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
-        text += "; the resource is kept as unload_failed, and may be unloaded again"
-        failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, trace)
-        self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
+        if not self.registrar.serving:  # it may end this process during its start
+            self.registrar.node.on_resumed(f"the {role.name} callback of {self.origin} for resource {resource.id}")
+        if role.alone:
+            self.health.probes.when_free(resource.id, functools.partial(self._start, run))
+        else:
+            self._start(run)
 
-    # -- recover -------------------------------------------------------------------------------------------------
-
-    @on_loop
-    def start_recover(self, resource: Resource, reload: bool) -> None:
-        """Ask the recover callback whether the resource lives, or load the resource again."""
-        instead = LOAD if reload or self.spec.recover is None else None
-        done = functools.partial(self._recover_ended, resource)
-        self.submit(RECOVER, resource, resource.attempt, done, instead=instead)
-
-    def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
-        self.registrar.progress.end(resource.id)
-        error = error or self.too_long(resource, response)
-        if error is None:
-            self._let_in(resource)
-            self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
-            return
-        self.registrar.publishers.close(resource.id)
-        text = readable(f"lost: {self.origin}: {said(error)}")
-        logger.warning("%s (resource %s)", text, resource.id)
-        failure = Failure("LoadFailed", text, {"server": self.origin})
-        self.registrar.post(c.RecoverErred(resource.id, resource.attempt, failure, new_id()))
-
-    # -- pause and resume ----------------------------------------------------------------------------------------
-
-    @on_loop
-    def start_pause(self, resource: Resource) -> None:
-        """Run the pause callback."""
-        done = functools.partial(self._pause_ended, resource)
-        self.health.probes.when_free(
-            resource.id, functools.partial(self.submit, PAUSE, resource, resource.attempt, done)
-        )
-
-    def _pause_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
-        if error is None:
-            self.registrar.post(c.PauseDone(resource.id, resource.attempt))
-            return
-        text = readable(f"{self.origin}: pause: {said(error)}")
-        log_raised(logger, error, "%s; resource %s runs on", text, resource.id)
-        failure = Failure("LoadFailed", text, {"server": self.origin})
-        self.registrar.post(c.PauseErred(resource.id, resource.attempt, failure))
-
-    @on_loop
-    def start_resume(self, resource: Resource) -> None:
-        """Run the resume callback; without one, as the server does not pause any more, the resource runs."""
-        self.submit(RESUME, resource, resource.attempt, functools.partial(self._resume_ended, resource))
-
-    def _new_response(self, answer: Any, where: str = "") -> bytes | None:
-        return None if answer is None else self.response.encode(answer, where or self.origin)
-
-    def _resume_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
-        error = error or self.too_long(resource, response)
-        if error is None:
-            self.registrar.post(c.ResumeDone(resource.id, resource.attempt, response, new_id()))
-            return
-        text = readable(f"lost: {self.origin}: resume: {said(error)}")
-        logger.warning("%s (resource %s)", text, resource.id)
-        failure = Failure("LoadFailed", text, {"server": self.origin})
-        self.registrar.post(c.ResumeErred(resource.id, resource.attempt, failure, new_id()))
-
-    # -- status --------------------------------------------------------------------------------------------------
-
-    @on_loop
-    def start_status(self, resource: Resource, notice: Notice, *, repeated: bool) -> None:
-        """Run the status callback for a status of the resource, or of one of its parts."""
+    def _received(self, notice: Notice, *, repeated: bool) -> StatusMessage:
         audience = self.registrar.audience
-        received = functools.partial(status_of, kind=StatusMessage) if audience is None else audience.received
-        status = received(notice, repeated=repeated)
+        if audience is None:
+            return status_of(notice, StatusMessage, repeated=repeated)
+        return audience.received(notice, repeated=repeated)
 
-        def done(_result: None, error: BaseException | None) -> None:
-            if error is not None:
-                self.registrar.callback_failures += 1
-                log_raised(logger, error, "%s: the status callback raised; the status goes on", self.origin)
-            self.registrar.post(c.StatusDone(resource.id, notice, status.is_handled))
+    def _start(self, run: Run) -> None:
+        role = run.role
+        instead = LOAD if role is RECOVER and (run.effect.reload or self.spec.recover is None) else None
+        at_once = functools.partial(self._ended_here, run) if role in (LOAD, UNLOAD) else None
+        more = () if run.heard is None else (run.heard,)
+        done = functools.partial(self._ended, run)
+        self.submit(role, run.effect.resource, run.number, done, *more, instead=instead, at_once=at_once)
 
-        self.submit(STATUS, resource, resource.attempt, done, status)
+    def _ended_here(self, run: Run, response: bytes | None) -> bool:
+        """Decide the end in the thread that ran the callback; return False if the loop has to."""
+        resource = run.effect.resource
+        if run.role is LOAD:
+            reports = self.registrar.progress
+            if self.too_long(resource, response) is not None:
+                return False
+            if reports.loads and not reports.forget_sent(resource.id):
+                return False
+        self._streams_after(run, failed=False)
+        is_decided = self.registrar.decide_here(CallbackEnded(run.role.name, resource.id, run.number, None, response))
+        if is_decided and run.role is LOAD:
+            self.load_times.take(run.began_s, failed=False)
+        return is_decided
+
+    def _ended(self, run: Run, response: bytes | None, error: BaseException | None) -> None:
+        role, resource = run.role, run.effect.resource
+        if role.reports:
+            self.registrar.progress.end(resource.id)
+        if role.answer:
+            error = error or self.too_long(resource, response)
+        if role is LOAD:
+            self.load_times.take(run.began_s, failed=error is not None)
+        elif role is STATUS and error is not None:
+            self.registrar.callback_failures += 1
+        self._streams_after(run, failed=error is not None)
+        failure = None if error is None else failure_of_callback(role, self.origin, resource, error)
+        event = new_id() if role.answer and role is not LOAD else ""
+        handled = run.heard is not None and run.heard.is_handled
+        end = role.name, resource.id, run.number, failure, None if error is not None else response, event
+        self.registrar.post(CallbackEnded(*end, run.effect.notice, handled))
+
+    def _streams_after(self, run: Run, *, failed: bool) -> None:
+        """Let readers in to the streams that a callback has opened; close those of a resource that is gone."""
+        publishers, id = self.registrar.publishers, run.effect.resource.id
+        if run.role.reports and not failed:
+            if publishers.streams:  # most registrars have none
+                publishers.let_in(id, functools.partial(stream_events.tell, self, run.effect.resource))
+        elif (run.role.reports and failed) or (run.role is UNLOAD and not failed):
+            publishers.close(id)
 
     # -- how callbacks run -------------------------------------------------------------------------------------------
 
@@ -362,7 +327,7 @@ class ServerActor:
         holder = catalog.holder_of(resource.id)
         interrupted = role is UNLOAD and resource.response is None
         counts = role.counted and instead is None  # else a reload, whose attempts the row counts
-        attempt = deaths_of(catalog, role.counted, resource.id) + 1 if counts else number
+        attempt = deaths_of(catalog, role.name, resource.id) + 1 if counts else number
         place = resource.id, attempt, holder, self.spec.name, registrar
         current = Current(*place, role, number, interrupted, resource.request, self._runs_again)
         run = self._runs[instead or role]

@@ -61,7 +61,7 @@ class UsageCallbacks:
             future.set_result(not_run_again(catalog, resource, "usage", deaths_of(catalog, "usage", resource.id)))
             return future
         self._measuring[resource.id] = future
-        self._registrar.post(c.BeginRun("usage", resource.id, self._server.spec.name))
+        self._registrar.post(c.BeginRun("usage", resource))
         return future
 
     @on_loop
@@ -71,7 +71,7 @@ class UsageCallbacks:
 
         def done(numbers: dict[str, float] | None, error: BaseException | None) -> None:
             self._measuring.pop(resource_id, None)
-            self._registrar.post(c.RunEnded("usage", resource_id))
+            self._registrar.post(c.CallbackEnded("usage", resource_id))
             left = self._registrar.catalog.resources.get(resource_id)
             if left is None or left.phase not in (LOADED, PAUSED):
                 future.set_result(None)
