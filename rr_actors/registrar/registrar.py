@@ -85,7 +85,6 @@ from rr_actors.registrar.queries import (
     response_bytes,
 )
 from rr_actors.registrar.replacements import Replacements, encoded_response
-from rr_actors.registrar.servers import stored_values
 from rr_actors.registrar.servers.callback_context import (
     Current,
     check_not_measuring,
@@ -94,8 +93,9 @@ from rr_actors.registrar.servers.callback_context import (
     serving,
     status_callback_of,
 )
+from rr_actors.registrar.servers.on_demand_callbacks import Measured, Usages
+from rr_actors.registrar.servers.registered_servers import reread_values
 from rr_actors.registrar.servers.server_actor import ServerActor
-from rr_actors.registrar.servers.usage_callbacks import Measured, Usages
 from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import RunningLimit, finite_time, time_limit
 from rr_actors.runtime.user_loop import CallersLoop
@@ -675,7 +675,7 @@ class Registrar(Consumer):
             catalog = self._actor.whole()
             resources = [catalog.resources[id] for id in catalog.by_server.get(spec.name, ())]
             known = catalog.server_types.get(types_id(spec.name))
-        reread = stored_values.reread(server, resources, b"" if known is None else known.blob)
+        reread = reread_values(server, resources, b"" if known is None else known.blob)
         kept = self._calls.call(self._register, server, stored, reread)
         if kept and is_declared_here and spec.recovery is None and spec.recover is None:
             logger.warning(_KEPT, self.name, spec.name, kept)

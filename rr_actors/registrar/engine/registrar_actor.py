@@ -25,9 +25,9 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import Loaded, LoadRefused
 from rr_actors.registrar.model.rows import Held, Hold
-from rr_actors.registrar.servers.callback_failures import load_failure
 from rr_actors.registrar.servers.registered_servers import Servers
 from rr_actors.registrar.servers.server_actor import RequestReader
+from rr_actors.registrar.servers.server_base import load_failure
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.runtime.thread_rules import on_loop

@@ -30,9 +30,9 @@ from rr_actors.base.errors import (
     shown,
     text_of,
 )
-from rr_actors.base.names import new_id
+from rr_actors.base.names import new_id, short_id
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.values.canonical import Codec
+from rr_actors.base.values.canonical import Codec, text_of_value
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.registrar.core.callback_runs import deaths_of
@@ -48,16 +48,14 @@ from rr_actors.registrar.model.effects import StartCallback
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, STATUS, UNLOAD, USAGE, Role
 from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
-from rr_actors.registrar.servers import stream_events
 from rr_actors.registrar.servers.callback_context import Current, enter
-from rr_actors.registrar.servers.callback_failures import failure_of_callback, load_failure, said
-from rr_actors.registrar.servers.health_callbacks import HealthCallbacks
-from rr_actors.registrar.servers.server_base import nothing
-from rr_actors.registrar.servers.usage_callbacks import UsageCallbacks
+from rr_actors.registrar.servers.on_demand_callbacks import HealthCallbacks, UsageCallbacks
+from rr_actors.registrar.servers.server_base import failure_of_callback, load_failure, nothing, said
 from rr_actors.runtime.callback_errors import Raised, described_error
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.user_loop import COROUTINE, Done, closing
 from rr_actors.runtime.workers import Gate, is_async
+from rr_actors.streams.stream import StreamNews
 from rr_actors.wire.frames import ADVICE
 
 logger = Log("rr_actors.server")
@@ -296,7 +294,7 @@ class ServerActor:
         publishers, id = self.registrar.publishers, run.effect.resource.id
         if run.role.reports and not failed:
             if publishers.streams:  # most registrars have none
-                publishers.let_in(id, functools.partial(stream_events.tell, self, run.effect.resource))
+                publishers.let_in(id, functools.partial(_tell_stream, self, run.effect.resource))
         elif (run.role.reports and failed) or (run.role is UNLOAD and not failed):
             publishers.close(id)
 
@@ -494,6 +492,21 @@ class ServerActor:
 def _cancel(loop: asyncio.AbstractEventLoop, task: asyncio.Task[Any]) -> None:
     with contextlib.suppress(RuntimeError):  # the loop is closed, and has cancelled its tasks
         loop.call_soon_threadsafe(task.cancel)
+
+
+def _tell_stream(server: ServerActor, resource: Resource, news: StreamNews) -> None:
+    """Tell the watchers of the system what has happened to a stream. From any thread."""
+    node = server.registrar.node
+    if not node.watched.level[0]:
+        return
+    facts = {"registrar": server.registrar.name, "server": server.origin, "resource_id": resource.id}
+    facts |= {"request": text_of_value(resource.request), "stream": news.stream.name, "detail": news.stream.name}
+    if (before := news.before) is not None:
+        instead = f"{before.name} of resource {short_id(before.resource_id)}"
+        facts["detail"] += f", read by {news.reader} instead of {instead}"
+        facts |= {"reader": news.reader, "before": f"{before.resource_id}/{before.name}"}
+    with contextlib.suppress(Unavailable):  # the loop has ended
+        node.dispatcher.call(functools.partial(node.emit, news.what, **facts))
 
 
 class RequestReader:
