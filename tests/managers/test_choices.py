@@ -708,6 +708,30 @@ def test_killed_when_it_has_released_an_exclusive_one_it_chooses_anew(start: Sta
     world.settled(choice, choice.response.server.removeprefix("sensors/"))
 
 
+def test_restarted_in_order_when_it_has_released_an_exclusive_one_it_chooses_anew(start: Start) -> None:
+    world = World(start, [sensor("camera", break_first=True), sensor("lidar"), sensor("sonar")])
+    choice, gate = world.choose(), Gate()
+    world.served["lidar"].do_load = lambda request: gate()
+    world.say("camera", "FATAL")
+    gate.wait_arrived()
+    world.system.supervisor().terminate_child("choices")
+    gate.open()
+    world.system.supervisor().restart_child("choices")
+    choice.wait_status("UPDATE", timeout_s=LIMIT_S)
+    world.settled(choice, choice.response.server.removeprefix("sensors/"))
+
+
+def test_killed_while_its_part_says_error_it_takes_the_next_that_is_well(start: Start) -> None:
+    world = World(start, settle_s=0.1)
+    choice = world.choose()
+    world.broken = {"lidar", "sonar"}
+    world.say("camera", "ERROR", "dark")
+    choice.wait_status("ERROR", timeout_s=LIMIT_S)
+    world.respawn()
+    world.broken = {"camera", "lidar"}
+    world.settled(choice, "sonar")
+
+
 def test_killed_when_it_has_been_told_to_return_it_returns(start: Start) -> None:
     world = World(start, settle_s=0.2)
     choice = world.choose()

@@ -404,9 +404,9 @@ class Choices(Manager):
     def _give_up(self, search: _Search, status: Status) -> None:
         text = nothing_left(search.held.request, search.tried)
         logger.warning("%s", text)
-        self._forget(search.id)
-        self.registrar.send_status(search.id, Status(State.FATAL, text))
+        self.registrar.send_status(search.id, Status(State.FATAL, text))  # this process may be ending: it is not lost
         status.handled()
+        self._forget(search.id)
 
     def _break(self, id: str, part: Query) -> None:
         """Release the part. It is on disk before that the choice has none, and so a crash does not leave it so."""
@@ -531,7 +531,7 @@ class Choices(Manager):
     def _held(self) -> dict[str, Held]:
         """The choices by resource id; at first those of the catalog. With the lock."""
         return {
-            info.id: held_choice(info.request, info.response)
+            info.id: held_choice(info.request, info.response, self.registrar.children(info.id))
             for info in self.registrar.resources()
             if info.server == "choice" and info.phase == Phase.LOADED and info.status is not State.FATAL
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -9,6 +10,7 @@ import msgspec
 from rr_actors.base.values.canonical import encode, shown_plain
 from rr_actors.managers.choices.alternatives import Alternative, key_of
 from rr_actors.managers.templates import Parameter
+from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query
 
 
@@ -49,7 +51,12 @@ class Chosen(msgspec.Struct, frozen=True):
 
 
 class Held(msgspec.Struct):
-    """A choice that is loaded. `moving`: it has been told to return to a better alternative, and has not done so."""
+    """A choice that is loaded.
+
+    Attributes:
+        failing: its part has said ERROR, and nothing could take its place.
+        moving: it has been told to return to a better alternative, and has not done so.
+    """
 
     request: Choose
     present: str
@@ -58,9 +65,10 @@ class Held(msgspec.Struct):
     moving: bool = False
 
 
-def held_choice(request: Choose, chosen: Chosen) -> Held:
+def held_choice(request: Choose, chosen: Chosen, parts: Sequence[Query]) -> Held:
     """Return what is known of a choice that a process before has made."""
-    return Held(request, key_of(chosen.server, chosen.request), chosen.address)
+    failing = any(part.state is State.ERROR for part in parts)
+    return Held(request, key_of(chosen.server, chosen.request), chosen.address, failing)
 
 
 def chosen_of(one: Alternative, query: Query) -> Chosen:
