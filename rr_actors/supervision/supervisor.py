@@ -230,8 +230,11 @@ class SupervisorActor(LoopActor):
             pid, since, up_s = (None, None, None) if life is None else (life.pid, life.since, life.up_s)
             node = {"id": id, "type": child.spec.type, "state": child.state, "pid": pid}
             children.append(node | {"restarts": restarts[id], "since": since, "up_s": up_s})
-        counted = len(within(tree.restarts, time.monotonic(), tree.spec.max_seconds))
-        return describe_settings(tree.spec) | {"recent_restarts": counted, "children": children}
+        counted, excused = (
+            len(within(some, time.monotonic(), tree.spec.max_seconds)) for some in (tree.restarts, tree.excused)
+        )
+        counts = {"recent_restarts": counted, "excused_restarts": excused}
+        return describe_settings(tree.spec) | counts | {"children": children}
 
     def _child(self, id: str) -> Child:
         child = child_calls.find_child(self._supervision.tree, id)

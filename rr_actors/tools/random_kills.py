@@ -244,8 +244,9 @@ def _state(row: ChildRow) -> str:
 
 
 def _has_room(path: str, rows: Mapping[str, ChildRow]) -> bool:
+    """Return whether a restart of this child is allowed, also if those count later that are excused for now."""
     above = rows[path.rpartition("/")[0]]
-    return above.recent_restarts < above.max_restarts
+    return above.recent_restarts + above.excused_restarts < above.max_restarts
 
 
 def _catalogs(state_dir: Path) -> dict[str, Contents]:

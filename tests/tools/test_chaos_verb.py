@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import ChildRow
 from rr_actors.tools.inspection import Contents, check_delivered
 from rr_actors.tools.random_kills import KillPlan, RandomKills, missing_after
-from support import Workshop, pid_of
+from support import Workshop, kill, pid_of, wait_respawned
 from support_cli import run_cli
 from support_managers import Order, Shop
 
@@ -175,6 +176,25 @@ def test_a_kill_waits_until_the_supervisor_may_restart_the_child(start: Start) -
 
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert "root has made all the restarts that it allows (one_for_one, 1 in 2 s): waiting" in ran.stderr
+    assert system.ended is None
+
+
+def test_a_restart_that_is_excused_for_now_takes_the_room_of_one(start: Start, workshop: Workshop) -> None:
+    shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    system = start(rr.Supervisor([shop], max_restarts=1, max_seconds=60))
+    workshop.shut("load lamp")
+    app = system.open_registrar("app")
+    with ThreadPoolExecutor(1) as caller:
+        loading = caller.submit(app.load, "shop/thing", Order("lamp"))
+        workshop.wait("load lamp")
+        wait_respawned(system, "shop", kill(system, "shop"))  # the load may be to blame, until it ends well
+
+        ran = chaos("--kills", 1, "--seconds", 1)
+
+        assert ran.stdout.splitlines()[-2].startswith("0 kills in ")
+        assert "root has made all the restarts that it allows" in ran.stderr
+        workshop.open("load lamp")
+        loading.result()
     assert system.ended is None
 
 

@@ -110,6 +110,7 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
         up_s: for how many seconds it has been ready.
         strategy: of a supervisor: its strategy and restart intensity.
         max_restarts, recent_restarts: of a supervisor: how many restarts its window allows, and how many are in it.
+        excused_restarts: of a supervisor: how many more are in it as soon as callbacks that ran then end well.
         note: what an operator should know of a manager: that its configuration file is wrong, for instance.
     """
 
@@ -124,6 +125,7 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
     error: str = ""
     max_restarts: int = 0
     recent_restarts: int = 0
+    excused_restarts: int = 0
     note: str = ""
 
     @property

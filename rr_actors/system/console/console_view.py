@@ -365,8 +365,8 @@ def _rows(node: Mapping[str, Any], depth: int = 0) -> Iterator[c.ChildRow]:
         row = msgspec.structs.replace(row, error=readable(error))
     elif "strategy" in node:
         strategy = f"{node['strategy']}, {most} in {node['max_seconds']:g} s"
-        recent = node["recent_restarts"]
-        row = msgspec.structs.replace(row, strategy=strategy, max_restarts=most, recent_restarts=recent)
+        counts = {"recent_restarts": node["recent_restarts"], "excused_restarts": node["excused_restarts"]}
+        row = msgspec.structs.replace(row, strategy=strategy, max_restarts=most, **counts)
     yield row
     for child in node.get("children", ()):
         yield from _rows(child, depth + 1)
