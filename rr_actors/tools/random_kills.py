@@ -60,6 +60,7 @@ class KillReport(msgspec.Struct):
     Attributes:
         left_alone: why a child was never killed, by its path.
         violations: what is wrong, a sentence each. The first of them ended the run.
+        interrupted: whether Ctrl-C ended the run. What follows the last kill was then not checked.
     """
 
     seed: int
@@ -69,6 +70,7 @@ class KillReport(msgspec.Struct):
     catalogs: int = 0
     queries: int = 0
     violations: list[str] = []
+    interrupted: bool = False
 
 
 class RandomKills:
@@ -131,7 +133,7 @@ class RandomKills:
         return False
 
     def run(self) -> KillReport:
-        """Kill until the plan is done or something is wrong, and return the report.
+        """Kill until the plan is done, something is wrong, or Ctrl-C, and return the report.
 
         Raises:
             NotRunning: the system ended before the first kill.
@@ -145,6 +147,8 @@ class RandomKills:
             if not report.kills:
                 raise
             report.violations.append(f"the system ended after {report.kills[-1].path} was killed")
+        except KeyboardInterrupt:
+            report.interrupted = True
         report.seconds = time.monotonic() - self._began
         return report
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -20,7 +21,7 @@ from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import ChildRow
 from rr_actors.tools.inspection import Contents, check_delivered
 from rr_actors.tools.random_kills import KillPlan, RandomKills, missing_after
-from support import Workshop, kill, pid_of, wait_respawned
+from support import LIMIT_S, Workshop, kill, pid_of, wait_respawned
 from support_cli import run_cli
 from support_managers import Order, Shop
 
@@ -120,6 +121,22 @@ def test_no_kill_begins_after_the_given_seconds(shop: rr.System) -> None:
     report = report_of("--seconds", 0)
 
     assert (killed(report), report["passed"]) == ([], True)
+
+
+def test_ctrl_c_ends_a_run_with_a_report_of_what_was_done(start: Start) -> None:
+    system = start(rr.Supervisor([rr.ChildSpec(Idler, id="a")], max_restarts=1, max_seconds=600))
+    command = [sys.executable, "-m", "rr_actors", "chaos", "--state", str(system.state_dir)]
+
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stderr is not None
+        progress = iter(running.stderr)
+        assert any("waiting" in line for line in progress)
+        running.send_signal(signal.SIGINT)
+        out, _ = running.communicate(timeout=LIMIT_S)
+
+    assert running.returncode == 130
+    assert "1 kills in " in out
+    assert out.endswith("interrupted: what follows the last kill was not checked\n")
 
 
 # -- what is left alone -----------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from rr_actors.tools.verbs.console_verbs import DryRun, Timeout, complete_child
 app = typer.Typer()
 
 _SEEDS = 1_000_000
+_INTERRUPTED = 130  # as a shell has it
 
 
 @app.command(epilog="Example: rr-actors chaos --kills 20 --only cameras")
@@ -60,11 +61,11 @@ def chaos(
         say(f"seed {plan.seed}, the system in {client.welcome.state_dir}", err=True)
         report = run.run()
     if as_json:
-        say_json(msgspec.to_builtins(report) | {"passed": not report.violations})
+        say_json(msgspec.to_builtins(report) | {"passed": not report.violations and not report.interrupted})
     else:
         _say_report(report)
-    if report.violations:
-        raise typer.Exit(1)
+    if report.violations or report.interrupted:
+        raise typer.Exit(1 if report.violations else _INTERRUPTED)
 
 
 def _say_plan(run: RandomKills, plan: KillPlan, as_json: bool) -> None:
@@ -97,5 +98,7 @@ def _say_report(report: KillReport) -> None:
     say(f"{len(report.kills)} kills in {report.seconds:.1f} s, seed {report.seed}")
     if report.violations:
         say_lines("\n".join(report.violations), "wrong: ")
+    elif report.interrupted:
+        say("interrupted: what follows the last kill was not checked")
     else:
         say(f"each child runs again; {report.catalogs} catalogs, {report.queries} queries: they agree")
