@@ -186,6 +186,9 @@ class Components(Manager):
         try:
             in_turn = self._after(failed, status, part, lambda: self.candidates(request.type), why)
             with LateWord(self.registrar, failed.name if failed else request.type, status) as late:
+                if part.state is not State.FATAL:  # a holder has called it lost: its program is being ended
+                    with contextlib.suppress(UnknownQuery, LoadTimeout):  # it is gone, or its grace is long
+                        part.wait_status(State.FATAL, timeout_s=LOAD_MARGIN_S)
                 component = self._run_best(request, functools.partial(self._swap, status, part, late), in_turn, why)
         except UnknownQuery:
             status.handled()  # it is being unloaded
@@ -215,9 +218,8 @@ class Components(Manager):
         part = next(iter(self.registrar.children(me.resource_id)), None)
         if part is not None and part.state is not State.FATAL:
             programs = registrar_in(self._node, part.registrar, patient=True, owner=self)
-            with contextlib.suppress(UnknownQuery, LoadTimeout):  # it is gone, or its grace is long
+            with contextlib.suppress(UnknownQuery):  # it is gone
                 programs.send_status(part.resource_id, Status(State.FATAL, status.message))
-                part.wait_status(State.FATAL, timeout_s=LOAD_MARGIN_S)  # it has ended, and has no device any more
         return part
 
     def _failed_part(self, status: Status) -> Query | None:

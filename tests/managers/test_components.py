@@ -316,7 +316,8 @@ def test_a_component_that_is_silent_is_replaced_lowered_once_and_its_holders_hea
     with app.load("components/component", LoadComponent("lidar", {"place": str(tmp_path)}), on_status=heard) as lidar:
         assert lidar.response.name == "good"
         served()
-        eventually(lambda: states(heard) == [rr.State.WARNING, rr.State.UPDATE])
+        eventually(lambda: rr.State.UPDATE in states(heard))
+        assert states(heard)[0] is rr.State.WARNING
         assert messages(heard)[0].startswith(f"health: socket {tmp_path}/checked: ")
         assert (lidar.response.name, list(running_programs())) == ("old", [lidar.response.pid])
         kept = json.loads((system.registrar("components").directory / "reliability.json").read_text())["reliability"]
@@ -341,6 +342,20 @@ def test_the_only_component_of_a_type_is_started_anew_when_its_predecessor_has_e
             system.registrar("components").send_status(driver, LOST)
         eventually(lambda: driver.response.pid != pid)
         assert list(running_programs()) == [driver.response.pid]
+
+
+def test_the_holders_of_a_component_that_is_called_lost_hear_warning_while_its_program_takes_long_to_end(
+    begin: Begin,
+) -> None:
+    code = "import signal, time; signal.signal(15, signal.SIG_IGN); print('ready'); time.sleep(600)"
+    system, app = begin(entry("good", code=code).replace("grace_s = 1", "grace_s = 3"), entry("old", reliability=0.4))
+    heard = Calls()
+    with app.load("components/component", LIDAR, on_status=heard) as lidar:
+        system.registrar("components").send_status(lidar, LOST)
+        eventually(lambda: rr.State.UPDATE in states(heard), 20)
+        assert states(heard)[0] is rr.State.WARNING
+        assert "no scans" in messages(heard)[0]
+        eventually(lambda: list(running_programs()) == [lidar.response.pid])
 
 
 # -- the registry's file -------------------------------------------------------------------------------------------
