@@ -83,7 +83,7 @@ class KnownReader:
     Args:
         pid: its process.
         rebound: hears of the registrar whose reader goes on with this stream, and of the stream before.
-        greeting: a note that it is sent when it has come.
+        greeting: what it is sent when it has come.
 
     Attributes:
         wanted: how many frames it can take.
@@ -99,7 +99,7 @@ class KnownReader:
         parcels: Shared,
         ready: PollSet,
         rebound: Callable[[str, Stream], None],
-        greeting: str = "",
+        greeting: Packet | None = None,
     ) -> None:
         self._rebound = rebound
         self._greeting = greeting
@@ -157,8 +157,8 @@ class KnownReader:
         self.keep = hello.keep
         if hello.before is not None:
             self._rebound(hello.registrar, hello.before)
-        if self._greeting:
-            self._socket.send(msgspec.msgpack.encode(Packet(0, 0.0, b"", self._greeting)))
+        if self._greeting is not None:
+            self._socket.send(msgspec.msgpack.encode(self._greeting))
 
     def _ask(self, raw: bytes) -> None:
         self.stuck, self.keeps_since = False, None

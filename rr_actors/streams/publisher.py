@@ -28,7 +28,15 @@ from rr_actors.runtime.time_limits import deadline_of, time_limit
 from rr_actors.streams.known_reader import KnownReader, PublishedFrame
 from rr_actors.streams.loan import Loan
 from rr_actors.streams.stream import Stream, StreamInfo, StreamNews, StreamRow
-from rr_actors.streams.stream_sockets import IN_BAND_BYTES, ReaderSocket, address_of, check_process, close_in_children
+from rr_actors.streams.stream_sockets import (
+    IN_BAND_BYTES,
+    OPENED,
+    Packet,
+    ReaderSocket,
+    address_of,
+    check_process,
+    close_in_children,
+)
 from rr_actors.wire.segments import Parcel, Segments
 
 logger = Log("rr_actors")
@@ -143,13 +151,13 @@ class Publisher:
 
     stream: Stream
 
-    def __init__(self, stream: Stream, segments: Segments, greeting: str = "") -> None:
+    def __init__(self, stream: Stream, segments: Segments, greeting: str = OPENED) -> None:
         self.stream = stream
         self._what = f"stream {stream.name!r} of resource {stream.resource_id}"
         self._pid = os.getpid()
         self._limit_bytes = segments.limit_bytes
         self._parcels = segments.parcels(self._pid)
-        self._greeting = greeting
+        self._greeting = Packet(0, time.time(), b"", greeting)
         self._turn = threading.Lock()
         self._tasks: deque[Callable[[], None]] = deque()
         self._consumers: dict[int, KnownReader] = {}

@@ -23,6 +23,7 @@ from rr_actors.streams.stream_sockets import (
     AWAY,
     LOOK,
     NOTHING_NEWER,
+    OPENED,
     OPENED_ONCE,
     PACKET_BYTES,
     WISH,
@@ -59,13 +60,14 @@ class PublisherLink:
     """A reader's connection to a publisher. One thread at a time calls its methods.
 
     Args:
-        latest: the reader wants the newest frame, and not each.
+        last, opened_at: those of the connection before.
 
     Attributes:
         pid: the publisher's process.
         is_taken: whether the frame that take() has returned is the caller's, and not to be returned again.
         claim: on the value of the first packet in the inbox. The value has it, too.
         last: the number of the last frame that was taken; None: there was none of this stream.
+        opened_at: when the last publisher that was heard opened the stream, which tells two apart; 0: there was none.
         is_open: whether the publisher is there.
         opened_once: nobody opens the stream again if the publisher ends.
         note: why frames are missed, as the publisher says; "": they are not.
@@ -74,7 +76,7 @@ class PublisherLink:
         OSError: there is no publisher, or it runs as another user, or has no room now.
     """
 
-    def __init__(self, stream: Stream, hello: Hello) -> None:
+    def __init__(self, stream: Stream, hello: Hello, last: int | None, opened_at: float) -> None:
         self._stream = stream
         connected = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         self._line = Line(connected)
@@ -88,7 +90,8 @@ class PublisherLink:
         self._offered_to = 0  # the thread that take() has given the first frame to
         self._number = 0  # of that frame
         self.is_taken = False
-        self.last: int | None = None
+        self.last = last
+        self.opened_at = opened_at
         self._owed = 1 if self._latest else 0  # frames that it has not said that it can take
         self._is_asked = False  # it has said so, and has got none since
         self._is_away = False  # the publisher knows that nobody waits
@@ -176,7 +179,7 @@ class PublisherLink:
             elif not packet.note:
                 return True
             else:
-                self._hear(packet.note)
+                self._hear(packet)
                 self._inbox.clear()
         return False
 
@@ -190,7 +193,7 @@ class PublisherLink:
                 return True
             if packet.note:
                 newer = newer or packet.note == NOTHING_NEWER
-                self._hear(packet.note)
+                self._hear(packet)
                 self._inbox.pop()
                 continue
             newer = True
@@ -227,8 +230,7 @@ class PublisherLink:
         except Exception:
             self.is_taken = True  # no other call could make it
             raise
-        last = 0 if self.last and packet.number <= self.last else self.last  # a manager in a thread has crashed
-        missed = 0 if last is None else packet.number - last - 1
+        missed = 0 if self.last is None else packet.number - self.last - 1
         frame = StreamFrame(value, packet.number, packet.published_at, missed, self._stream)
         self._offered_to = threading.get_ident()
         return frame
@@ -246,11 +248,14 @@ class PublisherLink:
             return packet_of(raw) if raw else None
         return None
 
-    def _hear(self, note: str) -> None:
-        if note == OPENED_ONCE:
-            self.opened_once = True
-        elif note != NOTHING_NEWER:
-            self.note = note
+    def _hear(self, packet: Packet) -> None:
+        if packet.note in (OPENED, OPENED_ONCE):
+            self.opened_once = packet.note == OPENED_ONCE
+            if self.opened_at not in (0.0, packet.published_at):
+                self.last = 0  # another publisher counts from 1
+            self.opened_at = packet.published_at
+        elif packet.note != NOTHING_NEWER:
+            self.note = packet.note
 
     def _hold(self, packet: Packet | None) -> None:
         if self.claim is None and packet is not None and isinstance(packet.body, Parcel):

@@ -11,7 +11,7 @@ from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.streams.publisher import Publisher
 from rr_actors.streams.stream import Stream, StreamNews
-from rr_actors.streams.stream_sockets import IN_BAND_BYTES, OPENED_ONCE
+from rr_actors.streams.stream_sockets import IN_BAND_BYTES, OPENED, OPENED_ONCE
 from rr_actors.wire.segments import Segments
 
 logger = Log("rr_actors")
@@ -51,7 +51,7 @@ class Publishers:
             streams = self.streams.setdefault(resource_id, {})
             if stream.name in streams:
                 raise NameTaken(f"resource {resource_id} has a stream {stream.name!r} already", name=stream.name)
-            publisher = streams[stream.name] = Publisher(stream, self._segments, OPENED_ONCE if once else "")
+            publisher = streams[stream.name] = Publisher(stream, self._segments, OPENED_ONCE if once else OPENED)
         if once and once not in self._warned:
             self._warned.add(once)
             logger.warning(

@@ -97,6 +97,7 @@ class StreamReader:
         self._before: Stream | None = None  # which it read until now
         self._link: PublisherLink | None = None
         self._last: int | None = None  # the number of the last frame of this stream
+        self._opened_at = 0.0  # when its last publisher had opened it
         self._publisher = 0  # the process of the last publisher of this stream
         self._apart_at: float | None = time.monotonic()  # since when it has no publisher
         self._is_once = False  # nobody opens the stream again
@@ -294,7 +295,8 @@ class StreamReader:
             self._part()
             if self._publisher:
                 self._before = self._stream
-            self._stream, self._last, self._publisher, self._is_once = stream, None, 0, False
+            self._stream, self._last, self._opened_at = stream, None, 0.0
+            self._publisher, self._is_once = 0, False
             self._apart_at = time.monotonic()
 
     def _meant(self) -> Stream | None:
@@ -354,11 +356,11 @@ class StreamReader:
         if self._stream is None or self._link is not None:
             return
         try:
-            link = PublisherLink(self._stream, msgspec.structs.replace(self._hello, before=self._before))
+            hello = msgspec.structs.replace(self._hello, before=self._before)
+            link = PublisherLink(self._stream, hello, self._last, self._opened_at)
         except OSError:
             return
-        is_new = self._publisher and link.pid != self._publisher  # it counts from 1
-        link.last = 0 if is_new else self._last
+        is_new = self._publisher and link.pid != self._publisher
         self._is_once = self._is_once and not is_new
         self._link, self._before, self._publisher, self._apart_at = link, None, link.pid, None
 
@@ -367,7 +369,7 @@ class StreamReader:
         link, self._link = self._link, None
         if link is not None:
             link.settle()
-            self._last = link.last
+            self._last, self._opened_at = link.last, link.opened_at
             self._is_once = self._is_once or link.opened_once  # else one that a dying publisher did not take in
             self._apart_at = time.monotonic()
             link.close()

@@ -35,8 +35,9 @@ that it looks now. Who looks gets the newest frame, or the note NOTHING_NEWER.""
 NOTHING_NEWER = "nothing newer"
 """A note: the newest frame has been sent."""
 
+OPENED = "opened"
 OPENED_ONCE = "its server has recovery='keep' and no recover callback, so nobody opens the stream again"
-"""A note that the publisher sends to each new reader."""
+"""The notes of which the publisher sends one to each new reader, with the time at which the stream was opened."""
 
 _LISTENS = 0x10000  # the flag of a listening socket in /proc/net/unix
 _FIELDS = 8  # of a line there that has a name
