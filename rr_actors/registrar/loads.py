@@ -20,7 +20,7 @@ from typing import Any, Protocol, TypeVar
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.actors.remote.start_order import why_registrar_too_early
+from rr_actors.actors.remote.hub import why_registrar_too_early
 from rr_actors.actors.turns import has_a_turn
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
 from rr_actors.base.names import ServerId, new_id

@@ -40,7 +40,7 @@ class Level(Protocol):
     def __getitem__(self, at: int, /) -> int: ...
 
 
-class Watched(Protocol):
+class Observed(Protocol):
     """Has the level of a system."""
 
     @property
@@ -71,7 +71,7 @@ class _Nobody:
 class _Several:
     """Several systems of one process."""
 
-    def __init__(self, systems: Sequence[Watched]) -> None:
+    def __init__(self, systems: Sequence[Observed]) -> None:
         self._systems = systems
 
     @property
@@ -89,10 +89,10 @@ class Notes:
     """
 
     def __init__(self) -> None:
-        self.watched: Watched = _Nobody()
-        self._systems: tuple[tuple[Watched, NoteTaker], ...] = ()
+        self.watched: Observed = _Nobody()
+        self._systems: tuple[tuple[Observed, NoteTaker], ...] = ()
 
-    def begin(self, watched: Watched, taker: NoteTaker) -> None:
+    def begin(self, watched: Observed, taker: NoteTaker) -> None:
         """Have the taker note the messages while the system is recorded."""
         self._set((*self._systems, (watched, taker)))
 
@@ -100,7 +100,7 @@ class Notes:
         """Have the taker note nothing any more."""
         self._set(tuple(known for known in self._systems if known[1] is not taker))
 
-    def _set(self, systems: tuple[tuple[Watched, NoteTaker], ...]) -> None:
+    def _set(self, systems: tuple[tuple[Observed, NoteTaker], ...]) -> None:
         self._systems = systems
         several = [watched for watched, _ in systems]
         self.watched = several[0] if len(several) == 1 else _Several(several) if several else _Nobody()

@@ -12,7 +12,7 @@ from typing import Any
 import pykka
 from pykka import ActorDeadError, ActorRegistry
 
-from rr_actors.actors.messaging import death_watch
+from rr_actors.actors.messaging import ask_cycles, death_watch
 from rr_actors.actors.messaging.ask_cycles import Chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import Reply, StopReply
@@ -21,14 +21,13 @@ from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.actors.remote.inbound import Asker, Visitor
 from rr_actors.actors.remote.peer import Cut, Line, PendingCall, Whereabouts
 from rr_actors.actors.remote.protocol import ASKS, KIND, PATH_URN, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
-from rr_actors.actors.remote.start_order import why_too_early
 from rr_actors.base import pickling
 from rr_actors.base.errors import ActorUnavailable, Unavailable, UsageError
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.shielding import Flag
-from rr_actors.wire.name_service import Directory, Presence, actor_key
+from rr_actors.wire.name_service import Directory, Presence, Turn, actor_key, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_sockets import paused, pid_of
 from rr_actors.wire.unix_transport import UnixTransport
@@ -422,6 +421,43 @@ class ActorHub:
         return kind(
             self.local, self._dispatcher, link, self._visitors.discard, self._transport.segments.parcels(link.pid)
         )
+
+
+# The start order: what the on_start of an actor cannot wait for, as it starts only after that actor.
+
+
+def why_too_early(directory: Directory, path: str, wait: str) -> str:
+    """Say why the actor at `path` cannot come before the on_start that runs this code returns; "" if it can.
+
+    Args:
+        wait: the verb for what on_start should do later: "load", "ask".
+    """
+    asker = ask_cycles.starting()
+    if asker is None:
+        return ""
+    mine, theirs = asker.name.split("/"), path.split("/")
+    same = next((at for at, parts in enumerate(zip(mine, theirs, strict=False)) if parts[0] != parts[1]), 0)
+    if not same:  # in other trees, or one is above the other
+        return ""
+    now, due = (directory.lookup(actor_key("/".join(parts[: same + 1]))) for parts in (mine, theirs))
+    if now is None or now.turn is not Turn.NOW or due is None or due.turn is not Turn.DUE:
+        return ""
+    above, first, later = "/".join(mine[:same]), theirs[same], mine[same]
+    return (
+        f"{path} starts after {asker.name}, whose on_start has not returned: put {first!r} before {later!r} in the "
+        f"list of {above}, or {wait} after on_start, in a thread"
+    )
+
+
+def why_registrar_too_early(directory: Directory, name: str) -> str:
+    """Say as why_too_early() why a manager, whose registrar has this name, cannot come before this on_start returns."""
+    asker = ask_cycles.starting()
+    entry = None if asker is None else directory.lookup(registrar_key(name))
+    if asker is None or entry is None or entry.status is not Presence.STARTING:
+        return ""
+    top = asker.name.partition("/")[0]
+    paths = [path for path in directory.actor_paths(top) if path.endswith(f"/{name}")]
+    return why_too_early(directory, paths[0], "load") if len(paths) == 1 else ""
 
 
 def _is_gone(address: str) -> bool:
