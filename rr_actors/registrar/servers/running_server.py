@@ -1,4 +1,4 @@
-"""ServerActor: one kind of resource of one registrar. It runs its callbacks in workers, and says how they ended.
+"""RunningServer: one kind of resource of one registrar. It runs its callbacks in workers, and says how they ended.
 
 In the worker, a request and a response are decoded, the callback is called, and its result is encoded. The end of a run
 is heard on the event loop; the end of one that goes well is heard first in the worker, which may deal with it.
@@ -112,7 +112,7 @@ class Run(msgspec.Struct, frozen=True, gc=False):
     began_s: float
 
 
-class ServerActor:
+class RunningServer:
     """One server of a registrar: starts its callbacks, and says how they ended.
 
     The registrar tells it which callback to start (StartCallback); it posts CallbackEnded back.
@@ -494,7 +494,7 @@ def _cancel(loop: asyncio.AbstractEventLoop, task: asyncio.Task[Any]) -> None:
         loop.call_soon_threadsafe(task.cancel)
 
 
-def _tell_stream(server: ServerActor, resource: Resource, news: StreamNews) -> None:
+def _tell_stream(server: RunningServer, resource: Resource, news: StreamNews) -> None:
     """Tell the watchers of the system what has happened to a stream. From any thread."""
     node = server.registrar.node
     if not node.watched.level[0]:
@@ -517,7 +517,7 @@ class RequestReader:
     """
 
     def __init__(
-        self, registrar: RegistrarBase, consumers: Consumers, server_of: Callable[[str], ServerActor | None]
+        self, registrar: RegistrarBase, consumers: Consumers, server_of: Callable[[str], RunningServer | None]
     ) -> None:
         self._registrar, self._consumers, self._server_of = registrar, consumers, server_of
 
