@@ -105,11 +105,12 @@ ACTIONS: list[type[rr.Action]] = [Moves, Step, Alone, Loads, Gives, Takes, Much,
 
 
 class World:
-    def __init__(self, start: Start, place: Path) -> None:
+    def __init__(self, start: Start, place: Path, **options: Any) -> None:
         self.place = place
         kwargs = {"actions": ACTIONS, "stop_s": 1.0}
-        children = [rr.ChildSpec(Actions, id=id, kwargs=kwargs) for id in ("actions", "arm")]
-        self.system = start(rr.Supervisor([*children, rr.ChildSpec(Slow, id="slow")], max_restarts=1000))
+        engine, arm = (rr.ChildSpec(Actions, id=id, kwargs=kwargs) for id in ("actions", "arm"))
+        children = [engine, rr.ChildSpec(Slow, id="slow"), arm]
+        self.system = start(rr.Supervisor(children, max_restarts=1000, **options))
         self.app = self.system.open_registrar("app")
         self.messages = self.system.ref("actions").proxy()
 
@@ -169,6 +170,16 @@ def test_after_a_kill_of_the_engine_an_action_of_another_manager_ends_before_it_
         wait_respawned(world.system, "actions", kill(world.system, "actions"))
         eventually(lambda: world.lines() == ["began 1", "ended", "began 2"], LIMIT_S)
         (world.place / "go").touch()
+        state_is(query, "FINISHED")
+
+
+def test_an_action_whose_other_manager_is_restarted_in_order_is_run_again(start: Start, tmp_path: Path) -> None:
+    world = World(start, tmp_path, strategy="rest_for_one")
+    with world.load("Moves", actor="arm") as query:
+        eventually(lambda: world.lines() == ["began 1"], LIMIT_S)
+        kill(world.system, "slow")
+        eventually(lambda: world.lines() == ["began 1", "ended", "began 2"], LIMIT_S)
+        (tmp_path / "go").touch()
         state_is(query, "FINISHED")
 
 

@@ -49,6 +49,7 @@ from rr_actors.managers.actions.graph_runs import (
     Halt,
     NodeRun,
     Pause,
+    Restored,
     Resume,
     checked_inputs,
     document_in,
@@ -65,6 +66,8 @@ from rr_actors.registrar.servers.callback_context import current
 from rr_actors.runtime.processes.isolated import Events, run_isolated
 
 logger = Log("rr_actors.managers.actions")
+
+INTERRUPTED = "interrupted"
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,10 @@ class RunControlled:
 
 @dataclass(frozen=True)
 class ActionEnd:
-    """The response: `result` is on_true or on_false; `outputs` by flat names."""
+    """The response: `result` is on_true or on_false; `outputs` by flat names.
+
+    To an engine in another manager it is `INTERRUPTED` if the manager of the action stops: the action runs again.
+    """
 
     result: str
     outputs: dict[str, Any]
@@ -314,6 +320,8 @@ class Actions(Manager):
                     del self._controls[request.run]
             control.over.set()
         if self._closing and action.stopping.is_set():
+            if request.engine not in ("", self.registrar.name):
+                return ActionEnd(INTERRUPTED, {})
             raise LoadFailed(f"{request.action}: its manager stops", server=f"{self.registrar.name}/action")
         return end
 
@@ -460,10 +468,12 @@ class Actions(Manager):
         actor = action.actor or self.registrar.name
         return self.registrar.load(f"{actor}/action", request, parent=graph_id, timeout_s=None)
 
-    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended:
+    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended | Restored:
         """Return how a run has ended whose query is held; of a sub-graph, wait for that."""
         response = query.response
         if isinstance(response, ActionEnd):
+            if response.result == INTERRUPTED:
+                return Restored((node,), run.number)
             return Ended(node, run.number, response.result, response.outputs)
         ended = wait_ended(query, None)
         result = "on_error" if ended.result == "on_halted" else ended.result

@@ -63,8 +63,8 @@ class Runner(Protocol):
         """Run an action, and return its query when it has ended."""
         ...
 
-    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended:
-        """Return how a run has ended whose query is held; of a sub-graph, wait for that."""
+    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended | Restored:
+        """Return how a run has ended whose query is held, or that it is to run again; of a sub-graph, wait for that."""
         ...
 
     def tell_run(self, actor: str, key: str, word: Word, step: int) -> Callable[[float], str]:
@@ -397,7 +397,12 @@ class GraphEngine:
             end = self._runner.end_of(query, name, node)
         except Exception as error:
             end = Ended(name, node.number, "on_error", why=_why(error))
-        if not self._runner.is_closing():
+        if self._runner.is_closing():
+            return
+        if isinstance(end, Restored):
+            self._release(query)
+            self._insist(end)
+        else:
             self._insist(end, query)
 
     def _wait_over(self, name: str, node: NodeRun) -> None:

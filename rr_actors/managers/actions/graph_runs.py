@@ -134,9 +134,13 @@ class Change(msgspec.Struct, frozen=True):
 
 
 class Restored(msgspec.Struct, frozen=True):
-    """A crash has ended the runs of these actions before their end was on disk."""
+    """A crash, or a restart, has ended the runs of these actions before their end was on disk.
+
+    `number`: of the run of the only one; 0: the newest run of each.
+    """
 
     lost: tuple[str, ...]
+    number: int = 0
 
 
 Event = Begin | Ended | Halt | Pause | Resume | Change | Restored
@@ -179,7 +183,7 @@ def decide(graph: ActionGraph, run: GraphRun, event: Event) -> tuple[GraphRun, t
         case Change():
             decision.change(event.graph, event.start)
         case Restored():
-            decision.restored(event.lost)
+            decision.restored(event.lost, event.number)
     decision.settle()
     return decision.outcome()
 
@@ -303,9 +307,11 @@ class _Decision:
         if start:
             self.start_named(start)
 
-    def restored(self, lost: tuple[str, ...]) -> None:
+    def restored(self, lost: tuple[str, ...], number: int) -> None:
         for name in lost:
-            node = self.leaving.get(name) or self.nodes[name]
+            node = self.leaving.get(name) or self.nodes.get(name)
+            if node is None or number not in (0, node.number):
+                continue
             if node.state == "STOPPING":
                 self.ended(Ended(name, node.number, "on_stopped"))
             elif node.state == "PAUSED":  # nothing begins in a pause, and what a crash ends there is no attempt
