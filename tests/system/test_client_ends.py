@@ -163,7 +163,8 @@ def test_a_revocation_has_its_reason_and_its_deadline(system: rr.System, client:
 
 
 def test_each_field_of_a_status_reaches_a_client() -> None:
-    of_status = {name for name in Status.__slots__ if not name.startswith("_")}
+    slots = {name for cls in Status.__mro__ for name in getattr(cls, "__slots__", ())}
+    of_status = {name for name in slots if not name.startswith("_")}
     values = {
         "state": "ERROR", "message": "m", "resource_id": "r", "query_id": "q", "source": "a/b",
         "repeated": True, "reason": "revoked", "deadline_s": 2.5,
