@@ -176,7 +176,7 @@ def _frames(rounds: int) -> dict[str, float]:
 def decided_alone(actor: RegistrarActor, load: Load) -> Decision:
     """What one Load changes and causes, if nothing else comes with it."""
     with actor.lock:
-        return decide(actor.catalog, [actor.servers.read(load, _ORIGIN)])
+        return decide(actor.catalog, [actor.reader.read(load, _ORIGIN)])
 
 
 def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
