@@ -31,11 +31,10 @@ EXPECTED = {
     ],
     "ping_pong": [
         "ping, pong, pong",
-        "participant p1 as root/ping",
-        "Ask 'ping'",
-        "Answer 'ping, pong'",
-        "Ask 'ping, pong'",
-        "Answer 'ping, pong, pong'",
+        "sequenceDiagram",
+        "    participant p1 as root/ping",
+        "    p1->>p2: ",
+        "    p2-->>p1: ",
     ],
     "replacing": [
         "killed, with both lidars held",

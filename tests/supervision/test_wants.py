@@ -188,6 +188,7 @@ def _restarted(state_dir: Path, wants: Wants, role: str, kind: str, numbers: tup
         app = system.open_registrar("app")
 
         def scene(at: int) -> bool:
+            system.registrar("maker").save_catalog()  # else each restart reads one file more than the one before
             with app.load("maker/thing", str(at)):
                 old = pid_of(system, "maker")
                 wants.arm(role, kind, at)
