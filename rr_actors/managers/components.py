@@ -24,12 +24,9 @@ from __future__ import annotations
 import contextlib
 import functools
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, TypeVar
-from weakref import WeakValueDictionary
 
 import msgspec
 
@@ -110,20 +107,6 @@ Run = Callable[[RunProgram, Made, float], Component]
 """Runs a program within a time limit in seconds, and returns the component that it is."""
 
 
-class _Turn(AbstractContextManager["_Turn"]):
-    """A lock that a WeakValueDictionary can have."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-
-    def __enter__(self) -> _Turn:
-        self._lock.acquire()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._lock.release()
-
-
 class NoComponent(LoadFailed):
     """The registry has no component of the type, or none of them could be loaded."""
 
@@ -150,8 +133,6 @@ class Components(Manager):
         self._programs = programs
         self._replace = replace
         self._retries = Retries[tuple[str, str]]()  # of components, by the id of the resource that has them and by name
-        self._replacing = WeakValueDictionary[str, _Turn]()  # by resource: two statuses never replace one part twice
-        self._lock = threading.Lock()
 
     def on_stop(self) -> None:
         """Wait for no component that has failed any more."""
@@ -172,12 +153,11 @@ class Components(Manager):
         Only its own fault lowers it. A crash may repeat this. The failure counts once, so the same component is chosen
         again.
         """
-        with self._turn(current().resource_id):
-            part = self._failed_part(status)
-            if part is None and status.resource_id == current().resource_id:
-                part = self._part_called_lost(status)
-            if part is not None:
-                self._replace_component(request, status, part)
+        part = self._failed_part(status)
+        if part is None and status.resource_id == current().resource_id:
+            part = self._part_called_lost(status)
+        if part is not None:
+            self._replace_component(request, status, part)
 
     # -- replacing -------------------------------------------------------------------------------------------------
 
@@ -198,11 +178,6 @@ class Components(Manager):
             logger.warning(
                 "%s: %s takes the place of one that failed: %s", request.type, component.name, status.message
             )
-
-    def _turn(self, id: str) -> _Turn:
-        """Return what one status callback of a resource holds at a time."""
-        with self._lock:
-            return self._replacing.setdefault(id, _Turn())
 
     def _part_called_lost(self, status: Status) -> Query | None:
         """Return the program of a component that a holder has called lost; None if there is nothing to replace.
