@@ -232,14 +232,15 @@ def test_a_program_that_a_holder_calls_lost_is_ended_before_the_others_hear(star
 
 
 def test_a_paused_program_is_not_silent_and_is_checked_again_when_it_goes_on(
-    start: Start, talker: RunProgram, quiet: Path
+    start: Start, talker: RunProgram, quiet: Path, tmp_path: Path
 ) -> None:
     system, app = begin(start, idle="pause")
     heard = Calls()
     program = app.load("programs/program", talker, on_status=heard)
     program.standby()
     eventually(lambda: stands(program.response.pid))
-    time.sleep(1.5)  # longer than line_every_s: that nothing is heard has no event
+    with app.load("programs/program", python(TALK, tmp_path, health=talker.health)) as silent:  # from its start on
+        silent.wait_status(FATAL, timeout_s=30)  # so a program that does not stand would have been found silent, too
     assert not heard
     program.priority = 0
     eventually(lambda: not stands(program.response.pid))
@@ -302,20 +303,32 @@ def test_a_silent_program_is_ended_and_heard_of_whatever_moment_its_manager_is_k
     assert not running_programs()
 
 
-def test_the_silence_of_a_standstill_of_the_manager_does_not_count(start: Start, talker: RunProgram) -> None:
+def test_the_silence_of_a_standstill_of_the_manager_does_not_count(start: Start, quiet: Path, tmp_path: Path) -> None:
     """The manager and the program stand still together, as on a machine that is suspended."""
-    system, app = begin(start)
+    checks = tmp_path / "checks"
+
+    def count(pid: int) -> bool:
+        with checks.open("a") as lines:
+            lines.write("checked\n")
+        return True
+
+    def checked() -> int:
+        return len(checks.read_text().splitlines()) if checks.exists() else 0
+
+    system, app = begin(start, probes={"count": count})
     heard = Calls()
+    talker = python(TALK, quiet, health=ProgramHealth(line_every_s=1.0, probe="count", **OFTEN))
     with app.load("programs/program", talker, on_status=heard) as program:
         pids = [pid_of(system, "programs"), program.response.pid]
-        time.sleep(0.5)  # some checks have been made: there is no event of that
+        eventually(lambda: checked() >= 5)
         for pid in pids:
             hang(pid)
-        time.sleep(1.5)  # longer than line_every_s
+        before = checked()
+        time.sleep(1.5)  # the standstill itself, which is longer than line_every_s
         for pid in reversed(pids):
             os.kill(pid, signal.SIGCONT)
+        eventually(lambda: checked() >= before + 5)
         assert system.registrar("programs").resources()[0].state == "OK"
-        time.sleep(0.5)
         assert not heard
 
 

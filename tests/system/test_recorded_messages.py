@@ -28,7 +28,7 @@ class Pong(rr.Actor):
 
 
 class Ping(rr.Actor):
-    """Sends what it is told to: ("ask", ref, ...) asks with each number, and so on."""
+    """Sends as its message says: for ("ask", ref, 1, 2) it asks the actor of `ref` with each number."""
 
     def on_receive(self, message: Any) -> Any:
         match message:
