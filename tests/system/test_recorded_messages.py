@@ -129,7 +129,12 @@ def test_an_ask_has_its_answer_and_what_its_handler_asked(system: rr.System) -> 
         "", timings[0].id, timings[1].id, timings[2].id, timings[1].id, timings[4].id
     ]  # fmt: skip
     assert all(one.ended is not None and one.ended >= one.began for one in timings)
-    assert len({span.context.trace_id for span in trace.spans()}) == 1
+    asked, handled = timings[0], timings[1]
+    assert handled.ended is not None
+    assert asked.ended is not None
+    assert handled.ended < asked.ended  # the answer was on its way
+    for some in (trace, recording.messages("pong"), recording.messages()):
+        assert len({span.context.trace_id for span in some.spans()}) == 1
 
 
 def test_a_tell_and_a_timer_have_the_message_that_caused_them(system: rr.System) -> None:
@@ -176,6 +181,8 @@ def test_the_trace_of_a_load_has_what_its_callback_asked(system: rr.System) -> N
         query = app.load("cameras/camera", "left")
         wait_for(recording, "pong", expected=["cameras>pong Ask 4", "pong>cameras Answer 5"])
         assert {"cameras>pong Ask 4", "pong>cameras Answer 5"} <= set(said(recording.trace(query)))
+        assert {"cameras>pong Ask 4", "pong>cameras Answer 5"} <= set(said(recording.trace(query.resource_id)))
+        assert recording.trace(query.resource_id).spans()
 
 
 def test_a_down_comes_from_the_actor_that_ended(start: Start) -> None:

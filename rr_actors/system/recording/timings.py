@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 
 import msgspec
@@ -16,12 +17,15 @@ ANSWERS = {
 """For the name of each answer, that of its question."""
 
 
+_DIGITS = re.compile("[0-9a-f]{32}")
+
+
 class Timing(msgspec.Struct, frozen=True):
     """The duration of a load, an unload or a callback, or of an ask or its handler.
 
     Attributes:
         id: 16 hexadecimal digits, the same in each process.
-        trace_id: 32 hexadecimal digits, of the whole trace: the id of the query that began it.
+        trace_id: 32 hexadecimal digits, of the whole trace: see trace_id_of().
         parent: the id of the timing that it belongs to; "" for none.
         name: "load cameras/camera", "unload cameras/camera", "callback load cameras/camera"; "ask root/maps",
             "handle Ask".
@@ -45,6 +49,11 @@ class Timing(msgspec.Struct, frozen=True):
     began: float
     ended: float | None = None
     error: str = ""
+
+
+def trace_id_of(what: str) -> str:
+    """Return the 32 hexadecimal digits of a trace: the id that it is about, or digits that are made of the words."""
+    return what if _DIGITS.fullmatch(what) else hashlib.blake2b(what.encode(), digest_size=16).hexdigest()
 
 
 def timings_of(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
@@ -82,7 +91,9 @@ def _asks(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
             found[key] = Timing(*what, entry.process, entry.pid, entry.registrar, "", entry.query, "", entry.at)
         elif entry.name in REPLIES:
             for key in (("ask", entry.query), ("handle", entry.query)):
-                if key in found:
+                if key in found and (
+                    key[0] == "ask" or entry.event == "sent"
+                ):  # a handler has ended before that is heard
                     error = entry.detail if entry.name == RAISED else ""
                     found[key] = msgspec.structs.replace(found[key], ended=entry.at, error=error)
     return list(found.values())

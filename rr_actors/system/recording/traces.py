@@ -19,7 +19,7 @@ from rr_actors.base.errors import NotFound, UsageError, few, shown
 from rr_actors.base.notebook import bundle, table
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.sequence_diagrams import sequence_of
-from rr_actors.system.recording.timings import Timing, timings_of
+from rr_actors.system.recording.timings import Timing, timings_of, trace_id_of
 
 DEAD_LETTER = "dead_letter"
 """The event of a message that reached no actor. Its registrar is that actor."""
@@ -46,14 +46,14 @@ class Trace:
 
     def timings(self) -> list[Timing]:
         """Return the duration of each load, unload and ask, with its callback or handler, below what it is for."""
-        return timings_of(self.id, self.entries)
+        return timings_of(trace_id_of(self.id), self.entries)
 
     def spans(self) -> list[Any]:
         """Return the timings as OpenTelemetry's spans, for any SpanExporter's export(). Needs the extra `otel`.
 
         A load's span belongs to the consumer's process. Below it is the span of its callback, in the provider's
         process. An ask has one of its asker, and below it that of the handler. The trace's id is the query's id, or
-        that of the message.
+        that of the message; of a resource, or of several actors, it is made of the id or the names.
 
         Raises:
             UsageError: the extra is not installed.
