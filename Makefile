@@ -1,4 +1,5 @@
-# Every target sets up the virtual environment it needs on first use, and again when pyproject.toml changes.
+# Every target sets up the virtual environment it needs on first use, and again when pyproject.toml or
+# constraints.txt changes.
 #   make demo   the robot's mission on real processes, with the faults
 #   make lab    experiments to learn from, on a web page: kill a child and see what its supervisor does
 #   make test   the tests, side by side on two cores and more: ten minutes on two
@@ -20,6 +21,7 @@
 #               (PYTHON=... VENV=.venv-3.13 EXTRAS=test,cli)
 #   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions; bench-peers: beside
 #               xoscar, Thespian and Ray, pictures beside iceoryx2 and Zenoh; it installs them in an environment of their own)
+#   make constraints  the newest version of each package that `make` installs, into constraints.txt (PYTHON=python3.11)
 # PYTHON=... chooses the interpreter (3.11 or later); VENV=... where the environment goes; EXTRAS=... what goes into it.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
@@ -36,7 +38,7 @@ CORES := $(shell getconf _NPROCESSORS_ONLN)
 SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 2 ? 2 : 4)))
 SLOW_SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 
-.PHONY: demo lab docs names test test-slow test-all lint format chaos breakages simulate explore streams fuzz fuzz-quick bench bench-quick bench-peers figures clean
+.PHONY: demo lab docs names test test-slow test-all lint format chaos breakages simulate explore streams fuzz fuzz-quick bench bench-quick bench-peers figures constraints clean
 .DELETE_ON_ERROR:
 
 # Where nothing is set up yet, these two do not wait for what the tests need.
@@ -118,15 +120,21 @@ define INSTALL
 	@echo "Setting up $(VENV) with what rr_actors[$(1)] needs: this takes a minute or so, and is done once."
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) \
 		|| { echo "cannot make a virtual environment: install your system's python3-venv package" >&2; rm -rf $(VENV); exit 1; }
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$(1)]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[$(1)]"
 	@touch $@
 endef
 
-$(STAMP): pyproject.toml
+$(STAMP): pyproject.toml constraints.txt
 	$(call INSTALL,$(EXTRAS))
 
-$(VENV)/.installed-%: pyproject.toml
+$(VENV)/.installed-%: pyproject.toml constraints.txt
 	$(call INSTALL,$*)
+
+# On the oldest Python: what is for that one is for the later ones too.
+constraints:
+	rm -rf build/newest && "$(PYTHON)" -m venv build/newest
+	build/newest/bin/python -m pip install --quiet --disable-pip-version-check ".[dev]"
+	build/newest/bin/python -m pip freeze --exclude rr-actors >constraints.txt
 
 clean:
 	rm -rf .venv .venv-* .pytest_cache .ruff_cache .hypothesis .import_linter_cache build dist out bench.json bench-peers.json

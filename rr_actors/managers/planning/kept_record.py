@@ -28,7 +28,7 @@ class KeptRecord(Generic[R]):
         self._path = path
         self._saving = threading.Lock()
         self._is_behind = False
-        self.now = kind()
+        self.now: R = kind()
         try:
             with Folder.at(path.parent) as folder:
                 self.now = msgspec.json.decode(folder.read(path.name), type=kind)
