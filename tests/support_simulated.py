@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from typing import Any, Literal
 
 from rr_actors.supervision.core import child_calls, restarts
@@ -14,6 +14,7 @@ from rr_actors.supervision.core.state import (
     Decision,
     Exit,
     ExitSupervisor,
+    KeptChild,
     Mode,
     Report,
     StartChild,
@@ -122,24 +123,24 @@ class World:
 
     # -- calls --
 
-    def start(self) -> World:
-        self.take(restarts.decide_start(self.tree, self.now))
+    def start(self, kept: Iterable[KeptChild] = ()) -> World:
+        self.take(restarts.decide_start(self.tree, self.now, kept))
         return self
 
     def stop(self) -> World:
         self.take(restarts.decide_stop(self.tree, self.now))
         return self
 
-    def call(self, name: str, argument: Any) -> int:
+    def call(self, name: str, argument: Any, *more: Any) -> int:
         """Make an administrative call; its number is the key of its reply."""
         self._callers += 1
         function: Any = getattr(child_calls, name)
-        self.take(function(self.tree, argument, self._callers, self.now))
+        self.take(function(self.tree, argument, self._callers, self.now, *more))
         return self._callers
 
-    def answer(self, name: str, argument: Any) -> str | None:
+    def answer(self, name: str, argument: Any, *more: Any) -> str | None:
         """Make a call, let everything happen that it takes, and return or raise its answer."""
-        caller = self.call(name, argument)
+        caller = self.call(name, argument, *more)
         self.settle()
         reply = self.replies[caller]
         if reply.error:

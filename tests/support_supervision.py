@@ -25,6 +25,7 @@ from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import event_loop
+from rr_actors.storage.child_records import ChildRecords
 from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.supervision.hosted import Hosted, prepare
@@ -63,7 +64,7 @@ class Tree:
         self.node = Node(info, on_event=self.events.append, open_catalog=open_catalog, remove_unneeded=remove_catalogs)
         await self.node.start()
         spec = as_child_spec(self.spec)
-        Entries(self.node.directory).announce(spec, "root")
+        Entries(self.node.directory, ChildRecords(self.state.path)).announce(spec, "root")
         cls, args, kwargs = target_of(spec)
         self.hosted = prepare(self.node, cls, "root", self._exited)
         await self.hosted.start(args, kwargs, None)

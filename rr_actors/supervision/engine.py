@@ -11,7 +11,8 @@ import contextlib
 import functools
 import os
 import time
-from collections.abc import Callable, Collection, Coroutine
+from collections.abc import Callable, Collection, Coroutine, Sequence
+from dataclasses import replace
 from typing import Any
 
 from rr_actors.base.errors import RrError, StartFailed, Unavailable, text_of
@@ -40,9 +41,10 @@ from rr_actors.supervision.core.state import (
     SupervisorState,
     Why,
 )
+from rr_actors.supervision.core.transition import Draft
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.supervision.given_up import give_up
-from rr_actors.supervision.name_entries import Entries, manager_of, registrars_of
+from rr_actors.supervision.name_entries import Entries, KeptChildren, manager_of, registrars_of
 from rr_actors.wire.name_service import Presence, Turn
 
 logger = Log("rr_actors.supervision")
@@ -86,7 +88,8 @@ class Supervision:
         self.history = History()
         self.tree = SupervisorState.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
         self.final = False
-        self.entries = Entries(node.directory)
+        self.kept = KeptChildren(node, path)
+        self.entries = Entries(node.directory, self.kept.records)
         self._node = node
         self._target_of = target_of
         self._on_started = on_started
@@ -102,9 +105,17 @@ class Supervision:
 
     # -- requests --------------------------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Start the children, then call on_started or on_exit."""
-        self.apply(restarts.decide_start(self.tree, time.monotonic()))
+    async def start(self) -> None:
+        """Start the children, then call on_started or on_exit. Kept children start from what is on disk.
+
+        Raises:
+            CatalogError: their records cannot be listed.
+        """
+        kept = await self.kept.read() if self.tree.dynamic else ()
+        if self.tree.mode is not Mode.NEW:  # it was asked to stop
+            return
+        self._specs.update({each.id: replace(self.tree.template, id=each.id) for each in kept})
+        self.apply(restarts.decide_start(self.tree, time.monotonic(), kept))
 
     def stop(self, *, final: bool) -> None:
         """Stop the children, also in the middle of a start, then call on_exit if that has not been done.
@@ -127,6 +138,10 @@ class Supervision:
     def apply(self, decision: Decision) -> None:
         """Keep the decision's SupervisorState and perform its actions."""
         self.tree, actions = decision
+        if over := [action.id for action in actions if isinstance(action, Report) and self._is_over(action)]:
+            replies = [action for action in actions if isinstance(action, CallReply)]
+            actions = [action for action in actions if not isinstance(action, CallReply)]
+            self._task(self._forget(over, replies))  # no caller hears of an end that is not on disk
         steps = Steps()
         for action in actions:
             steps.take(f"performing a {type(action).__name__}", self._perform, action)
@@ -178,6 +193,27 @@ class Supervision:
             case ExitSupervisor():
                 self._on_exit(action)
 
+    def _is_over(self, report: Report) -> bool:
+        """Return whether a kept child has ended for good: it is forgotten, or has ended in order, with its supervisor.
+
+        One that has not ended in order may not have unloaded what it serves. It comes back, and then does.
+        """
+        if not self.kept.has(report.id):
+            return False
+        life = self._lives.get(report.run)
+        in_order = report.exit is not None and report.exit.reason != "killed"
+        return report.state is None or (self.final and in_order and life is not None and life.ready_at is not None)
+
+    async def _forget(self, ids: Sequence[str], replies: Sequence[CallReply]) -> None:
+        failure: RrError | None = None
+        try:
+            await self.kept.remove(ids)
+        except RrError as error:
+            logger.error("supervisor %s: %s will come back: %s", self.path, ", ".join(ids), error)
+            failure = error
+        for reply in replies:
+            self._perform(reply if reply.error or failure is None else CallReply(reply.caller, error=failure))
+
     async def _start(self, life: Life, delay_s: float) -> None:
         if delay_s > 0:
             with contextlib.suppress(TimeoutError):
@@ -189,6 +225,10 @@ class Supervision:
             return
         life.began = time.monotonic()
         try:
+            if life.why in (Why.NEW, Why.MANUAL) and (child := self.tree.children[life.id]).kept:
+                await self.kept.write(child.id, child.extra)
+                if life.told_to_stop.is_set():
+                    return
             life.run = self._new_run(life)
             ready = await life.run.start(by_hand=life.why in (Why.NEW, Why.MANUAL))
         except Exception as failure:
@@ -260,13 +300,16 @@ class Supervision:
     def _is_final(self, id: str) -> bool:
         """Return whether a child that is being stopped will not be started again."""
         child = self.tree.children.get(id)
-        forgotten = child is None or (child.phase is ChildPhase.STOPPING and child.spec.restart == "temporary")
-        return forgotten or self.tree.dynamic or self._ends_with_supervisor(id)
+        if child is None or self.tree.dynamic:
+            return child is None or self.final or Draft(self.tree).forgets(child)
+        forgotten = child.phase is ChildPhase.STOPPING and child.spec.restart == "temporary"
+        return forgotten or self._ends_with_supervisor(id)
 
     def _ends_with_supervisor(self, id: str) -> bool:
         """Return whether the supervisor is stopping and will not have this child at its next start."""
         stopping = self.tree.mode in (Mode.STOPPING, Mode.STOPPED)
-        return self.final or (stopping and id not in self._ids_of(self.tree.spec))
+        comes_back = id in self._ids_of(self.tree.spec) or self.kept.has(id)
+        return self.final or (stopping and not comes_back)
 
     def _ids_of(self, spec: Supervisor) -> frozenset[str]:
         if self._named[0] is not spec:
@@ -343,10 +386,17 @@ class Supervision:
             return
         if status is Presence.STOPPED and self._ends_with_supervisor(report.id):
             status = Presence.GONE
-        closed = {name for name in registrars_of(spec, path) if self._node.status_of(name) is Presence.GONE}
+        closed = {name for name in self.entries.registrars_of(spec, path) if self._is_gone(name)}
         child = self.tree.children.get(report.id)
         is_due = status is Presence.STARTING and child is not None and child.phase is ChildPhase.DUE
         self._retire(self.entries.mark(spec, path, status, _why(record), Turn.DUE if is_due else None), closed)
+        if status is Presence.STOPPED and self.kept.has(report.id) and self.tree.mode in (Mode.STARTING, Mode.RUNNING):
+            self.entries.mark_dormant(spec, path, _why(record))
+        if status is Presence.GONE and report.state is None and spec.type == "supervisor":
+            self._task(self.kept.remove_below(path))
+
+    def _is_gone(self, registrar: str) -> bool:
+        return self._node.status_of(registrar) is Presence.GONE
 
     def _deaths(self, life: Life) -> str:
         """Say how earlier runs died. The child's registrar names that in the errors of loads that they interrupted."""

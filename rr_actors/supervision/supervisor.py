@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +19,7 @@ from rr_actors.actors.messaging.futures import fail
 from rr_actors.actors.messaging.mailbox import is_stop
 from rr_actors.actors.refs import ActorRef, local_of, ref_to
 from rr_actors.actors.remote.hub import urn_of_path
-from rr_actors.base.checks import NoSupervisor, SupervisorCall, examined, invalid
+from rr_actors.base.checks import NoSupervisor, SupervisorCall, check_id, examined, invalid
 from rr_actors.base.errors import (
     ActorUnavailable,
     InvalidName,
@@ -124,7 +125,7 @@ class SupervisorActor(LoopActor):
     async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
         if not self._all_down.done():  # it may have been asked to stop
             check_descriptors(count_processes(self._spec), self._supervision.path)
-            self._supervision.start()
+            await self._supervision.start()
         await self._all_up
 
     async def on_stop(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -205,13 +206,16 @@ class SupervisorActor(LoopActor):
         tree, now, subject = self._supervision.tree, time.monotonic(), change.subject
         match change.name:
             case "start_child":
+                if change.id and tree.dynamic and change.id not in tree.children:
+                    new = dataclasses.replace(tree.template, id=change.id)
+                    self._supervision.entries.check_names(new, self._supervision.path_of(new.id))
                 if isinstance(subject, ChildSpec | Supervisor) and subject.id not in tree.children:
                     new = as_child_spec(subject)
                     where = self._supervision.path_of(new.id)
                     if not isinstance(new.actor_class_or_manager, Supervisor):
                         check_hostable(new.actor_class_or_manager, where, new.args, new.kwargs)
                     self._supervision.entries.check_names(new, where)
-                return child_calls.start_child(tree, subject, answer, now)
+                return child_calls.start_child(tree, subject, answer, now, change.id)
             case "terminate_child":
                 return child_calls.terminate_child(tree, subject, answer, now)
             case "restart_child":
@@ -320,16 +324,24 @@ class SupervisorRef:
         """Return the supervisor's settings, and its children in their order with restarts and age, as plain data."""
         return self._ask(child_calls.Question("describe"))
 
-    def start_child(self, spec: ChildSpec | Supervisor | Sequence[Any]) -> ActorRef[Any] | None:
+    def start_child(
+        self, spec: ChildSpec | Supervisor | Sequence[Any], *, id: str | None = None
+    ) -> ActorRef[Any] | None:
         """Add a child and start it. Return its reference when it is ready, or None if its on_start returned IGNORE.
 
         Args:
             spec: the new child; under simple_one_for_one a list of additional arguments.
+            id: under simple_one_for_one, the child's id. The child and its arguments are on disk then. They come back
+                with their supervisor, also after a crash of the whole system. terminate_child() ends the child, and so
+                does an orderly stop of the system. A temporary child does not come back. Default: None, an id is made
+                up, and the child ends with its supervisor.
 
         Raises:
             AlreadyStarted: a running child has that id.
-            AlreadyPresent: a child that does not run has that id.
-            InvalidSpec: this supervisor cannot have such a child.
+            AlreadyPresent: a child that does not run has that id. A stopped one with an id of its own, which did not
+                come back, starts with the new arguments instead.
+            NameTaken: another manager has the id.
+            InvalidSpec: this supervisor cannot have such a child, or no child can have such an id.
             TooManyChildren: the supervisor has max_children already.
             StartFailed: the child did not start, and is not added. `__cause__` has the reason.
             UsageError: a module that the child's process needs is still being imported.
@@ -344,10 +356,15 @@ class SupervisorRef:
             child = as_child_spec(cast("ChildSpec | Supervisor", spec))
             check_children_can_import(child, f"{self.path}/{child.id}", f"supervisor {self.path}: start_child()")
             note_started(classes_of(child))
-        return self._ask(child_calls.Change("start_child", spec))
+        if id is not None:
+            check_id(id, f"start_child of {self.path}")
+        return self._ask(child_calls.Change("start_child", spec, id or ""))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
         """Stop a child and return when it is down. Its specification stays, unless it is temporary or dynamic.
+
+        A dynamic child with an id of its own does not come back after that: it has unloaded what it serves, and is
+        removed from disk.
 
         Raises:
             NotFound: there is no such child.

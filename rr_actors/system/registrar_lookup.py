@@ -5,6 +5,7 @@ The process of a dormant registrar died, and nobody has opened it again. Its que
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import time
@@ -130,6 +131,17 @@ def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> 
         except CatalogError as error:
             logger.warning("%s: not read: %s", name, error)
             found[name] = "its catalog cannot be read"
+    return found
+
+
+def gone_and_serving(node: Node) -> list[str]:
+    """Return the registrars that are gone for good, and whose catalogs still serve something. Blocks."""
+    found: list[str] = []
+    for name in node.directory.registrars():
+        catalog = node.config.registrar(name).catalog_path(Path(node.info.state_dir))
+        with contextlib.suppress(CatalogError):  # it is being opened, or removed
+            if node.status_of(name) is Presence.GONE and is_there(catalog):
+                found += [name] * any(isinstance(row, Resource) for row in read_rows(catalog))
     return found
 
 

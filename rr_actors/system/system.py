@@ -65,6 +65,7 @@ from rr_actors.runtime.processes.process import keep_standard_fds
 from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.workers import Workers
+from rr_actors.storage.child_records import ChildRecords
 from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.streams.stream import StreamInfo
 from rr_actors.supervision.core.rendering import Tree
@@ -81,7 +82,14 @@ from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings
-from rr_actors.system.registrar_lookup import give_up_clients, left_behind, open_registrar, registrar_in, take_over
+from rr_actors.system.registrar_lookup import (
+    give_up_clients,
+    gone_and_serving,
+    left_behind,
+    open_registrar,
+    registrar_in,
+    take_over,
+)
 from rr_actors.system.snapshots import (
     ask_registrars,
     describe_at,
@@ -296,8 +304,9 @@ class System:
         try:
             spec = as_child_spec(self.root)
             note_started(classes_of(spec))
-            in_tree = set(registrars_of(spec, self._top))
-            Entries(node.directory).announce(spec, self._top)
+            entries = Entries(node.directory, ChildRecords(info.state_dir))
+            entries.announce(spec, self._top)
+            in_tree = set(entries.registrars_of(spec, self._top))
             renamed = renamed_managers(spec, self._top)
             await node.dispatcher.workers.run(take_over, self.config, Path(info.state_dir), renamed)
             dormant = await node.dispatcher.workers.run(left_behind, self.config, Path(info.state_dir), in_tree)
@@ -576,7 +585,8 @@ class System:
             node = self._node
             why = report.detail or report.reason
             node.directory.mark(actor_key(self._top), Presence.GONE, why)
-            for name in registrars_of(as_child_spec(self.root), self._top):
+            entries = Entries(node.directory, ChildRecords(node.info.state_dir))
+            for name in entries.registrars_of(as_child_spec(self.root), self._top):
                 if name not in node.registrars:
                     node.directory.mark(registrar_key(name), Presence.GONE, why)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
@@ -617,8 +627,14 @@ class System:
         return registrar_in(self._running(), name, patient=True, owner=self)
 
     def dormant(self) -> list[str]:
-        """Return the registrars that hold or serve something, whose process died, and that nobody has opened again."""
-        return [name for name, status in self._running().statuses().items() if status is Presence.DORMANT]
+        """Return the registrars that hold or serve something, whose process died, and that nobody has opened again.
+
+        They include those of managers that are gone for good, with a supervisor that died say, and that still serve
+        something: no unload callback has run.
+        """
+        node = self._running()
+        dormant = [name for name, status in node.statuses().items() if status is Presence.DORMANT]
+        return sorted([*dormant, *gone_and_serving(node)])
 
     def release(self, name: str, *, force: bool = False) -> None:
         """Release everything that a dormant registrar holds; a provider that is down does so when it is back.

@@ -47,6 +47,8 @@ class Change(SupervisorCall, frozen=True):
 
     name: Literal["start_child", "terminate_child", "restart_child", "delete_child", "update"]
     subject: Any
+    id: str = ""
+    """Of the dynamic child that start_child adds; "": one is made up."""
 
 
 class Question(SupervisorLook, frozen=True):
@@ -67,9 +69,12 @@ class ChildUpdated(SupervisorCall, frozen=True):
 
 
 def start_child(
-    tree: SupervisorState, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, now: float
+    tree: SupervisorState, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, now: float, id: str = ""
 ) -> Decision:
     """Add a child after the others and start it; under simple_one_for_one `spec` is a list of additional arguments.
+
+    A dynamic child with an `id` is kept, unless it is temporary. If it is there and stopped, it starts with these
+    arguments.
 
     Reply: the child's id, or None if its on_start returned IGNORE. (The specification is kept then, unless it is
     temporary or dynamic.) Errors: AlreadyStarted, AlreadyPresent, StartFailed (nothing is added), InvalidSpec,
@@ -77,11 +82,11 @@ def start_child(
     """
     draft = Draft(tree, now)
     try:
-        child = _newcomer(tree, spec, caller)
+        child = _newcomer(tree, spec, caller, id)
     except (InvalidSpec, TooManyChildren) as error:
         draft.reply([caller], error=error)
         return draft.done()
-    if tree.dynamic:
+    if tree.dynamic and not id:
         draft.tree = replace(tree, last_dynamic=tree.last_dynamic + 1)
     return _perform(draft, Call("start", child.id, caller, child))
 
@@ -96,7 +101,7 @@ def terminate_child(tree: SupervisorState, id: str, caller: Hashable, now: float
 
 
 def restart_child(tree: SupervisorState, id: str, caller: Hashable, now: float) -> Decision:
-    """Start a stopped child again.
+    """Start a stopped child again. Of dynamic children only a kept one can be stopped.
 
     Reply: its id, or None (IGNORE). Errors: ChildRunning, ChildRestarting, NotFound, NotForDynamic, StartFailed (the
     child stays stopped).
@@ -213,7 +218,7 @@ def _do(draft: Draft, call: Call) -> None:
     child = draft.children.get(call.id)
     if not draft.alive:
         draft.reply([call.caller], error=draft.gone())
-    elif call.kind in ("restart", "delete") and draft.tree.dynamic:
+    elif draft.tree.dynamic and (call.kind == "delete" or (call.kind == "restart" and not (child and child.kept))):
         error = NotForDynamic(f"{call.kind}_child({call.id!r}): {draft.tree.path} is simple_one_for_one", id=call.id)
         draft.reply([call.caller], error=error)
     elif call.kind == "start" and child is None:
@@ -231,8 +236,13 @@ def _do_when_settled(draft: Draft, child: SupervisedChild, call: Call) -> None:
     standing = _standing(child)
     if standing is None:
         draft.put(child, waiting=(*child.waiting, call))
+    elif standing == "stopped" and call.kind == "start" and child.kept:
+        assert call.child is not None
+        draft.due(replace(child, extra=call.child.extra, lost=None, why=Why.MANUAL, starters=(call.caller,)))
     elif standing != "stopped" or call.kind == "start":
         draft.reply([call.caller], error=_refusal(draft, child, call, standing))
+    elif call.kind == "restart" and child.lost is not None:
+        draft.reply([call.caller], error=draft.start_error(child, child.lost))
     elif call.kind == "restart":
         draft.due(replace(child, why=Why.MANUAL, attempts=0, starters=(call.caller,)))
     else:
@@ -302,24 +312,37 @@ def _absent(tree: SupervisorState, id: str) -> RrError | None:
     return _not_found(tree, id)
 
 
-def _newcomer(tree: SupervisorState, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable) -> SupervisedChild:
+def _newcomer(
+    tree: SupervisorState, spec: ChildSpec | Supervisor | Sequence[Any], caller: Hashable, id: str
+) -> SupervisedChild:
     """Return the child that start_child adds; raise InvalidSpec or TooManyChildren if there must not be one."""
     who = f"start_child of {tree.path}"
     if tree.dynamic:
         if not isinstance(spec, list | tuple):
             raise _wrong_type(who, "args", "a list of additional arguments, as it is simple_one_for_one", spec)
+        if id:
+            check_kept_id(id, tree)
         limit = tree.spec.max_children
-        if limit is not None and len(tree.children) >= limit:
+        if limit is not None and len(tree.children) >= limit and id not in tree.children:
             text = f"{who}: it has {len(tree.children)} children, and max_children is {limit}: terminate one first"
             raise TooManyChildren(text, id=tree.path, limit=limit)
-        id = tree.dynamic_id(str(tree.last_dynamic + 1))
-        child = SupervisedChild(id, tree.template, tuple(spec), why=Why.NEW, starters=(caller,))
+        kept = bool(id) and tree.template.restart != "temporary"
+        id = id or tree.dynamic_id(str(tree.last_dynamic + 1))
+        child = SupervisedChild(id, tree.template, tuple(spec), kept, why=Why.NEW, starters=(caller,))
         _ = child.start_spec  # raises InvalidSpec if the arguments are wrong
         return child
     if not isinstance(spec, ChildSpec | Supervisor):
         raise _wrong_type(who, "spec", "a ChildSpec or Supervisor", spec)
+    if id:
+        raise invalid(who, "id", "none, as the ChildSpec has one", id)
     check_significant(spec, tree.spec, spec.id)
     return SupervisedChild(spec.id, as_child_spec(spec), why=Why.NEW, starters=(caller,))
+
+
+def check_kept_id(id: str, tree: SupervisorState) -> None:
+    """Raise InvalidSpec if no dynamic child of this supervisor may have the id."""
+    if id == tree.template.id:
+        raise invalid(f"start_child of {tree.path}", "id", "another id than the template's", id)
 
 
 def _wrong_type(who: str, field: str, expected: str, got: object) -> InvalidSpec:

@@ -7,13 +7,14 @@ Administrative calls (start_child, terminate_child ...) are in child_calls.py.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from msgspec.structs import replace
 
-from rr_actors.base.errors import StartFailed, UsageError, text_of
+from rr_actors.base.errors import InvalidSpec, StartFailed, UsageError, text_of
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.supervision.core.child_calls import replay
+from rr_actors.supervision.core.child_calls import check_kept_id, replay
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import Backoff, RestartType
 from rr_actors.supervision.core.state import (
@@ -22,6 +23,7 @@ from rr_actors.supervision.core.state import (
     Event,
     Exit,
     ExitSupervisor,
+    KeptChild,
     Mode,
     Reason,
     Restart,
@@ -51,19 +53,37 @@ def needs_restart(restart: RestartType, reason: Reason) -> bool:
 # -- the supervisor ------------------------------------------------------------------------------------------------
 
 
-def decide_start(tree: SupervisorState, now: float) -> Decision:
+def decide_start(tree: SupervisorState, now: float, kept: Iterable[KeptChild] = ()) -> Decision:
     """Start the supervisor: start each child when the child before it is ready.
 
     SupervisorStarted follows when all children are ready. If one fails, the children before it are stopped in reverse
     order, and ExitSupervisor has StartFailed. A child that ends meanwhile is restarted as usual.
+
+    Of the `kept` children, which come after the others, those that do not start stay stopped. Only if one fails for
+    want of something outside, which its supervisor's start may have the next time, the start fails.
     """
     if tree.mode is not Mode.NEW:
         raise UsageError(f"supervisor {tree.path}: started twice (it is {tree.mode.name.lower()})")
     draft = Draft(replace(tree, mode=Mode.STARTING), now)
-    for child in list(tree.children.values()):
-        draft.put(child, phase=ChildPhase.DUE, why=Why.INIT)
+    for each in kept:
+        draft.put(_come_back(tree, each))
+    for child in list(draft.children.values()):
+        child = draft.put(child, phase=ChildPhase.DUE, why=Why.INIT)
+        if child.lost is not None:
+            draft.down(child, "start_failed", error=child.lost, keep=True)
     draft.advance()
     return draft.done()
+
+
+def _come_back(tree: SupervisorState, kept: KeptChild) -> SupervisedChild:
+    """Return a kept child that has not started; it is lost if the present template cannot be its template."""
+    child = SupervisedChild(kept.id, tree.template, kept.args, kept=True, lost=kept.lost)
+    try:
+        check_kept_id(kept.id, tree)
+        _ = child.start_spec
+    except InvalidSpec as error:
+        return replace(child, extra=(), lost=child.lost or error)
+    return child
 
 
 def decide_stop(tree: SupervisorState, now: float) -> Decision:
@@ -145,9 +165,10 @@ def _start_failed(draft: Draft, child: SupervisedChild, reason: BaseException, c
     draft.reply(child.starters, error=error)
     match child.why:
         case Why.INIT:
-            draft.down(child, "start_failed", error=reason)
+            draft.down(child, "start_failed", error=reason, keep=child.kept)
             replay(draft, child.waiting)
-            draft.give_up(error)
+            if wanted_by(reason) or not child.kept:
+                draft.give_up(error)
         case Why.NEW | Why.MANUAL:
             draft.down(child, "start_failed", error=reason, keep=child.why is Why.MANUAL)
             replay(draft, child.waiting)
@@ -277,9 +298,10 @@ def _restart(draft: Draft, child: SupervisedChild, event: Event, reason: str, ch
     count = draft.count_restart(child, reason)
     if count > draft.tree.spec.max_restarts:
         error = draft.too_many_restarts()
-        draft.down(child, event, restarts=count, **details)
+        draft.down(child, event, restarts=count, keep=child.kept, **details)
         replay(draft, child.waiting)
-        draft.report("gave_up", child, None if draft.forgets(child) else "stopped", error=error, restarts=count)
+        state = None if draft.forgets(child) and not child.kept else "stopped"
+        draft.report("gave_up", child, state, error=error, restarts=count)
         draft.give_up(error)
     else:
         delay_s = child.spec.backoff.delay(child.attempts, chance) if child.spec.backoff else 0.0

@@ -86,6 +86,9 @@ class SupervisedChild(Struct, frozen=True):
     Attributes:
         id: its name; under simple_one_for_one a generated one.
         spec: its specification. Under simple_one_for_one the template's; `extra` are this child's additional arguments.
+        kept: whether it is a dynamic child that start_child() was given an id for. It is on disk, and comes back with
+            its supervisor, until it has ended for good.
+        lost: of a kept child, why it cannot be started from what is on disk.
         run: number of its present or last start; 0 before the first. `previous`: of the start before.
         why: the purpose of its present start; RESTART once it is up, since the next start will be a restart.
         up_at: when this run became ready, monotonic seconds; None before.
@@ -100,6 +103,8 @@ class SupervisedChild(Struct, frozen=True):
     id: str
     spec: ChildSpec
     extra: tuple[Any, ...] = ()
+    kept: bool = False
+    lost: RrError | None = None
     phase: ChildPhase = ChildPhase.STOPPED
     why: Why = Why.INIT
     run: int = 0
@@ -134,6 +139,14 @@ class SupervisedChild(Struct, frozen=True):
         if self.id == self.spec.id:
             return self.spec
         return replace(self.spec, id=self.id, args=(*self.spec.args, *self.extra))
+
+
+class KeptChild(Struct, frozen=True):
+    """A kept child of an earlier incarnation of its supervisor, as it is on disk: `args`, or why they are `lost`."""
+
+    id: str
+    args: tuple[Any, ...] = ()
+    lost: RrError | None = None
 
 
 class Restart(Struct, frozen=True):

@@ -8,6 +8,7 @@ Nothing remembers what to do next: `advance` derives it from the children's phas
 - one_for_all, rest_for_one: first the condemned children are stopped, the last first. Then the due children are started
   in order, each when the child before it is ready.
 - The supervisor's own start: the due children are started in this way with any strategy.
+  A kept child that does not start stays stopped, and ends nothing: nobody could end it while its supervisor is down.
 """
 
 from __future__ import annotations
@@ -93,7 +94,12 @@ class Draft:
         return self.put(child, phase=phase)
 
     def forgets(self, child: SupervisedChild) -> bool:
-        """Return whether a child is dropped when down: dynamic, temporary, or its start_child has not succeeded."""
+        """Return whether a child is dropped when down: dynamic, temporary, or its start_child has not succeeded.
+
+        A kept child is not dropped because its supervisor ends. It is if a caller has ended it before.
+        """
+        if child.kept and self.tree.mode is Mode.STOPPING and child.why is not Why.NEW:
+            return bool(child.stoppers)
         return self.tree.dynamic or child.spec.restart == "temporary" or child.why is Why.NEW
 
     def down(

@@ -309,7 +309,8 @@ class Restart(Command[c.Done], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> c.Done:
         path, supervisor, child = _child(view, self.child)
         spec = supervisor.get_childspec(child.id)
-        if spec.restart == "temporary" or supervisor.describe()["strategy"] == "simple_one_for_one":
+        is_dynamic = supervisor.describe()["strategy"] == "simple_one_for_one"
+        if spec.restart == "temporary" or (is_dynamic and child.state != "stopped"):
             raise UsageError(f"{path}: its supervisor forgets it when it stops; terminate it, and start a new one")
         facts = {"path": path, "was": child.state}
         if self.dry_run:
