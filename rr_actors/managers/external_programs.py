@@ -133,7 +133,7 @@ class ExternalPrograms:
         self._lock = threading.Lock()
         self._watched: dict[str, ProcessHandle] = {}
         self._usages: dict[str, ProgramUsage] = {}
-        self._gives_up = False
+        self._is_closed = self._gives_up = False
         remove_retired(directory)  # a killed predecessor left them
 
     def start(
@@ -144,14 +144,16 @@ class ExternalPrograms:
         attempt: int = 1,
         missing: Callable[[Running], str] = lambda running: "",
         timeout_s: float = 10.0,
+        is_unwanted: Callable[[], bool] = lambda: False,
     ) -> Running:
         """Start a program, or take over the one that an interrupted start of this key left; return once it is ready.
 
         The program is ready when its output has had the order's `ready_line` and `missing(running)` returns "". Until
-        then it returns what is missing.
+        then it returns what is missing. If `is_unwanted()` meanwhile, nobody waits for the program any more.
 
         Raises:
-            ProgramFailed: the program could not be started, ended, or was not ready in time. No process of it is left.
+            ProgramFailed: the program could not be started, ended, was not ready in time, or is unwanted. No process of
+                it is left.
         """
         home = self._home(key)
         spawned: ProcessHandle | None = None
@@ -159,7 +161,7 @@ class ExternalPrograms:
             if not home.is_held():
                 self._clear(home)
                 spawned = self._spawn(home, order, f"{key}.{attempt}")
-            return self._wait_ready(home, order, missing, timeout_s, spawned)
+            return self._wait_ready(home, order, missing, timeout_s, spawned, is_unwanted)
         except BaseException:
             self.stop(key)
             raise
@@ -273,7 +275,7 @@ class ExternalPrograms:
 
         `final`: nobody will; the starts that have not returned yet end their programs, and fail.
         """
-        self._gives_up = final
+        self._gives_up, self._is_closed = final, True
         self._watcher.close()
         with self._lock:
             self._watched.clear()
@@ -349,6 +351,7 @@ class ExternalPrograms:
         missing: Callable[[Running], str],
         timeout_s: float,
         spawned: ProcessHandle | None,
+        is_unwanted: Callable[[], bool],
     ) -> Running:
         limit = RunningLimit(timeout_s)
         asked: Future[str] | None = None
@@ -371,6 +374,8 @@ class ExternalPrograms:
                 asked = None
             if self._gives_up:
                 raise ProgramFailed(f"{command!r} was not ready yet, and its manager is being stopped")
+            if not self._is_closed and is_unwanted():  # a restart of the manager goes on with it
+                raise ProgramFailed(f"{command!r} was not ready yet, and nobody waits for it any more")
             if limit.is_over():
                 output = "\n".join(f"  {line}" for line in home.output(TAIL_LINES)) or "  (none)"
                 if asked is None and not seen:

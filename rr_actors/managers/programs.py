@@ -158,7 +158,9 @@ class Programs(Manager):
         order, missing = _order(request), self._missing(request.ready, repeated=me.attempt > 1)
         timeout_s = request.ready.timeout_s
         check = self._check(request)
-        running = self._external.start(me.resource_id, order, attempt=me.attempt, missing=missing, timeout_s=timeout_s)
+        stop = me.stopping.is_set
+        start = functools.partial(self._external.start, missing=missing, timeout_s=timeout_s, is_unwanted=stop)
+        running = start(me.resource_id, order, attempt=me.attempt)
         self._begin_checks(check)
         return Program(*running)
 

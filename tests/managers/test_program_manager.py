@@ -61,6 +61,13 @@ def test_a_program_is_started_shared_and_ended_with_its_last_holder(system: rr.S
     assert not psutil.pid_exists(second.response.pid)
 
 
+def test_a_program_that_nobody_waits_for_any_more_is_ended_before_it_is_ready(app: rr.Registrar) -> None:
+    slow = RunProgram("sleep", ("600",), ready=Ready(line="ready", timeout_s=600.0))
+    with pytest.raises(rr.LoadTimeout):
+        app.load("programs/program", slow, timeout_s=1.0)
+    eventually(lambda: not running_programs())
+
+
 def is_paused(program: Program) -> bool:
     return stands(program.pid)
 
