@@ -8,6 +8,7 @@ The registry is a TOML file::
     reliability = 0.9                                    # 0 to 1; a failure halves it
     defaults = { run = "/run/robot" }                    # for what the request does not give
     parameters = { scans = "${run}/front-lidar.sock" }   # ${...}: from the request, and `here`, `python`, `name`
+    break_first = true                                   # it cannot run beside another one; may be left out
 
     [component.program]                                  # as RunProgram, see programs.py
     command = "${python}"
@@ -24,21 +25,23 @@ from __future__ import annotations
 import contextlib
 import functools
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, LoadFailed, LoadTimeout, RrError, UnknownQuery
+from rr_actors.actors.messaging.futures import Reply
+from rr_actors.base.errors import ConfigError, LoadError, LoadFailed, LoadTimeout, RrError, UnknownQuery
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
+from rr_actors.managers.planning.hedging import HEDGE_S
 from rr_actors.managers.planning.last_good import last_good_file, path_of
-from rr_actors.managers.planning.late_word import LateWord
 from rr_actors.managers.planning.reliability import Reliabilities
-from rr_actors.managers.planning.retries import GIVEN_UP, Retries
+from rr_actors.managers.planning.retries import Retries
+from rr_actors.managers.planning.searches import Loading, Search, groups, release_soon, release_strays
 from rr_actors.managers.program_checks import parameter_faults, program_faults, template_faults
 from rr_actors.managers.program_conditions import ProgramHealth
 from rr_actors.managers.programs import RunProgram
@@ -52,13 +55,19 @@ from rr_actors.system.registrar_lookup import registrar_in
 
 logger = Log("rr_actors.managers.components")
 
-C = TypeVar("C")
+R = TypeVar("R")
 
 LOAD_MARGIN_S = 20.0  # added to the program's own limit: its manager may be restarting after a crash
+_FIRST_HEDGE_S = 5.0  # nobody uses anything that has failed yet, and devices are slow to start
 
 
 class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One component as the registry describes it."""
+    """One component as the registry describes it.
+
+    Attributes:
+        break_first: it cannot run beside another component of its type, as two drivers of one device cannot. So it is
+            started when those before it have ended, and none is started beside it.
+    """
 
     name: str
     type: str
@@ -67,6 +76,7 @@ class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     parameters: dict[str, Parameter] = {}
     defaults: dict[str, Parameter] = {}
     health: ProgramHealth | None = None
+    break_first: bool = False
 
 
 class RegistryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -101,10 +111,11 @@ class Component(msgspec.Struct, frozen=True):
     parameters: dict[str, str]
 
 
-Made = Callable[[Query], Component]
-"""Makes the response of the query of a component's program."""
-Run = Callable[[RunProgram, Made, float], Component]
-"""Runs a program within a time limit in seconds, and returns the component that it is."""
+class Start(NamedTuple):
+    """How to start a component for a request: its program, and what makes the response of that program's query."""
+
+    program: Loading
+    made: Callable[[Query], Any]
 
 
 class NoComponent(LoadFailed):
@@ -134,6 +145,10 @@ class Components(Manager):
         self._replace = replace
         self._retries = Retries[tuple[str, str]]()  # of components, by the id of the resource that has them and by name
 
+    def on_start(self) -> None:
+        """Release the programs that the process before has started in the place of others, and had not put there."""
+        release_strays(self.registrar, self._programs, new_id())
+
     def on_stop(self) -> None:
         """Wait for no component that has failed any more."""
         self._retries.stop()
@@ -144,7 +159,23 @@ class Components(Manager):
     @server("component")
     def load_component(self, request: LoadComponent) -> Component:
         """Run the most reliable component of the type whose program can be run."""
-        return self._run_best(request, self._load, self.candidates(request.type), [])
+        candidates, search = self.candidates(request.type), self._search()
+        start, is_over = functools.partial(self._start_of, request), current().stopping.is_set
+        hedge_s = max([_FIRST_HEDGE_S, *(one.program.ready.timeout_s / 2 for one in candidates)])
+
+        def begin(one: ComponentDescription) -> Reply[Query]:
+            return search.as_part(start(one).program)
+
+        def take(one: ComponentDescription, query: Query) -> Component:
+            return start(one).made(query)
+
+        found = self._first(search, candidates, begin, take, is_over=is_over, hedge_s=hedge_s)
+        if found is not None:
+            return found
+        if candidates:
+            raise NoComponent("\n".join([f"no component of type {request.type!r} could be loaded:", *search.tried]))
+        known = ", ".join(sorted({component.type for component in self._registry})) or "none"
+        raise NoComponent(f"no component of type {request.type!r} in {self._path}: expected one of {known}")
 
     @load_component.status
     def component_status(self, request: LoadComponent, status: Status) -> None:
@@ -157,27 +188,10 @@ class Components(Manager):
         if part is None and status.resource_id == current().resource_id:
             part = self._part_called_lost(status)
         if part is not None:
-            self._replace_component(request, status, part)
+            failed, start = self._component_of(request, part.request), functools.partial(self._start_of, request)
+            self._replace_part(request.type, failed, status, part, lambda: self.candidates(request.type), start)
 
     # -- replacing -------------------------------------------------------------------------------------------------
-
-    def _replace_component(self, request: LoadComponent, status: Status, part: Query) -> None:
-        failed, why = self._component_of(request, part.request), list[str]()
-        try:
-            in_turn = self._after(failed, status, part, lambda: self.candidates(request.type), why)
-            with LateWord(self.registrar, failed.name if failed else request.type, status) as late:
-                if part.state is not State.FATAL:  # a holder has called it lost: its program is being ended
-                    with contextlib.suppress(UnknownQuery, LoadTimeout):  # it is gone, or its grace is long
-                        part.wait_status(State.FATAL, timeout_s=LOAD_MARGIN_S)
-                component = self._run_best(request, functools.partial(self._swap, status, part, late), in_turn, why)
-        except UnknownQuery:
-            status.handled()  # it is being unloaded
-        except RrError as error:
-            logger.warning("%s: nothing takes the place of one that failed: %s", request.type, error)
-        else:
-            logger.warning(
-                "%s: %s takes the place of one that failed: %s", request.type, component.name, status.message
-            )
 
     def _part_called_lost(self, status: Status) -> Query | None:
         """Return the program of a component that a holder has called lost; None if there is nothing to replace.
@@ -206,50 +220,90 @@ class Components(Manager):
             status.handled()  # a run before a crash has replaced it, or it was released while loading
         return about.part
 
-    def _after(
+    def _replace_part(
         self,
+        what: str,
         failed: ComponentDescription | None,
         status: Status,
         part: Query,
-        candidates: Callable[[], Sequence[ComponentDescription]],
-        why: list[str],
-    ) -> Iterator[ComponentDescription]:
-        """Blame what has failed, and yield the candidates to try in its place, each when it has rested.
+        fitting: Callable[[], Sequence[ComponentDescription]],
+        start: Callable[[ComponentDescription], Start],
+    ) -> None:
+        """Blame what has failed, and put the first of those that fit in the place of its program.
 
-        Those that have to rest come last. One that is given up is noted in `why`.
+        Those that have to rest come last.
         """
-        id = current().resource_id
+        search, name = self._search(status), failed.name if failed else what
         if failed is not None and is_own_failure(status):
             self._lower(failed, part.resource_id)  # the same for all statuses of this failure
 
-        def is_resting(one: ComponentDescription) -> bool:
-            return not self._retries.is_ready((id, one.name))
+        def begin(one: ComponentDescription) -> Reply[Query]:
+            return search.beside(start(one).program)
 
-        def say(text: str) -> None:
-            self.registrar.send_status(id, Status(State.WARNING, f"{text}: {status.message}"))
+        def take(one: ComponentDescription, query: Query) -> str:
+            search.swap(status, part, *start(one))
+            release_soon(query)
+            return one.name
 
-        for one in sorted(candidates(), key=is_resting):
-            if one is failed and status.reason == "revoked":
-                why.append(f"{one.name}: {status.message}")  # it would wait for the end of this one
-            elif self._retries.rest((id, one.name), one.name, say) is None:
-                why.append(f"{one.name}: {GIVEN_UP}")
-            else:
-                yield one
+        try:
+            with search.telling(HEDGE_S, f"{name} has failed, and another one is being started"):
+                if part.state is not State.FATAL:  # a holder has called it lost: its program is being ended
+                    with contextlib.suppress(UnknownQuery, LoadTimeout):  # it is gone, or its grace is long
+                        part.wait_status(State.FATAL, timeout_s=LOAD_MARGIN_S)
+                in_turn = sorted(fitting(), key=lambda one: not self._retries.is_ready((search.id, one.name)))
+                if failed in in_turn and status.reason == "revoked":
+                    in_turn.remove(failed)  # it would wait for the end of this one
+                found = self._first(search, in_turn, begin, take, check=search.check_wanted)
+        except UnknownQuery:
+            status.handled()  # it is being unloaded
+            return
+        except RrError as error:
+            search.tried.append(str(error))
+            found = None
+        if found is None:
+            why = "\n".join(search.tried or ["none fits there"])
+            logger.warning("%s: nothing takes the place of %s: %s", what, name, why)
+        else:
+            logger.warning("%s: %s takes the place of %s: %s", what, found, name, status.message)
 
-    def _first_of(
-        self, candidates: Iterable[ComponentDescription], run: Callable[[ComponentDescription], C], why: list[str]
-    ) -> C | None:
-        """Return what `run` makes of the first candidate that can be run; `why` gets why each other cannot."""
-        for one in candidates:
-            try:
-                made = run(one)
-            except LoadFailed as error:
-                why.append(f"{one.name}: {error}")
-                if is_own_fault(error):
-                    self._lower(one, new_id())
-            else:
-                self._retries.used((current().resource_id, one.name))
-                return made
+    def _search(self, status: Status | None = None) -> Search[ComponentDescription]:
+        id, message = current().resource_id, "" if status is None else status.message
+        return Search(
+            self.registrar,
+            self._retries,
+            key=lambda one: (id, one.name),
+            name=lambda one: one.name,
+            text=lambda said: f"{said}: {message}",
+        )
+
+    def _first(
+        self,
+        search: Search[ComponentDescription],
+        in_turn: Sequence[ComponentDescription],
+        begin: Callable[[ComponentDescription], Reply[Query]],
+        take: Callable[[ComponentDescription, Query], R],
+        *,
+        is_over: Callable[[], bool] = lambda: False,
+        check: Callable[[], object] = lambda: None,
+        hedge_s: float = HEDGE_S,
+    ) -> R | None:
+        """Return what `take` makes of the program of the first candidate that can be run; None if there is none."""
+
+        def use(one: ComponentDescription, query: Query) -> R:
+            taken = take(one, query)
+            self._retries.used((search.id, one.name))
+            return taken
+
+        def failed(one: ComponentDescription, error: Exception) -> None:
+            if is_over() or not isinstance(error, LoadError):
+                raise error
+            if is_own_fault(error):
+                self._lower(one, new_id())
+
+        for group in groups(in_turn, lambda one: one.break_first):
+            found = search.first(group, begin, use, failed, check=check, hedge_s=hedge_s)
+            if found is not None:
+                return found
         return None
 
     def _lower(self, component: ComponentDescription, failure_id: str) -> None:
@@ -272,37 +326,12 @@ class Components(Manager):
     def _reliabilities(self) -> Reliabilities:
         return Reliabilities(self.registrar.directory / "reliability.json")
 
-    def _load(self, program: RunProgram, made: Made, timeout_s: float) -> Component:
-        return made(self.registrar.load(self._programs, program, timeout_s=timeout_s))
+    def _start_of(self, request: LoadComponent, candidate: ComponentDescription) -> Start:
+        program, parameters = self._filled(candidate, request)
+        return Start(self._loading(program), functools.partial(component_of, candidate, parameters))
 
-    def _swap(
-        self, status: Status, part: Query, late: LateWord, program: RunProgram, made: Made, timeout_s: float
-    ) -> Component:
-        spare = self.registrar.replace_part(
-            status, program, self._programs, part=part, response=late.before(made), timeout_s=timeout_s
-        )
-        return made(spare)
-
-    def _run_best(
-        self, request: LoadComponent, run: Run, candidates: Iterable[ComponentDescription], why: list[str]
-    ) -> Component:
-        """Run the first candidate that can be run.
-
-        Raises:
-            NoComponent: no candidate could be run.
-        """
-
-        def run_one(candidate: ComponentDescription) -> Component:
-            program, parameters = self._filled(candidate, request)
-            made = functools.partial(component_of, candidate, parameters)
-            return run(program, made, program.ready.timeout_s + LOAD_MARGIN_S)
-
-        if (found := self._first_of(candidates, run_one, why)) is not None:
-            return found
-        if why:
-            raise NoComponent(f"no component of type {request.type!r} could be loaded:\n" + "\n".join(why))
-        known = ", ".join(sorted({component.type for component in self._registry})) or "none"
-        raise NoComponent(f"no component of type {request.type!r} in {self._path}: expected one of {known}")
+    def _loading(self, program: RunProgram) -> Loading:
+        return Loading(self._programs, program, program.ready.timeout_s + LOAD_MARGIN_S)
 
     def _component_of(self, request: LoadComponent, program: RunProgram) -> ComponentDescription | None:
         """Return the component that runs this program; None if the registry has changed since the program started."""

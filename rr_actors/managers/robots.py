@@ -16,13 +16,15 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.base.errors import ConfigError, LoadFailed, RrError, UnknownQuery
+from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.components import Component, LoadComponent
 from rr_actors.managers.planning.blame import is_own_failure, part_of
+from rr_actors.managers.planning.hedging import HEDGE_S
 from rr_actors.managers.planning.last_good import last_good_file, path_of
-from rr_actors.managers.planning.late_word import LateWord
-from rr_actors.managers.planning.retries import GIVEN_UP, Retries
+from rr_actors.managers.planning.retries import Retries
+from rr_actors.managers.planning.searches import Loading, Search, release_soon, release_strays
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Beginning, Manager
@@ -101,6 +103,10 @@ class Robots(Manager):
         self._replace = replace
         self._retries = Retries[tuple[str, str, str]]()  # of parts, by the id of the robot, the type and the number
 
+    def on_start(self) -> None:
+        """Release the components that the process before has loaded in the place of others, and had not put there."""
+        release_strays(self.registrar, self._components, new_id())
+
     def on_stop(self) -> None:
         """Wait for no part that has failed any more."""
         self._retries.stop()
@@ -141,21 +147,31 @@ class Robots(Manager):
         what = failed.request.type
         key = id, what, failed.request.instance
         self._retries.failed(key, status.resource_id)
+        search = Search[LoadComponent](
+            self.registrar,
+            self._retries,
+            key=lambda _: key,
+            name=lambda order: order.type,
+            text=lambda said: f"{said}: {status.message}",
+        )
 
-        def say(text: str) -> None:
-            self.registrar.send_status(id, Status(State.WARNING, f"{text}: {status.message}"))
+        load = Loading(failed.server_id, failed.request, _LOAD_LIMIT_S)
 
-        if self._retries.rest(key, what, say) is None:
-            raise LoadFailed(f"{what}: {GIVEN_UP}")
-        with LateWord(self.registrar, what, status) as late:
-            spare = self.registrar.replace_part(
-                status,
-                failed.request,
-                response=late.before(lambda spare: self._assembled(request, self._in_order(request, [*others, spare]))),
-                timeout_s=_LOAD_LIMIT_S,
+        def made(spare: Query) -> Robot:
+            return self._assembled(request, self._in_order(request, [*others, spare]))
+
+        def take(order: LoadComponent, query: Query) -> str:
+            search.swap(status, failed, load, made)
+            self._retries.used(key)
+            release_soon(query)
+            return query.response.name
+
+        with search.telling(HEDGE_S, f"{what} has failed, and another one is being started"):
+            name = search.first(
+                [failed.request], lambda _: search.beside(load), take, _blame_nobody, check=search.check_wanted
             )
-        self._retries.used(key)
-        name = spare.response.name
+        if name is None:
+            raise LoadFailed("\n".join(search.tried))
         logger.warning("%s: %s takes the place of a part that failed: %s", request.name, name, status.message)
 
     def _update(self, request: LoadRobot, parts: list[Query], why: str) -> None:
@@ -199,6 +215,10 @@ class Robots(Manager):
             text = f"no robot {name!r} in {self._path}: expected one of {', '.join(known) or 'none'}"
             raise UnknownRobot(text, name=name, known=known)
         return found
+
+
+def _blame_nobody(order: LoadComponent, error: Exception) -> None:
+    """Lower nothing: the component manager has."""
 
 
 def read_robots(path: Path, beginning: Beginning | None = None) -> list[RobotDescription]:

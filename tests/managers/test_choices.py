@@ -366,6 +366,19 @@ def test_the_best_one_that_hangs_costs_a_new_choice_some_seconds_and_not_its_who
     eventually(lambda: world.has("camera", "lidar"), LIMIT_S, "the camera is on trial, and held once")
 
 
+def test_nothing_is_tried_beside_one_that_is_exclusive_in_a_new_choice(start: Start) -> None:
+    world = World(start, [sensor("camera", break_first=True), sensor("lidar")])
+
+    def give_up_late(request: Any) -> None:
+        time.sleep(6)  # beside another one, the next is tried after five seconds
+        world.steps("the camera has failed")
+        raise OSError("no camera")
+
+    world.served["camera"].do_load = give_up_late
+    assert world.choose().response.server == "sensors/lidar"
+    assert list(world.steps) == ["the camera has failed", "load lidar"]
+
+
 def test_what_another_choice_has_is_preferred_to_what_is_not_loaded(world: World) -> None:
     world.choose(Choose("range", {"rate_hz": "<10"}))
     choice = world.choose()

@@ -82,6 +82,45 @@ def test_a_candidate_that_cannot_begin_has_failed() -> None:
     assert some.failed == ["a: a: not there"]
 
 
+def test_one_that_fails_beside_another_is_tried_again_alone_if_all_else_fails() -> None:
+    some = Candidates(a=None, b=rr.LoadFailed("the device is taken"), c=rr.LoadFailed("broken"))
+    begin, beside = some.begin, list[str]()
+
+    def taken_by_a(name: str) -> Reply[str]:
+        if some.begun.count("b") == 1 and name == "b":
+            some.outcomes["b"] = "B"
+        reply = begin(name)
+        if name == "c":
+            threading.Timer(0.2, some.replies["a"].set_exception, (rr.LoadFailed("late"),)).start()
+        return reply
+
+    won = first_of(
+        some.outcomes,
+        taken_by_a,
+        release=some.released.append,
+        on_failed=lambda name, error: some.failed.append(f"{name}: {error}"),
+        on_failed_beside=lambda name, error: beside.append(f"{name}: {error}"),
+        hedge_s=0.05,
+    )
+    assert won == Won("b", "B")
+    assert some.begun == ["a", "b", "c", "b"]
+    assert (some.failed, beside) == (["a: late"], ["b: the device is taken", "c: broken"])
+
+
+def test_one_that_rests_is_tried_beside_one_that_hangs_when_it_has_rested() -> None:
+    some, rests_s = Candidates(a=None, b="B"), [0.1, 0.05, 0.0]
+    won = first_of(
+        some.outcomes,
+        some.begin,
+        release=some.released.append,
+        on_failed=lambda *_: None,
+        rest_s=lambda _: rests_s.pop(0),
+        hedge_s=0.01,
+    )
+    assert won == Won("b", "B")
+    assert (rests_s, some.withdrawn) == ([], ["a"])
+
+
 def test_what_the_caller_raises_ends_it_and_withdraws_what_is_in_flight() -> None:
     some = Candidates(a=None, b=rr.LoadFailed("broken"))
 

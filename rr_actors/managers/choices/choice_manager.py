@@ -7,15 +7,12 @@ manager has.
 
 from __future__ import annotations
 
-import contextlib
-import contextvars
 import functools
 import os
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from itertools import groupby
-from typing import Any, cast
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import msgspec
 
@@ -33,15 +30,16 @@ from rr_actors.managers.choices.offers import Offers, nothing_left
 from rr_actors.managers.choices.planning import Choice, in_turn
 from rr_actors.managers.choices.trials import FAILED, Trials
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
-from rr_actors.managers.planning.hedging import HEDGE_S, first_of
+from rr_actors.managers.planning.hedging import HEDGE_S
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.reliability import Reliabilities
-from rr_actors.managers.planning.retries import GIVEN_UP, SOON_S
+from rr_actors.managers.planning.retries import SOON_S, Retries
+from rr_actors.managers.planning.searches import Loading, Search, groups, release_soon, strays
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOWEST, Phase, State
 from rr_actors.registrar.queries import Query, Status, StatusCallback
-from rr_actors.registrar.registrar import NO_FIELDS
+from rr_actors.registrar.registrar import NO_FIELDS, Registrar
 from rr_actors.registrar.servers.callback_context import current
 
 logger = Log("rr_actors.managers.choices")
@@ -51,26 +49,21 @@ _AGAIN = "chooses again, as a crash came in between"
 _FIRST_HEDGE_S = 5.0  # nobody uses anything that has failed yet, and devices are slow to start
 
 
-_Begin = Callable[[Alternative], Reply[Query]]
-_Take = Callable[[Alternative, Query], None]
-_Failed = Callable[[Alternative, Exception], None]
-
-
 class _Broken(msgspec.Struct):
     """The choices whose part has been released before another one was loaded in its place."""
 
     choices: list[str] = []
 
 
-class _Search:
-    """One search for an alternative that can be had, and why each of those before could not be."""
+class _Search(Search[Alternative]):
+    """A search for what a choice is to have in the place of `part`; None: it has no part."""
 
-    def __init__(self, id: str, held: Held, part: Query | None = None, tried: Sequence[str] = ()) -> None:
-        self.id, self.held, self.part = id, held, part
-        self.tried = list(tried)
-        self.decided_at = time.monotonic()  # when it was decided what to load
-        self.saying = threading.Lock()
-        self.is_over = False
+    def __init__(
+        self, registrar: Registrar, retries: Retries[str], held: Held, part: Query | None, tried: Sequence[str]
+    ) -> None:
+        super().__init__(registrar, retries, _key, _key, lambda what: "; ".join((*self.tried, what)))
+        self.held, self.part = held, part
+        self.tried += tried
 
 
 class Choices(Manager):
@@ -113,7 +106,7 @@ class Choices(Manager):
             self._load_on_trial,
             self._have_taken,
             lambda: self._offers.has_changed(),
-            self._strays,
+            lambda: strays(self.registrar, self._begun),
         )
         self._begun = ""
 
@@ -146,29 +139,31 @@ class Choices(Manager):
     def load_choice(self, request: Choose) -> Chosen:
         """Load the best alternative that can be loaded."""
         best = self._offers.allowed(request)
-        search = _Search(current().resource_id, Held(request, ""))
-        made: list[Chosen] = []
+        search = self._search(Held(request, ""), retries=Retries())  # what is new waits for nothing
 
-        def take(one: Alternative, query: Query) -> None:
-            made[:] = [self._addresses.made(search.id, search.held, one, query)]
+        def take(one: Alternative, query: Query) -> Chosen:
+            return self._addresses.made(search.id, search.held, one, query)
 
         def failed(one: Alternative, error: Exception) -> None:
             if current().stopping.is_set():
                 raise error
             self._not_loaded(search, one, error)
 
+        def tried(group: Sequence[Alternative]) -> Chosen | None:
+            return self._try(search, group, search.as_part, take, failed, hedge_s=_FIRST_HEDGE_S)
+
         try:
-            found = self._try(search, self._in_turn(best, ()), self._begin_part, take, failed, _FIRST_HEDGE_S)
+            chosen = next(filter(None, map(tried, groups(self._in_turn(best, ()), _breaks_first))), None)
         except BaseException:
             self._addresses.close(search.id)
             raise
-        if not found:
+        if chosen is None:
             self._addresses.close(search.id)
             raise LoadFailed(nothing_left(request, search.tried), server=f"{self.registrar.name}/choice")
-        self._use(search, made[0])
+        self._use(search, chosen)
         if search.held.present != best[0].key:
             self._trials.look()
-        return made[0]
+        return chosen
 
     @load_choice.unload
     def unload_choice(self, request: Choose, response: Chosen | None) -> None:
@@ -236,7 +231,7 @@ class Choices(Manager):
             parts = self.registrar.children(id)
             better = self._offers.find(key, kind)
             if key != held.present and better is not None and parts:  # else a run before a crash has done it
-                self._swap(_Search(id, held, parts[0]), status, better)
+                self._swap(self._search(held, parts[0]), status, better)
                 logger.info("%s: returns to %s", kind, key)
         except RrError as error:
             logger.warning("%s: cannot return to %s: %s", kind, key, error)
@@ -252,7 +247,7 @@ class Choices(Manager):
         if is_own and (one := self._in_use(held)) is not None:
             self._offers.lower(one, status.resource_id)
         self._trials.failed(failed, status.resource_id, is_own=is_own)
-        search = _Search(id, held, part, [f"{failed}: {said}"])
+        search = self._search(held, part, [f"{failed}: {said}"])
         if self._fill(search, status, {failed}):
             logger.warning("%s: %s takes the place of %s: %s", held.request.kind, held.present, failed, said)
         elif self._is_broken(id) or (status.state is State.FATAL and status.reason != "revoked"):
@@ -266,23 +261,24 @@ class Choices(Manager):
         """Choose anew after a crash, when one had been released and it is not known how far the next one had come."""
         for part in self.registrar.children(id):
             self._release(part)
-        search = _Search(id, held)
+        search = self._search(held)
         if not self._fill(search, status, ()):
             self._give_up(search, status)
         self._trials.look()
 
+    def _search(
+        self, held: Held, part: Query | None = None, tried: Sequence[str] = (), retries: Retries[str] | None = None
+    ) -> _Search:
+        return _Search(self.registrar, retries or self._trials.retries, held, part, tried)
+
     def _fill(self, search: _Search, status: Status, without: Collection[str]) -> bool:
         """Put the first alternative that can be had in the place of the part. Return whether there was one."""
-        say = functools.partial(self._say_slow, search, "the next one is being loaded")
-        soon = threading.Timer(SOON_S, contextvars.copy_context().run, (say,))  # a part of this callback
-        soon.daemon = True
-        soon.start()
-        try:
-            return any(self._fill_from(search, status, group) for group in self._groups(search, without))
-        finally:
-            soon.cancel()
-            with search.saying:
-                search.is_over = True
+        with search.telling(SOON_S, "the next one is being loaded"):
+            with self._changed:  # else what fails meanwhile is tried once more
+                search.decided_at = time.monotonic()
+                allowed = self._offers.allowed_now(search.held.request)
+                in_turn = self._in_turn(allowed, without, self._trials.well_beside(search.id))
+            return any(self._fill_from(search, status, group) for group in groups(in_turn, _breaks_first))
 
     def _fill_from(self, search: _Search, status: Status, group: Sequence[Alternative]) -> bool:
         present = self._in_use(search.held)
@@ -291,115 +287,64 @@ class Choices(Manager):
             search.part = None
         failed = functools.partial(self._not_loaded, search)
         if search.part is None:
-            return self._try(search, group, self._load_part, functools.partial(self._put, search, status), failed)
-        begin = functools.partial(self._begin_beside, self._priority_of(search.id))
-        return self._try(search, group, begin, functools.partial(self._swap_loaded, search, status), failed)
+            put = functools.partial(self._put, search, status)
+            return self._try(search, group, self._load_part, put, failed) is not None
 
-    def _groups(self, search: _Search, without: Collection[str]) -> Iterator[list[Alternative]]:
-        """Yield the alternatives to try in turn, in groups of those that may be loaded beside each other.
+        def swap(one: Alternative, query: Query) -> Chosen:
+            chosen = self._swap(search, status, one)
+            release_soon(query)
+            return chosen
 
-        One that has failed again and again is waited for, and given up after some tries.
-        """
-        retries = self._trials.retries
-        with self._changed:  # else what fails meanwhile is tried once more
-            search.decided_at = time.monotonic()
-            in_turn = self._in_turn(
-                self._offers.allowed_now(search.held.request), without, self._well_beside(search.id)
-            )
-            alone = {one.key: i for i, one in enumerate(in_turn, 1) if one.break_first or retries.wait_s(one.key) != 0}
-        for _, group in groupby(in_turn, key=lambda one: alone.get(one.key, 0)):
-            found = list(group)
-            first = found[0].key
-            if first in alone:
-                waited_s = retries.rest(first, first, functools.partial(self._say_slow, search))
-                if waited_s is None:
-                    search.tried.append(f"{first}: {GIVEN_UP}")
-                    continue
-                if waited_s:
-                    search.decided_at = time.monotonic()
-            yield found
+        return self._try(search, group, search.beside, swap, failed, check=search.check_wanted) is not None
 
     def _try(
         self,
         search: _Search,
-        group: Iterable[Alternative],
-        begin: _Begin,
-        take: _Take,
-        failed: _Failed,
+        group: Sequence[Alternative],
+        begin: Callable[[Loading], Reply[Query]],
+        take: Callable[[Alternative, Query], Chosen],
+        failed: Callable[[Alternative, Exception], None],
+        check: Callable[[], object] = lambda: None,
         hedge_s: float = HEDGE_S,
-    ) -> bool:
+    ) -> Chosen | None:
         """Take the first of these alternatives that can be had, the next one beside one that hangs."""
-        left, release = iter(group), self._trials.release
-        while (won := first_of(left, begin, release=release, on_failed=failed, hedge_s=hedge_s)) is not None:
-            try:
-                with search.saying:  # a WARNING comes before the UPDATE, or not at all
-                    take(won.candidate, won.value)
-                    search.is_over = True
-            except RrError as error:
-                release(won.value)
-                if isinstance(error, UnknownQuery):  # the choice is being unloaded
-                    raise
-                failed(won.candidate, error)
-            else:
-                search.held.present, search.held.failing = won.candidate.key, False
-                self._trials.used(won.candidate.key)
-                return True
-        return False
 
-    def _begin_part(self, one: Alternative) -> Reply[Query]:
-        """Begin to load an alternative as a part of the choice whose callback runs."""
-        request, limit_s = _request_of(one), one.timeout_s
-        return cast("Reply[Query]", self.registrar.load(one.server, request, timeout_s=limit_s, block=False))
+        def use(one: Alternative, query: Query) -> Chosen:
+            chosen = take(one, query)
+            search.held.present, search.held.failing = one.key, False
+            self._trials.used(one.key)
+            return chosen
 
-    def _load_part(self, one: Alternative) -> Reply[Query]:
+        return search.first(group, lambda one: begin(_loading(one)), use, failed, check=check, hedge_s=hedge_s)
+
+    def _load_part(self, load: Loading) -> Reply[Query]:
         """Load the part of a choice that has none, and wait for it: a load that a crash left would be one too many."""
         loaded: Reply[Query] = Reply()
-        loaded.set(self.registrar.load(one.server, _request_of(one), timeout_s=one.timeout_s))
+        loaded.set(self.registrar.load(load.server, load.request, timeout_s=load.timeout_s))
         return loaded
 
-    def _begin_beside(self, priority: int | None, one: Alternative) -> Reply[Query]:
-        """Begin to load an alternative as no part of anything: a crash leaves a stray, which the next process ends."""
-        load = functools.partial(
-            self.registrar.load, one.server, _request_of(one), priority=priority, timeout_s=one.timeout_s, block=False
-        )
-        return cast("Reply[Query]", contextvars.Context().run(load))
-
-    def _swap_loaded(self, search: _Search, status: Status, one: Alternative, query: Query) -> None:
-        """Put an alternative in the place of the part, and release the query by which it was tried."""
-        self._swap(search, status, one)
-        self._trials.release(query)
-
-    def _swap(self, search: _Search, status: Status, one: Alternative) -> None:
+    def _swap(self, search: _Search, status: Status, one: Alternative) -> Chosen:
         made = functools.partial(self._addresses.made, search.id, search.held, one)
-        limit_s, request = one.timeout_s, _request_of(one)
-        part = self.registrar.replace_part(
-            status, request, one.server, part=search.part, response=made, timeout_s=limit_s
-        )
+        chosen = search.swap(status, search.part, _loading(one), made)
         search.held.present, search.held.failing = one.key, False
-        self._use(search, made(part))
+        self._use(search, chosen)
         self._trials.used(one.key)
+        return chosen
 
-    def _put(self, search: _Search, status: Status, one: Alternative, query: Query) -> None:
+    def _put(self, search: _Search, status: Status, one: Alternative, query: Query) -> Chosen:
         """Use what is loaded as the part of a choice that has none now."""
         chosen = self._addresses.made(search.id, search.held, one, query)
         self.registrar.update_response(search.id, chosen, f"{one.key} takes the place of another one")
         self._mend(search.id)
         status.handled()
         self._use(search, chosen)
+        return chosen
 
     def _use(self, search: _Search, chosen: Chosen) -> None:
         """Note that a choice has this part now."""
         self._addresses.point(search.id, chosen)
         with self._changed:
             self._held[search.id] = search.held
-
-    def _say_slow(self, search: _Search, what: str) -> None:
-        """Tell the holders of a choice that it has nothing that works, while it looks for something."""
-        with search.saying:
-            if not search.is_over:
-                text = "; ".join((*search.tried, what))
-                with contextlib.suppress(RrError):  # it is being unloaded
-                    self.registrar.send_status(search.id, Status(State.WARNING, text))
 
     def _give_up(self, search: _Search, status: Status) -> None:
         text = nothing_left(search.held.request, search.tried)
@@ -461,30 +406,18 @@ class Choices(Manager):
         by_key = {one.key: one for one in best}
         return [by_key[key] for key in order]
 
-    def _well_beside(self, id: str) -> set[str]:
-        with self._changed:
-            return self._trials.well_beside(id)
-
     def _not_loaded(self, search: _Search, one: Alternative, error: Exception) -> None:
         """Note that an alternative cannot be loaded. Only a fault of its own lowers its reliability, and once."""
         is_own = is_own_fault(error)
         counts = self._trials.failed(one.key, began=search.decided_at, is_own=is_own)
         if is_own and counts:
             self._offers.lower(one, new_id())
-        search.tried.append(f"{one.key}: {error}")
 
     def _in_use(self, held: Held) -> Alternative | None:
         """Return the alternative that a choice has; None if neither the file nor a server names it any more."""
         return self._offers.find(held.present, held.request.kind)
 
-    def _priority_of(self, id: str) -> int | None:
-        return next((info.priority for info in self.registrar.resources() if info.id == id), None)
-
     # -- for the trials --------------------------------------------------------------------------------------------
-
-    def _strays(self) -> list[Query]:
-        """Return what the process before has loaded on trial: ids grow with the time at which they are made."""
-        return [query for query in self.registrar.queries() if not query.parent and query.id < self._begun]
 
     def _choices(self) -> dict[str, Choice]:
         return {id: self._choice(held) for id, held in self._held.items()}
@@ -501,8 +434,8 @@ class Choices(Manager):
         one = self._offers.find(key)
         if one is None:
             raise UnknownServer(f"{key}: its server is not there any more", server=key, known=())
-        limit_s, request = one.timeout_s, _request_of(one)
-        return self.registrar.load(one.server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
+        server, request, limit_s = _loading(one)
+        return self.registrar.load(server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
 
     def _have_taken(self, id: str, key: str) -> None:
         """Have a choice return to an alternative, in its status callback, where a crash can repeat it."""
@@ -550,5 +483,13 @@ class Choices(Manager):
         return KeptRecord(self.registrar.directory / "choices.json", _Broken)
 
 
-def _request_of(one: Alternative) -> Any:
-    return NO_FIELDS if one.request is None else one.request
+def _loading(one: Alternative) -> Loading:
+    return Loading(one.server, NO_FIELDS if one.request is None else one.request, one.timeout_s)
+
+
+def _key(one: Alternative) -> str:
+    return one.key
+
+
+def _breaks_first(one: Alternative) -> bool:
+    return one.break_first

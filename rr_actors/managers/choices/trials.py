@@ -14,6 +14,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.managers.choices.planning import UNKNOWN, Choice, Plan, Standing, failed, plan
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault
 from rr_actors.managers.planning.retries import Retries
+from rr_actors.managers.planning.searches import release_soon
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status, StatusCallback
 
@@ -121,10 +122,6 @@ class Trials:
             self.look()
             return True
 
-    def release(self, query: Query) -> None:
-        """Release a query in a thread of its own: that may wait for its provider."""
-        self._in_thread(lambda: query.unload_if_held())
-
     # -- the thread ------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
@@ -155,7 +152,7 @@ class Trials:
     def _release_strays(self) -> None:
         with contextlib.suppress(RegistrarDown):  # it has just been stopped
             for query in self._strays():
-                self.release(query)
+                release_soon(query)
 
     def _begin(self, made: Plan) -> None:
         for key in made.load:
@@ -168,7 +165,7 @@ class Trials:
     def _end(self, key: str) -> None:
         query = self._queries.pop(key, None)
         if query is not None:
-            self.release(query)
+            release_soon(query)
 
     def _try(self, key: str) -> None:
         """Load an alternative on trial, and note how that ended."""

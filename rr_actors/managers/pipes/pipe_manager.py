@@ -7,7 +7,6 @@ another component in the same place has the same ones, and its neighbours run on
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection, Sequence
 
 import msgspec
@@ -22,12 +21,12 @@ from rr_actors.managers.components import (
     ComponentDescription,
     Components,
     LoadComponent,
+    Start,
     component_of,
 )
 from rr_actors.managers.pipes.chains import Goal, Link, best_chain, substitutes, why_none
 from rr_actors.managers.pipes.pipe_files import PipeDescription, read_pipe_file
 from rr_actors.managers.planning.blame import is_own_fault
-from rr_actors.managers.planning.late_word import LateWord
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.templates import Parameters
 from rr_actors.registrar.declarations import server
@@ -95,11 +94,25 @@ class Pipes(Components):
         if part is None:
             return
         try:
-            self._replace_segment(request, status, part)
+            segments, place = self._segments(), _place_of(part)
         except UnknownQuery:
             status.handled()  # the pipe is being unloaded
-        except RrError as error:
-            logger.warning("%s: nothing takes the place of a segment that failed: %s", request.of_type, error)
+            return
+
+        def fitting() -> list[ComponentDescription]:
+            return [self._described[link.name] for link in self._fitting(request, segments, place)]
+
+        def start(one: ComponentDescription) -> Start:
+            program, parameters = self._segment(request, one.name, place)
+
+            def made(spare: Query) -> BuiltPipe:
+                new = component_of(one, parameters, spare)
+                return self._built(request, [*segments[:place], new, *segments[place + 1 :]])
+
+            return Start(self._loading(program), made)
+
+        failed = self._described.get(segments[place].name)
+        self._replace_part(request.of_type, failed, status, part, fitting, start)
 
     # -- building --------------------------------------------------------------------------------------------------
 
@@ -160,44 +173,6 @@ class Pipes(Components):
         return BuiltPipe(request.of_type, segments, {type: _address(id, place, type) for type in last.outputs})
 
     # -- replacing -------------------------------------------------------------------------------------------------
-
-    def _replace_segment(self, request: Pipe, status: Status, part: Query) -> None:
-        """Put the most reliable component that fits in the place of a segment; its neighbours stay.
-
-        Raises:
-            NoPipe: none fits, or none that does can be run.
-            UnknownQuery: the pipe is being unloaded.
-        """
-        segments, place = self._segments(), _place_of(part)
-        failed, why = segments[place].name, list[str]()
-
-        def fitting() -> list[ComponentDescription]:
-            return [self._described[link.name] for link in self._fitting(request, segments, place)]
-
-        def put(one: ComponentDescription) -> str:
-            self._put(request, status, segments, place, one.name, late)
-            return one.name
-
-        with LateWord(self.registrar, failed, status) as late:
-            found = self._first_of(self._after(self._described.get(failed), status, part, fitting, why), put, why)
-        if found is None:
-            raise NoPipe("\n".join([f"no component can take the place of {failed}:", *(why or ["none fits there"])]))
-        logger.warning("%s: %s takes the place of %s: %s", request.of_type, found, failed, status.message)
-
-    def _put(
-        self, request: Pipe, status: Status, segments: list[Component], place: int, name: str, late: LateWord
-    ) -> None:
-        program, parameters = self._segment(request, name, place)
-        made = functools.partial(component_of, self._described[name], parameters)
-        self.registrar.replace_part(
-            status,
-            program,
-            self._programs,
-            response=late.before(
-                lambda spare: self._built(request, [*segments[:place], made(spare), *segments[place + 1 :]])
-            ),
-            timeout_s=program.ready.timeout_s + LOAD_MARGIN_S,
-        )
 
     def _fitting(self, request: Pipe, segments: Sequence[Component], place: int) -> list[Link]:
         links = {link.name: link for link in self._links()}
