@@ -28,8 +28,10 @@ TYPE_CHECKING = False  # type checkers take it for true; to import that of typin
 if TYPE_CHECKING or getattr(_sys, "frozen", False):
     with _left_alone():
         from rr_actors.actors.actor import IGNORE, Actor, ExitReport
+        from rr_actors.actors.mailbox_refs import MailboxRef
         from rr_actors.actors.messaging.dead_letters import DeadLetter, DeadLetters
         from rr_actors.actors.messaging.exit_reports import Down
+        from rr_actors.actors.messaging.mailbox_looks import MailboxInfo, MessageInfo
         from rr_actors.actors.monitors import Monitor, monitor
         from rr_actors.actors.refs import ActorDeadError, ActorRef
         from rr_actors.actors.timers import Timer, send_after
@@ -157,7 +159,10 @@ __all__ = [
     "LoadFailed",
     "LoadTimeout",
     "MailboxFull",
+    "MailboxInfo",
+    "MailboxRef",
     "Manager",
+    "MessageInfo",
     "MissedEvent",
     "Monitor",
     "NameTaken",
@@ -225,8 +230,10 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:
     _NAMES = {
         "rr_actors.actors.actor": "Actor ExitReport IGNORE",
+        "rr_actors.actors.mailbox_refs": "MailboxRef",
         "rr_actors.actors.messaging.dead_letters": "DeadLetter DeadLetters",
         "rr_actors.actors.messaging.exit_reports": "Down",
+        "rr_actors.actors.messaging.mailbox_looks": "MailboxInfo MessageInfo",
         "rr_actors.actors.monitors": "Monitor monitor",
         "rr_actors.actors.refs": "ActorDeadError ActorRef",
         "rr_actors.actors.timers": "Timer send_after",

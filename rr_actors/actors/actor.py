@@ -12,6 +12,7 @@ import threading
 import uuid
 from collections.abc import Callable, Coroutine
 from contextvars import Context
+from time import monotonic
 from types import TracebackType
 from typing import Any, ClassVar, Literal, Self, cast
 
@@ -30,14 +31,16 @@ from rr_actors.actors.messaging.mailbox import (
     Envelope,
     Mailbox,
     Packed,
+    Starting,
     StopActor,
     is_stop,
     refuse_all,
 )
 from rr_actors.actors.messaging.message_notes import Stamp, notes
+from rr_actors.actors.messaging.stepped_mailbox import SteppedMailbox
 from rr_actors.actors.monitors import Monitor, begin, take
 from rr_actors.actors.refs import ActorRef
-from rr_actors.actors.remote.hub import running, urn_of_path
+from rr_actors.actors.remote.hub import is_debugged, running, urn_of_path
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.checks import check_for_actor
 from rr_actors.base.errors import Unavailable, UsageError, shortened, text_of
@@ -87,6 +90,8 @@ class BaseActor(pykka.Actor):
     _life_driver: Driver
     _started: Reply[Any]
     _begun = False
+    _handled: PykkaEnvelope[Any] | None = None  # while a handler runs, for those that look
+    _handled_at = 0.0  # since when, by time.monotonic()
     _report = ExitReport("normal")
     _final = False
     _stop_replies: list[pykka.Future[Any]]
@@ -102,7 +107,8 @@ class BaseActor(pykka.Actor):
         self._place = birth.place
         self._on_exit = birth.on_exit
         self._target = Target(self.actor_urn, birth.path or f"{cls.__name__} ({self.actor_urn})")
-        self._mailbox = Mailbox(self._target.name, cls.mailbox_limit, opens_packed=not cls._lives_on_loop)
+        box = SteppedMailbox if not cls._lives_on_loop and is_debugged(birth.path) else Mailbox
+        self._mailbox = box(self._target.name, cls.mailbox_limit, opens_packed=not cls._lives_on_loop)
         self.actor_inbox = self._mailbox
         self.actor_stopped = threading.Event()
         self._actor_ref = ActorRef(self, self._target, birth.path)
@@ -267,19 +273,22 @@ class BaseActor(pykka.Actor):
     async def _live(self) -> None:
         envelope: PykkaEnvelope[Any] | None = None
         try:
+            self._handled, self._handled_at = Envelope(Starting()), monotonic()
             if not await self._begin():
                 return
             handled = 0
             while not self.actor_stopped.is_set():
-                envelope = self._mailbox.next()
+                self._handled = envelope = self._mailbox.next()
                 if envelope is None:
                     handled = 0
                     await REST
                     continue
+                self._handled_at = monotonic()
                 await self._handle(envelope)
                 handled += 1
                 if handled == BATCH:
                     handled = 0
+                    self._handled = None
                     await PAUSE
         except GeneratorExit:  # the life is dropped, with its process
             raise
@@ -423,6 +432,7 @@ class BaseActor(pykka.Actor):
             log_raised(logger, raised_by(another), "on_failure of %s raised:", self)
 
     async def _end(self) -> None:
+        self._handled = None
         left: list[PykkaEnvelope[Any]] = []
         for envelope in self._mailbox.close():
             if envelope.reply_to is not None and is_stop(envelope.message):

@@ -467,6 +467,19 @@ def watch(ref: DistantRef[Any], fire: Callable[[str, str], None]) -> Callable[[]
     return ref._hub().watch(ref._where, fire)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
+def inquire(ref: ActorRef[Any], what: str) -> Reply[Any]:
+    """Send a question about an actor of another process to that process, whose loop answers."""
+    distant = cast("DistantRef[Any]", ref)
+    return distant._hub().inquire(distant._where, what)  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def why_silent(ref: ActorRef[Any]) -> str:
+    """Return words, "; it is ...", for an error if a signal has stopped the process of an actor; "" else."""
+    process = hub(ref.path)
+    where = cast("DistantRef[Any]", ref)._where  # pyright: ignore[reportPrivateUsage]  # same file
+    return "" if process is None else process.paused(where)
+
+
 def ref_to(path: str) -> ActorRef[Any]:
     """Return the reference to the supervised actor at `path`, "root/cameras", whether or not it runs now."""
     return DistantRef(Whereabouts(Target(urn_of_path(path), path), path, ""))

@@ -43,6 +43,8 @@ class SystemInfo(msgspec.Struct, frozen=True):
     """The state directory, to look whether it is still there."""
     log_levels: dict[str, int] = {}
     """The application's loggers' levels, by name, at the system's start. Children send up no record below them."""
+    debug: bool = False
+    """Whether actors can be paused."""
 
 
 def _unheard(*_said: object) -> None:
@@ -140,7 +142,12 @@ class ProcessNode(abc.ABC):
         self.spawner = Spawner(info.config.preload, info.run_dir)
         self.keeper.also.append(self.spawner.reap)
         self.hub = ActorHub(
-            self.dispatcher, self.transport, self.directory, name=path, ask_timeout_s=info.config.ask_timeout_s
+            self.dispatcher,
+            self.transport,
+            self.directory,
+            name=path,
+            ask_timeout_s=info.config.ask_timeout_s,
+            debug=info.debug,
         )
 
     async def start(self) -> None:

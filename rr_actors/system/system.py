@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Self, cast
 
 from rr_actors.actors.actor import ExitReport
+from rr_actors.actors.mailbox_refs import MailboxRef
 from rr_actors.actors.messaging.dead_letters import Collection, DeadLetters
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.remote.hub import hub
@@ -148,6 +149,7 @@ class System:
         state_dir: the directory for catalogs, sockets and locks, made private (0700). One system at a time uses it.
             Give it one of its own: start() warns if it has other files at first.
         config: limits and defaults.
+        debug: whether actors can be paused and stepped: system.mailbox(id).pause().
 
     Raises:
         InvalidSpec: the tree is wrong. `.field`, `.expected`, `.got`.
@@ -161,11 +163,13 @@ class System:
         name: str = "system",
         state_dir: str | os.PathLike[str] = "rr_state",
         config: SystemConfig | None = None,
+        debug: bool = False,
     ) -> None:
         self.name = check_name(name, "system name")
         self.root = _root_of(root)
         self.state_dir = state_path(state_dir)
         self.config = system_config(config)
+        self.debug = debug
         _check_tree(self.root, self.root.id)
         self._top = self.root.id  # the paths of this tree begin with it
         self._lock = threading.RLock()  # held by the thread that starts or stops the system
@@ -234,7 +238,9 @@ class System:
                 self._child_logs = KeptLogs()
                 self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
                 place = str(state.path), str(state.run_dir), state.key
-                info = SystemInfo(self.name, *place, self.config, state.place, forwarded_logs.levels())
+                info = SystemInfo(
+                    self.name, *place, self.config, state.place, forwarded_logs.levels(), debug=self.debug
+                )
                 self._ended = Flag()
                 self._end = None
                 self._why_stopped = _NOT_RUNNING
@@ -712,6 +718,19 @@ class System:
     def start_child(self, spec: ChildSpec | Supervisor) -> ActorRef[Any] | None:
         """Add a child to the root supervisor and start it, as SupervisorRef.start_child() does."""
         return self.supervisor().start_child(spec)
+
+    def mailbox(self, id: str) -> MailboxRef:
+        """Return the mailbox of an actor, to look at it, or to pause it. No actor is asked for that.
+
+        Args:
+            id: an id or path as for ref(), or that of a supervisor.
+
+        Raises:
+            NotFound: no actor has it, or several have. `.known` has the paths of all.
+        """
+        node = self._running()
+        id = check_text(id, "mailbox: expected an actor's id or path")
+        return MailboxRef(ref_to(self._top) if id in (self._top, self.root.id) else node.ref(id))
 
     # -- looking -------------------------------------------------------------------------------------------------
 

@@ -29,11 +29,13 @@ def run_tree(
     log_level: str,
     log_json: bool = False,
     watch: bool = False,
+    debug: bool = False,
 ) -> bool:
     """Run the tree of a TOML file until a signal ends it, or it ends by itself; return False if the tree gave up.
 
     Modules that the tree names are looked for in the current directory, too. A second signal kills the processes that
-    still run. With `watch`, children whose modules change are restarted.
+    still run. With `watch`, children whose modules change are restarted. With `debug`,
+    actors can be paused.
 
     Raises:
         RrError: a file cannot be read, or the system does not start.
@@ -43,7 +45,7 @@ def run_tree(
         sys.path.insert(0, os.getcwd())
     settings = SystemConfig() if config is None else SystemConfig.from_toml(config)
     root = Supervisor.from_toml(tree)
-    system = System(root, name=name, state_dir=state_dir, config=settings)
+    system = System(root, name=name, state_dir=state_dir, config=settings, debug=debug)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _told)
     try:

@@ -127,6 +127,13 @@ def end_wait(urn: str | None, awaited: Awaited) -> None:
             del _waits[urn]
 
 
+def waits_of(urn: str) -> list[str]:
+    """Return the names of the actors whose replies the handler of this actor waits for. From any thread."""
+    with _lock:
+        waits = list(_waits.get(urn, ()))
+    return [awaited.target.name for awaited in waits if awaited.target is not None and not awaited.done()]
+
+
 def _check(me: Activity, target: Target) -> None:
     check_chain(target, (*me.chain, me.target))
     path = _path(target, me.target.urn)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections import deque
 from collections.abc import Callable
+from time import monotonic
 from typing import Any
 
 import msgspec
@@ -20,12 +22,12 @@ from rr_actors.base.errors import MailboxFull, Unavailable
 
 
 class Envelope(PykkaEnvelope[Any]):
-    """A message, the future for its reply, the actors that are blocked until it is answered, and its stamp.
+    """A message, the future for its reply, the actors that are blocked until it is answered, its stamp, and its time.
 
-    It has a stamp while its system is recorded.
+    It has a stamp while its system is recorded. `at`: when it was made, by time.monotonic().
     """
 
-    __slots__ = ["chain", "stamp"]
+    __slots__ = ["at", "chain", "stamp"]
 
     def __init__(
         self, message: Any, reply_to: Future[Any] | None = None, chain: Chain = (), stamp: Stamp | None = None
@@ -34,6 +36,7 @@ class Envelope(PykkaEnvelope[Any]):
         self.reply_to = reply_to
         self.chain = chain
         self.stamp = stamp
+        self.at = monotonic()
 
 
 class DownNotice(Envelope):
@@ -90,11 +93,23 @@ def has_ended(error: BaseException, name: str) -> bool:
     return isinstance(error, ActorDeadError) and error.__traceback__ is None
 
 
+class Starting:
+    """What an actor handles that is in its on_start."""
+
+
 class Packed(msgspec.Struct, frozen=True, eq=False):
-    """A pickled message, which is unpickled where its actor runs, never on the loop. `size` in bytes."""
+    """A pickled message, which is unpickled where its actor runs, never on the loop.
+
+    Attributes:
+        size: in bytes.
+        sender: the name of the process that sent it.
+        blob: its pickle, unless that is in shared memory.
+    """
 
     open: Callable[[], Any]
     size: int
+    sender: str = ""
+    blob: bytes = b""
 
     def __repr__(self) -> str:
         return f"<{self.size} bytes>"
@@ -110,12 +125,15 @@ class Mailbox:
 
     Attributes:
         waiting: the messages that wait for their turn, first in, first out.
+        limit: how many of them there may be.
     """
+
+    is_paused = False
 
     def __init__(self, owner: str, limit: int, *, opens_packed: bool = False) -> None:
         self.opens_packed = opens_packed
         self._owner = owner
-        self._limit = limit
+        self.limit = limit
         self._lock = threading.Lock()
         self.waiting: deque[PykkaEnvelope[Any]] = deque()
         self._control: deque[PykkaEnvelope[Any]] = deque()
@@ -161,13 +179,21 @@ class Mailbox:
     def _check(self, *, urgent: bool) -> None:
         if not self._open:
             raise Ended(f"{self._owner} not found", self._owner)
-        if not urgent and len(self.waiting) >= self._limit:
+        if not urgent and len(self.waiting) >= self.limit:
             raise MailboxFull(
-                f"mailbox of {self._owner}: holds {self._limit} messages, its limit; send less, ask instead of "
+                f"mailbox of {self._owner}: holds {self.limit} messages, its limit; send less, ask instead of "
                 f"telling, or raise the class's mailbox_limit",
                 name=self._owner,
-                limit=self._limit,
+                limit=self.limit,
             )
+
+    def first(self, count: int) -> list[PykkaEnvelope[Any]]:
+        """Return the first messages, at most `count`; they stay. From any thread."""
+        while True:
+            try:
+                return list(itertools.islice(itertools.chain(self._control, self.waiting), count))
+            except RuntimeError:  # another thread has put or taken one meanwhile
+                continue
 
     def take_turn(self) -> bool:
         """Take the turn for which the actor was scheduled; return False if it was taken before."""

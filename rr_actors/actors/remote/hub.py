@@ -62,6 +62,7 @@ class ActorHub:
         transport: the transport at whose address other processes find this process's actors; it may listen later.
         name: the name of this process, for errors on the other side: "root/cameras".
         ask_timeout_s: the time-out of an ask that has none of its own.
+        debug: whether the mailboxes of its actors can be paused.
     """
 
     def __init__(
@@ -72,8 +73,10 @@ class ActorHub:
         *,
         name: str = "root",
         ask_timeout_s: float = ASK_TIMEOUT_S,
+        debug: bool = False,
     ) -> None:
         self.name = name
+        self.debug = debug
         self.address = transport.address
         self.ask_timeout_s = ask_timeout_s
         self._dispatcher = dispatcher
@@ -201,7 +204,7 @@ class ActorHub:
         line.put(Tell(where.target.urn, line.parcels.pack(body), stamp))
 
     def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
-        """Ask the actor's process about the actor: "alive", "class" or "attributes"."""
+        """Ask the actor's process about the actor: "alive", "class" or "attributes", or for what is in ORDERS."""
         reply: Reply[Any] = Reply()  # without a target: the process replies, so the actor's own handler may wait for it
         self._call(where, reply, lambda number, _: Inquire(number, where.target.urn, what))
         return reply
@@ -496,6 +499,12 @@ def hub(path: str | None = None) -> ActorHub | None:
     """Return this process's hub for the tree of `path`; the newest hub if there is no such tree here, or no path."""
     found = None if path is None else _hubs.get(_top(path))
     return found or next(reversed(_hubs.values()), None)
+
+
+def is_debugged(path: str | None) -> bool:
+    """Return whether the tree of `path` was started for debugging."""
+    found = None if path is None else _hubs.get(_top(path))
+    return found is not None and found.debug
 
 
 def ask_timeout_s() -> float:

@@ -13,6 +13,7 @@ from rr_actors.actors.messaging.ask_cycles import Chain, Target, check_chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import ExcInfo, error_of
 from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, StopActor, has_ended, put
+from rr_actors.actors.messaging.mailbox_orders import ORDERS, carry_out
 from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.actors.remote.protocol import (
     PATH_URN,
@@ -72,6 +73,8 @@ class Visitor:
                 self._deliver(to, body, call, chain, stamp)
             case Tell(to, body, stamp):
                 self._deliver(to, body, None, (), stamp)
+            case Inquire(call, to, what) if what in ORDERS:
+                self._order(call, to, what)
             case Inquire(call, to, what):
                 self._in_turn(to, call, message, self._inquire, call, to, what)
             case Halt(call, to, reason, final, stamp):
@@ -150,7 +153,7 @@ class Visitor:
     def _deliver(self, to: str, body: bytes | Parcel, call: int | None, chain: Chain, stamp: Stamp | None) -> None:
         ref = self._find(to)
         opens = (lambda: pickling.loads(body)) if isinstance(body, bytes) else self._parcels.claim(body)
-        packed = Packed(opens, len(body))
+        packed = Packed(opens, len(body), self._link.peer, body if isinstance(body, bytes) else b"")
         if ref is None:
             self._undeliverable(to, call, packed)
         elif _opens_packed(ref):
@@ -230,6 +233,17 @@ class Visitor:
             ref.actor_inbox.put(Envelope(StopActor(reason, final=final), answer, stamp=stamp))
         except Exception as error:
             self.raised(call, error, str(ref))
+
+    def _order(self, call: int, to: str, what: str) -> None:
+        """Look at a mailbox, or hold it up. The loop answers at once, whatever the actor does."""
+        ref = self._find(to)
+        if ref is None:
+            self.post(Dead(call))
+            return
+        try:
+            carry_out(ref, what, lambda done: self.answer(call, done, to))
+        except Exception as error:
+            self.raised(call, error)
 
     def _inquire(self, call: int, to: str, what: str) -> None:
         ref = self._find(to)

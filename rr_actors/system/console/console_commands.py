@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from rr_actors.actors.mailbox_refs import MailboxRef
+from rr_actors.actors.messaging.mailbox_looks import MailboxInfo
 from rr_actors.base.errors import (
     ActorUnavailable,
     NotFound,
@@ -362,6 +364,49 @@ def _child(view: View, given: str) -> tuple[str, SupervisorRef, Child]:
         raise UsageError(f"{path}: it is the root supervisor; to end it, shut the system down")
     supervisor = SupervisorRef(above)
     return path, supervisor, supervisor.which_child(id)
+
+
+# -- mailboxes, in a system for debugging ----------------------------------------------------------------------------
+
+
+class PauseActor(Command[c.Done], frozen=True):
+    """Keep the messages of an actor in its mailbox."""
+
+    actor: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        found = view.at_mailbox(self.actor, MailboxRef.pause)
+        busy = f"; it still handles {found.handled}" if found.handled is not None else ""
+        return c.Done(f"paused {found.path}: {found.length} wait{busy}", _mailbox_facts(found))
+
+
+class ResumeActor(Command[c.Done], frozen=True):
+    """Have a paused actor handle its messages again."""
+
+    actor: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        found = view.at_mailbox(self.actor, MailboxRef.resume)
+        return c.Done(f"resumed {found.path}: {found.length} waited", _mailbox_facts(found))
+
+
+class StepActor(Command[c.Done], frozen=True):
+    """Have a paused actor handle one message."""
+
+    actor: c.Text
+    timeout_s: c.Seconds = 30.0
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        stepped = view.at_mailbox(self.actor, lambda mailbox: mailbox.step(self.timeout_s))
+        found = view.at_mailbox(self.actor, MailboxRef.look)
+        facts = _mailbox_facts(found) | {"type": None if stepped is None else stepped.type}
+        if stepped is None:
+            return c.Done(f"{found.path} handled nothing: no message waits", facts)
+        return c.Done(f"{found.path} handled {stepped}; {found.length} wait", facts)
+
+
+def _mailbox_facts(found: MailboxInfo) -> dict[str, object]:
+    return {"path": found.path, "waiting": found.length, "is_paused": found.is_paused}
 
 
 # -- clients ----------------------------------------------------------------------------------------------------------

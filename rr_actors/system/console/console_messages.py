@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import msgspec
 
 from rr_actors.actors.messaging.dead_letters import DeadLetter
+from rr_actors.actors.messaging.mailbox_looks import MailboxInfo
 from rr_actors.base.names import named
 from rr_actors.base.reporting.tracebacks import ProcessStacks
 from rr_actors.base.values.failure import Failure
@@ -269,6 +270,12 @@ class ChildStacks(Message, frozen=True):
 
     path: str
     stacks: ProcessStacks
+
+
+class MailboxSeen(Message, frozen=True):
+    """The mailbox of an actor."""
+
+    mailbox: MailboxInfo
 
 
 class Letters(Message, frozen=True):

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import msgspec
 
+from rr_actors.actors.mailbox_refs import MailboxRef
 from rr_actors.base.errors import NotSerializable
 from rr_actors.registrar.declarations import Declaring
 from rr_actors.registrar.registrar import has_all_streams
@@ -192,6 +193,15 @@ class ListStacks(Verb[c.ChildStacks], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> c.ChildStacks:
         path = view.running_child(self.child)
         return c.ChildStacks(path, view.node.dispatcher.run(view.node.stacks.of(path, self.limit_s)))
+
+
+class LookAtMailbox(Verb[c.MailboxSeen], frozen=True):
+    """The mailbox of an actor, which its path or id names: a child, a supervisor, a registrar or one of its clients."""
+
+    actor: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.MailboxSeen:
+        return c.MailboxSeen(view.at_mailbox(self.actor, MailboxRef.look))
 
 
 class ListDeadLetters(Verb[c.Letters], frozen=True):

@@ -20,11 +20,12 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import msgspec
 
+from rr_actors.actors.mailbox_refs import MailboxRef
 from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.actors.messaging.exit_reports import ExitReport
-from rr_actors.actors.refs import ActorRef
+from rr_actors.actors.refs import ActorDeadError, ActorRef
 from rr_actors.base.config import SystemConfig
-from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, readable, text_of
+from rr_actors.base.errors import ActorUnavailable, NotFound, RrError, Unavailable, UsageError, readable, shown, text_of
 from rr_actors.base.names import child_meant, no_child
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.registrar.engine.node import Node
@@ -62,6 +63,8 @@ class Viewed(Protocol):
     def supervisor(self, path: str | None = None) -> SupervisorRef: ...
 
     def ref(self, id: str) -> ActorRef[Any]: ...
+
+    def mailbox(self, id: str) -> MailboxRef: ...
 
     def registrar(self, name: str) -> Registrar: ...
 
@@ -174,6 +177,18 @@ class View:
         if rows[path].pid is None:
             raise Unavailable(f"{path}: it has no process now: it is {rows[path].state}")
         return path
+
+    def at_mailbox(self, actor: str, do: Callable[[MailboxRef], _A]) -> _A:
+        """Do something with the mailbox of an actor.
+
+        Raises:
+            NotFound: there is no such actor.
+            ActorUnavailable: it has ended.
+        """
+        try:
+            return do(self.system.mailbox(actor))
+        except ActorDeadError as error:
+            raise ActorUnavailable(f"{shown(actor)}: {error}", id=actor) from error
 
     # -- registrars --------------------------------------------------------------------------------------------------
 

@@ -40,6 +40,7 @@ from rr_actors.tools.cli_commands import (
     shown_again,
 )
 from rr_actors.tools.explanations import LOADS_HEADS, NO_LOAD_WAITS, WAITING_HEADS, explain, loads_cells, waiting_cells
+from rr_actors.tools.mailbox_texts import explain_actor
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
@@ -653,15 +654,20 @@ def why(
     id: Annotated[
         str,
         typer.Argument(
-            help="The id of a query or resource, its beginning or end, or a resource's name.",
-            autocompletion=_completing(_targets),
+            help="The id of a query or resource, its beginning or end, or a resource's name; or an actor's id or path.",
+            autocompletion=_completing(_children_or_resources),
         ),
     ],
     state: StateOption = None,
 ) -> None:
-    """Say who holds a resource, for whom, since when, and what it waits for."""
+    """Say who holds a resource, for whom, since when, and what it waits for; or whom an actor waits for.
+
+    An actor that asks waits for the one that it has asked. If these wait for each other, the ring is named.
+    """
     with _client(state) as client:
-        for line in explain(client, id):
+        for line in explain_actor(lambda one: client.ask(questions.LookAtMailbox(one)).mailbox, id) or explain(
+            client, id
+        ):
             say(line)
 
 

@@ -27,12 +27,13 @@ def run(
     log: Annotated[Literal["debug", "info", "warning", "error"], typer.Option(help="What its log tells.")] = "info",
     as_json: Annotated[bool, typer.Option("--json", help="The log as one object of JSON a line.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Restart a child whose module has changed.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Let rr-actors pause, step and resume its actors.")] = False,
 ) -> None:
     """Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second one kills what is left.
 
     Exit code 1 if the tree gave up by itself.
     """
-    if not run_tree(tree, state, config, name, log_level=log, log_json=as_json, watch=watch):
+    if not run_tree(tree, state, config, name, log_level=log, log_json=as_json, watch=watch, debug=debug):
         raise typer.Exit(1)
 
 

@@ -40,6 +40,12 @@ def _streams() -> ModuleType:
     return stream_verbs
 
 
+def _mailboxes() -> ModuleType:
+    from rr_actors.tools.verbs import mailbox_verbs
+
+    return mailbox_verbs
+
+
 def _recording() -> ModuleType:
     from rr_actors.tools.verbs import recording_verbs
 
@@ -90,7 +96,9 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
                 "Serve a live web page of a running system: its tree, its resources, the last minutes; "
                 "print its address"
             ),
-            "why": "Say who holds a resource, for whom, since when, and what it waits for",
+            "why": (
+                "Say who holds a resource, for whom, since when, and what it waits for; or whom an actor waits for"
+            ),
             "graph": (
                 "Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz"
             ),
@@ -98,6 +106,12 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
                 "Wait until a child or a resource is in a state; before the system runs, for that, too; "
                 "exit code 1 if in vain"
             ),
+        },
+        _mailboxes: {
+            "mailbox": (
+                "Show how many messages wait for an actor, since when, of what types, and what it handles, "
+                "from whom, since when"
+            )
         },
         _planner: {
             "keep": "Show what a Keeper keeps, how many replicas are ready, and why others are not",
@@ -144,6 +158,13 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
             "restart": "Start a child again",
             "start": "Add a child to the running tree, and start it",
             "shutdown": "Stop the whole system in order, as its own stop() does",
+        },
+        _mailboxes: {
+            "pause": (
+                "Keep the messages of an actor in its mailbox, in a system that was started for debugging (--debug)"
+            ),
+            "step": "Have a paused actor handle one message, and say which",
+            "resume": "Have a paused actor handle its messages again",
         },
         _chaos: {
             "chaos": (
