@@ -39,7 +39,7 @@ def left_behind() -> list[Path]:
 
 
 def test_each_experiment_says_what_it_is_and_what_to_look_for() -> None:
-    assert len({one.title for one in EXPERIMENTS.values()}) == len(EXPERIMENTS) == 18
+    assert len({one.title for one in EXPERIMENTS.values()}) == len(EXPERIMENTS) == 21
     for one in EXPERIMENTS.values():
         assert one.about
         assert one.look_for
@@ -200,6 +200,9 @@ RIGHT = {
     "rebinding": {"the lidar, and later the camera again"},
     "keep": {"radio 0, radio 1 and radio 2"},
     "umrf": {"the spare camera takes it"},
+    "full_mailbox": {"nothing: readings become dead letters"},
+    "philosophers": {"one is refused at once, the others eat"},
+    "lost_token": {"it is gone, and the ring stands still"},
 }
 PULLED = (
     ("your_own_tree", {"strategy": "one_for_all", "max_restarts": 0}, {"give up"}),
@@ -213,6 +216,13 @@ PULLED = (
     ("rebinding", {"at_least_hz": 50}, {"nothing: it ends with an error"}),
     ("keep", {"fault": "silent", "then_wanted": 5}, {"radio 0, radio 1 and radio 2"}),
     ("keep", {"delay_s": 20.0}, {"radio 1 and radio 2"}),
+    ("full_mailbox", {"way": "ask"}, {"each answer, as slow as the filter"}),
+    ("full_mailbox", {"where": "its own process"}, {"MailboxFull"}),
+    ("full_mailbox", {"limit": 1000}, {"nothing: all of them wait"}),
+    ("philosophers", {"where": "processes of their own"}, {"all wait, until a time limit ends one"}),
+    ("philosophers", {"first": "the fork with the lower number"}, {"all eat, one after another"}),
+    ("philosophers", {"way": "tell"}, {"all wait for ever"}),
+    ("lost_token", {"watch": "the program, with a monitor"}, {"the one that watches makes a new one"}),
     ("umrf", {"killed": "actions"}, {"the spare camera takes it", "the spare camera begins again, as attempt 2"}),
 )
 

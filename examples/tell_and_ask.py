@@ -1,0 +1,49 @@
+"""Tell against ask: a tell returns at once and hears nothing; an ask waits for the answer, and hears the error.
+
+An error in a handler that was told ends the actor, and its supervisor starts it again: its count is lost.
+
+python examples/tell_and_ask.py
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import threading
+
+import rr_actors as rr
+
+
+class Counter(rr.Actor):
+    count = 0
+
+    def on_receive(self, message: int) -> int:
+        if message < 0:
+            raise ValueError("only upward")
+        self.count += message
+        return self.count
+
+
+def main() -> None:
+    logging.getLogger("rr_actors").setLevel(logging.CRITICAL)  # the errors are what this shows
+    back = threading.Event()
+    children = [rr.ChildSpec(Counter, id="counter", placement="thread")]
+    with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
+        system.subscribe(lambda event: back.set() if event["event"] == "restarted" else None)
+        counter = system.ref("counter")
+        for _ in range(3):
+            counter.tell(10)
+        print("told three times, then asked:", counter.ask(0))
+        try:
+            counter.ask(-1)
+        except ValueError as error:
+            print("asked, and heard the error:", error)
+        print("the actor lives, and has:", counter.ask(0))
+        counter.tell(-1)
+        print("told, and heard nothing")
+        back.wait(10)
+        print("the actor is another one, and has:", counter.ask(0))
+
+
+if __name__ == "__main__":
+    main()
