@@ -80,7 +80,7 @@ class ChildRecords:
         Raises:
             CatalogError: the directory cannot be read.
         """
-        place = self._place(supervisor)
+        place = self.place(supervisor)
         with _errors_named(place):
             try:
                 with Folder.below(self.state_dir, place) as folder:
@@ -95,7 +95,7 @@ class ChildRecords:
             CatalogDamaged, CatalogVersion: as decode() says.
             CatalogError: it cannot be read.
         """
-        place = self._place(supervisor)
+        place = self.place(supervisor)
         with _errors_named(place / id), Folder.below(self.state_dir, place) as folder:
             return decode(folder.read(id), str(place / id), _below_root(supervisor), id)
 
@@ -105,7 +105,7 @@ class ChildRecords:
         Raises:
             CatalogError: it cannot be written.
         """
-        place = self._place(supervisor)
+        place = self.place(supervisor)
         with _errors_named(place / id):
             make_directories(place, synced=synced)
             with Folder.below(self.state_dir, place) as folder:
@@ -118,7 +118,7 @@ class ChildRecords:
         Raises:
             CatalogError: one cannot be removed.
         """
-        place = self._place(supervisor)
+        place = self.place(supervisor)
         with _errors_named(place):
             try:
                 folder = Folder.below(self.state_dir, place)
@@ -161,7 +161,8 @@ class ChildRecords:
                 path = f"{top}/{other}" if other else top
                 self.remove(path, self.ids(path), synced=False)
 
-    def _place(self, supervisor: str) -> Path:
+    def place(self, supervisor: str) -> Path:
+        """Return the directory that has the records of a supervisor's children."""
         return self.state_dir / _PLACE / f":{_below_root(supervisor).replace('/', ':')}"
 
 

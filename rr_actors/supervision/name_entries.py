@@ -23,6 +23,7 @@ from rr_actors.base.errors import (
     NameTaken,
     RrError,
     StartFailed,
+    few,
 )
 from rr_actors.base.names import CLIENTS
 from rr_actors.base.reporting.log import Log
@@ -39,6 +40,11 @@ from rr_actors.wire.name_service import Directory, Presence, Turn, actor_key, re
 from rr_actors.wire.unix_sockets import pid_of
 
 logger = Log("rr_actors.supervision")
+
+
+_ORPHANS = (
+    "%s: its children %s are on disk, and start again when the tree has this supervisor; to forget them, remove %s"
+)
 
 
 class Entries:
@@ -98,6 +104,18 @@ class Entries:
                 text = f"{where} is kept on disk from an earlier run, and {other} has its id: choose another for that"
                 raise InvalidSpec(text, field="id", expected="an id that no kept child has", got=child.id)
             self._mark_one(child, where, Presence.STARTING, turn=Turn.DUE)
+
+    def tell_of_orphans(self, spec: ChildSpec, path: str) -> None:
+        """Log each supervisor that is not in the tree now, and whose children are on disk.
+
+        Raises:
+            CatalogError: what is kept cannot be listed.
+        """
+        there = {where for where, _ in self.starting_with(spec, path)}
+        for below in self._records.supervisors():
+            above = f"{path}/{below}" if below else path
+            if above not in there and (ids := self._records.ids(above)):
+                logger.warning(_ORPHANS, above, few(ids), self._records.place(above))
 
     def mark_dormant(self, spec: ChildSpec, path: str, why: str) -> None:
         """Mark the registrars of a kept child that does not start as DORMANT: its catalogs are there, and not open."""

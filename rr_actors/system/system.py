@@ -312,6 +312,7 @@ class System:
             note_started(classes_of(spec))
             entries = Entries(node.directory, ChildRecords(info.state_dir))
             entries.announce(spec, self._top)
+            entries.tell_of_orphans(spec, self._top)
             in_tree = set(entries.registrars_of(spec, self._top))
             renamed = renamed_managers(spec, self._top)
             await node.dispatcher.workers.run(take_over, self.config, Path(info.state_dir), renamed)

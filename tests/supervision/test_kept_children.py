@@ -405,6 +405,18 @@ class Counter(rr.Actor):
         return self.value
 
 
+def test_children_of_a_supervisor_that_the_tree_has_no_more_are_named_and_start_when_it_is_added(
+    start: Start, state_dir: Path, workshop: Workshop, caplog: pytest.LogCaptureFixture
+) -> None:
+    lost(state_dir, pickle.dumps((str(workshop.root),)))
+    system = start()
+    (told,) = [record.getMessage() for record in caplog.records if "on disk" in record.getMessage()]
+    assert told.startswith("root/pool: its children a, b, c are on disk, and start again when the tree has this")
+    assert told.endswith(str(state_dir / ".children" / ":pool"))
+    system.start_child(pool())
+    assert {child.state for child in system.supervisor("pool").which_children()} == {"running"}
+
+
 # -- children without an id ------------------------------------------------------------------------------------------
 
 

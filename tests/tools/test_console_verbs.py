@@ -883,6 +883,20 @@ def test_children_are_killed_stopped_restarted_and_added(shop: rr.System, worksh
     assert "second/thing" in shop.registrar("second").servers()
 
 
+def test_a_child_of_a_dynamic_supervisor_is_added_shown_and_stopped(start: Start, workshop: Workshop) -> None:
+    pool = rr.Supervisor([rr.ChildSpec(Shop, id="shop")], id="pool", strategy="simple_one_for_one")
+    system = start(rr.Supervisor([pool]))
+    args = json.dumps([str(workshop.root)])
+    ttys0 = ("start", args, "--under", "pool", "--id", "ttyS0")
+    assert "would start the worker root/pool/ttyS0" in said(*ttys0, "--dry-run")
+    assert said(*ttys0).strip() == "started the worker root/pool/ttyS0"
+    assert "ttyS0" in said("ps")
+    assert "is running" in refused(2, *ttys0)
+    assert "expected a JSON list" in refused(2, "start", "{}", "--under", "pool", "--id", "ttyS1")
+    assert said("terminate", "ttyS0").strip() == "stopped root/pool/ttyS0"
+    assert system.supervisor("pool").which_children() == []
+
+
 def test_a_shutdown_that_waits_returns_when_no_child_runs(shop: rr.System) -> None:
     pid = pid_of(shop, "shop")
     assert "would stop" in said("shutdown", "--wait", "--dry-run")

@@ -324,24 +324,35 @@ class Restart(Command[c.Done], frozen=True):
 
 
 class StartChild(Command[c.Done], frozen=True):
-    """Add a child to the supervisor at a path ("": the root), from a TOML text as Supervisor.from_toml reads it."""
+    """Add a child to the supervisor at a path ("": the root), from a TOML text as Supervisor.from_toml reads it.
+
+    With an `id`, a child of a dynamic supervisor: `spec` has its arguments, as a JSON list.
+    """
 
     spec: c.Long
     supervisor: c.Text = ""
     file: c.Text = "the specification"
     dry_run: bool = False
+    id: c.Text = ""
 
     def _carry_out(self, view: View, caller: Caller) -> c.Done:
-        spec = child_from_toml(self.spec.encode(), self.file)
         supervisor = view.system.supervisor(self.supervisor or None)
-        path = f"{supervisor.path}/{spec.id}"
+        spec = _arguments(self.spec) if self.id else child_from_toml(self.spec.encode(), self.file)
+        path = f"{supervisor.path}/{self.id if isinstance(spec, list) else spec.id}"
         what = "supervisor" if isinstance(spec, Supervisor) else "worker"
         if self.dry_run:
             return c.Done(f"would start the {what} {path}", {"path": path})
-        ref = supervisor.start_child(spec)
+        ref = supervisor.start_child(spec, id=self.id or None)
         if ref is None:
             return c.Done(f"{path}: its on_start said IGNORE, so it does not run", {"path": path, "pid": None})
         return c.Done(f"started the {what} {path}", {"path": path, "pid": ref.pid})
+
+
+def _arguments(text: str) -> list[Any]:
+    try:
+        return msgspec.json.decode(text, type=list[Any])
+    except (msgspec.MsgspecError, UnicodeError) as error:
+        raise UsageError(f"arguments: expected a JSON list, got {shown(text)}: {error}") from error
 
 
 class ShutDown(Command[c.Done], frozen=True):

@@ -952,21 +952,26 @@ def restart(
 @app.command(epilog="Example: rr-actors start lidar.toml --under root/sensors")
 def start(
     spec: Annotated[
-        Path, typer.Argument(metavar="SPEC.toml", help="actor = 'module:class', id = ...; or a supervisor.")
+        str,
+        typer.Argument(
+            metavar="SPEC.toml",
+            help="actor = 'module:class', id = ...; or a supervisor. With --id: a JSON list of arguments.",
+        ),
     ],
     under: Annotated[
         str, typer.Option(help="The path of its supervisor. Default: the root.", autocompletion=_completing(_children))
     ] = "",
+    id: Annotated[str, typer.Option(help="The id of a child of a dynamic supervisor, which has the class.")] = "",
     state: StateOption = None,
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
     """Add a child to the running tree, and start it. Its class is imported by the running system, by its name."""
     try:
-        text = spec.read_text()
+        text = spec if id else Path(spec).read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{spec}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    _carry_out(state, commands.StartChild(text, under, str(spec), dry_run), as_json)
+    _carry_out(state, commands.StartChild(text, under, "" if id else spec, dry_run, id), as_json)
 
 
 @app.command(epilog="Example: rr-actors shutdown --state rr_state")
