@@ -442,6 +442,25 @@ def test_what_one_without_an_id_leaves_with_its_dead_supervisor_is_dormant_and_i
     eventually(lambda: system.dormant() == [])
 
 
+def test_what_a_static_child_that_was_added_at_run_time_leaves_is_dormant_and_is_ended_by_its_class(
+    start: Start, workshop: Workshop, args: list[str]
+) -> None:
+    system = start(rr.Supervisor([rr.Supervisor([], id="inner", placement="process")]))
+    shop = rr.ChildSpec(Shop, id="shop", args=args)
+    system.supervisor("inner").start_child(shop)
+    query = system.open_registrar("app").load("shop/thing", THING)
+    kill(system, "inner")
+    assert query.wait_status(rr.State.FATAL, timeout_s=LIMIT_S)
+    eventually(lambda: system.dormant() == ["shop"])
+    eventually(lambda: child(system, "inner").state == "running")
+    system.supervisor("inner").start_child(shop)
+    assert system.dormant() == []
+    system.supervisor("inner").terminate_child("shop")
+    system.supervisor("inner").delete_child("shop")
+    system.stop()
+    assert workshop.lines("unload lamp") == ["unload lamp"]
+
+
 def test_a_record_of_a_manager_with_power_durability_is_synced(
     start: Start, state_dir: Path, args: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
