@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 from fuzz.target import Feed, Target
 from rr_actors.actors.actor import Actor
 from rr_actors.base.config import RegistrarConfig, SystemConfig
-from rr_actors.base.errors import ConfigError
+from rr_actors.base.errors import CatalogError, ConfigError
 from rr_actors.managers.components import read_registry
 from rr_actors.managers.planning.reliability import FALL, Reliabilities
 from rr_actors.managers.robots import read_robots
+from rr_actors.storage.child_records import ChildRecord, decode, encode
 from rr_actors.supervision.core.specs import Supervisor
 
 
@@ -125,6 +127,26 @@ def _prepare_reliability(directory: Path) -> Feed:
 
     return feed
 
+
+def _prepare_child(_directory: Path) -> Feed:
+    def feed(data: bytes) -> None:
+        """With a checksum that is right, too: it is the record of this child, or a named error."""
+        for file in (data, b"rr-child %08x %b" % (zlib.crc32(data), data)):
+            try:
+                assert (record := decode(file, "file", "pool", "a")).id == "a"
+                assert decode(encode(record), "file", "pool", "a") == record
+            except CatalogError as error:
+                assert error.path == "file"
+
+    return feed
+
+
+def _children() -> list[bytes]:
+    whole = [encode(ChildRecord("pool", id, 7, b"arguments")) for id in ("a", "b")]
+    return [part for file in whole for part in (file, file[18:])]
+
+
+CHILD = Target("the record of a child", _prepare_child, _children)
 
 RELIABILITY = Target(
     "what the component manager remembers of failures",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fuzz.catalogs import CATALOG
 from fuzz.consoles import CONSOLE
-from fuzz.files import READERS, RELIABILITY
+from fuzz.files import CHILD, READERS, RELIABILITY
 from fuzz.journals import JOURNAL
 from fuzz.peers import PEER
 from fuzz.requests import REQUESTS
@@ -20,6 +20,7 @@ TARGETS: dict[str, Target] = {
     "requests": REQUESTS,
     **READERS,
     "reliability.json": RELIABILITY,
+    "child": CHILD,
     "catalog": CATALOG,
     "journal": JOURNAL,
 }

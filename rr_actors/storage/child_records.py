@@ -51,10 +51,15 @@ def decode(data: bytes, path: str, supervisor: str, id: str) -> ChildRecord:
     if magic != _MAGIC or checksum != b"%08x" % zlib.crc32(body):
         raise _damaged(path, "other bytes than were written")
     version, _, packed = body.partition(b" ")
-    if int(version) != _VERSION:
+    if version != b"%d" % _VERSION and version.isdigit() and len(version) < 10:
         text = f"{path}: expected the record of a child in version {_VERSION}, got version {int(version)}; it is left"
         raise CatalogVersion(f"{text} as it is", path=path, expected=_VERSION, got=int(version))
-    record = msgspec.msgpack.decode(packed, type=ChildRecord)
+    if version != b"%d" % _VERSION:
+        raise _damaged(path, "one of no version")
+    try:
+        record = msgspec.msgpack.decode(packed, type=ChildRecord)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise _damaged(path, f"one that rr_actors does not write: {error}") from error
     if (record.supervisor, record.id) != (supervisor, id):
         raise _damaged(path, f"that of {record.id!r} of the supervisor {record.supervisor!r}")
     return record

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,12 @@ def test_the_record_of_another_version_is_named(
         records.write("root/pool", "a", b"", 1, synced=False)
     with pytest.raises(CatalogVersion, match="expected the record of a child in version 1, got version 2"):
         records.read("root/pool", "a")
+
+
+@pytest.mark.parametrize("body", [b"", b"1", b"1 ", b"x \x80", b"9" * 5000 + b" \x80", b"1 \x84", b"1 \xa1\xff"])
+def test_a_whole_file_that_no_version_writes_is_named_as_damaged(body: bytes) -> None:
+    with pytest.raises(CatalogDamaged, match=r"^file: expected the record of a child, got one "):
+        decode(b"rr-child %08x %b" % (zlib.crc32(body), body), "file", "pool", "a")
 
 
 @pytest.mark.parametrize("kind", ["link", "directory", "pipe"])
