@@ -734,6 +734,23 @@ def test_restarted_in_order_when_it_has_released_an_exclusive_one_it_chooses_ane
     world.settled(choice, choice.response.server.removeprefix("sensors/"))
 
 
+def test_stopped_in_order_while_it_searches_it_logs_no_error(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    every = [Alternative("range", f"sensors/{name}", "front", break_first=True) for name in ("camera", "lidar")]
+    system = start(rr.ChildSpec(Choices, id="choices", args=(every,), placement="thread"))
+    sensors, gate = system.open_registrar("sensors"), Gate()
+    serve(sensors, "camera")
+    serve(sensors, "lidar", lambda request: gate())
+    system.open_registrar("app").load("choices/choice", Choose("range"))
+    sensors.send_status(sensors.resources()[0], rr.Status("FATAL", "unplugged"))
+    gate.wait_arrived()
+    system.supervisor().terminate_child("choices")
+    gate.open()
+    assert [record.getMessage() for record in caplog.records if "choice" in record.getMessage()] == []
+    system.supervisor().restart_child("choices")
+    (query,) = system.registrar("app").queries()
+    eventually(lambda: query.state is rr.State.UPDATE, LIMIT_S)
+
+
 def test_killed_while_its_part_says_error_it_takes_the_next_that_is_well(start: Start) -> None:
     world = World(start, settle_s=0.1)
     choice = world.choose()

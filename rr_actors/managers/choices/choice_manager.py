@@ -18,7 +18,15 @@ import msgspec
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.checks import is_number
-from rr_actors.base.errors import ConfigError, LoadFailed, RrError, Unavailable, UnknownQuery, UnknownServer
+from rr_actors.base.errors import (
+    ConfigError,
+    LoadFailed,
+    RegistrarDown,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UnknownServer,
+)
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import wrong
@@ -183,6 +191,8 @@ class Choices(Manager):
                 self._hear_part(id, held, status)
         except UnknownQuery:  # the choice is being unloaded
             status.handled()
+        except RegistrarDown as error:  # the next process hears the status again
+            logger.info("%s: %s", request.kind, error)
 
     # -- hearing ---------------------------------------------------------------------------------------------------
 
@@ -288,14 +298,14 @@ class Choices(Manager):
         failed = functools.partial(self._not_loaded, search)
         if search.part is None:
             put = functools.partial(self._put, search, status)
-            return self._try(search, group, self._load_part, put, failed) is not None
+            return self._try(search, group, self._load_part, put, failed, search.check_wanted) is not None
 
         def swap(one: Alternative, query: Query) -> Chosen:
             chosen = self._swap(search, status, one)
             release_soon(query)
             return chosen
 
-        return self._try(search, group, search.beside, swap, failed, check=search.check_wanted) is not None
+        return self._try(search, group, search.beside, swap, failed, search.check_wanted) is not None
 
     def _try(
         self,

@@ -112,7 +112,8 @@ class Search(Generic[C]):
             begin: begins to load a candidate, as_part() or beside().
             take: uses what is loaded. If it raises, the candidate has failed.
             failed: called with a candidate that cannot be had, and why. What it raises ends the search.
-            check: called each time that nothing has answered for `hedge_s`. What it raises ends the search.
+            check: called when one has failed, and each time that nothing has answered for `hedge_s`. What it raises
+                ends the search.
             hedge_s: after so many seconds the next candidate is tried beside one that hangs.
 
         Raises:
@@ -128,6 +129,7 @@ class Search(Generic[C]):
             return begin(one)
 
         def note(one: C, error: Exception) -> None:
+            check()
             self.tried.append(f"{self._name(one)}: {error}")
             if not isinstance(error, _GivenUp):
                 failed(one, error)
@@ -183,10 +185,11 @@ class Search(Generic[C]):
         return response(spare)
 
     def check_wanted(self) -> None:
-        """Check that the resource is not being unloaded.
+        """Check that the resource is still served.
 
         Raises:
-            UnknownQuery: it is.
+            UnknownQuery: it is being unloaded.
+            RegistrarDown: this process stops. The next one hears the status again.
         """
         self._registrar.children(self.id)
 
