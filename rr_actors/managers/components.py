@@ -131,6 +131,8 @@ class Components(Manager):
     that fails again and again waits longer each time, with a WARNING, and is given up after ten failures in a row.
     """
 
+    _side_by_side = True
+
     def __init__(self, registry: str, programs: str = "programs/program", replace: bool = True) -> None:
         """Read the components from the TOML file `registry`.
 

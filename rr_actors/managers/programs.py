@@ -117,6 +117,8 @@ class Programs(Manager):
     Programs must stay in the foreground: a daemon that a program leaves is ended with it. Linux only.
     """
 
+    _side_by_side = True
+
     def __init__(
         self,
         directory: str | None = None,

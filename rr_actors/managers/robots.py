@@ -89,6 +89,8 @@ class Robots(Manager):
     The holders of a robot hear UPDATE when a part was replaced. They hear FATAL only if no component could replace it.
     """
 
+    _side_by_side = True
+
     def __init__(self, descriptions: str, components: str = "components/component", replace: bool = True) -> None:
         """Read the robots from the TOML file `descriptions`.
 

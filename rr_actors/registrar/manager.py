@@ -87,6 +87,8 @@ class Manager(Actor):
     registrar: Registrar = cast("Registrar", _NotYet())
     """This manager's registrar. It exists before the first recover callback, and so before on_start."""
 
+    _side_by_side: ClassVar[bool] = False  # it must not be serial: of a ready-made manager
+
     _gate: Gate | None = None  # of a serial manager
 
     def __init_subclass__(cls, *, serial: bool | None = None, **kwargs: Any) -> None:
@@ -96,6 +98,10 @@ class Manager(Actor):
             if type(serial) is not bool:
                 raise UsageError(f"class {cls.__name__}: serial: expected True or False, got {shown(serial)}")
             cls.serial = serial
+        if cls.serial and cls._side_by_side:
+            ready_made = next(base.__name__ for base in cls.__mro__ if vars(base).get("_side_by_side"))
+            why = "a ready-made manager, whose callbacks wait for each other"
+            raise UsageError(f"class {cls.__name__}: serial: expected False, as it is a {ready_made}: {why}")
 
     def ref(self, id: str) -> ActorRef[Any]:
         """Return a reference to another actor of the system; from on_start on, and in every callback.

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import pytest
 
 import rr_actors as rr
+from rr_actors.managers import Actions, Budgets, Choices, Components, Keeper, Pipes, Programs, Robots
 from support import eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -360,6 +361,14 @@ def test_a_class_is_serial_as_its_base_class_is_unless_it_says_otherwise() -> No
 def test_serial_is_true_or_false(wrong: Any) -> None:
     with pytest.raises(rr.UsageError, match="serial: expected True or False, got"):
         type("Cameras", (rr.Manager,), {}, serial=wrong)
+
+
+@pytest.mark.parametrize("kind", [Actions, Budgets, Choices, Components, Keeper, Pipes, Programs, Robots])
+def test_a_ready_made_manager_is_not_serial(kind: type[rr.Manager]) -> None:
+    with pytest.raises(rr.UsageError, match=r"class One: serial: expected False, as it is a .*: a ready-made manager"):
+        type("One", (kind,), {}, serial=True)
+    with pytest.raises(rr.UsageError, match="class Two: serial: expected False"):
+        type("Two", (Lines, kind), {})
 
 
 @pytest.mark.parametrize("wrong", [0, -1, True, 1.0, "1"])

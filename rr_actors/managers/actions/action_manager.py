@@ -148,6 +148,8 @@ class Actions(Manager):
     graph goes on after a crash of this manager: no action runs again whose end is on disk.
     """
 
+    _side_by_side = True
+
     def __init__(
         self, actions: Sequence[type[Action]] = (), graphs: str | os.PathLike[str] | None = None, stop_s: float = 5.0
     ) -> None:

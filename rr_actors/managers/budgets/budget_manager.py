@@ -78,6 +78,8 @@ class Budgets(Manager):
     `status.reason == "revoked"`, and have `grace_s` seconds.
     """
 
+    _side_by_side = True
+
     def __init__(self, file_or_pools: str | os.PathLike[str] | Sequence[Pool], grace_s: float = 5.0) -> None:
         """Take pools from a TOML file, or as they are given.
 

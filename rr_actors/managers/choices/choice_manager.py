@@ -81,6 +81,8 @@ class Choices(Manager):
     that message says for each alternative why not. A better one that is well again for `settle_s` takes its place back.
     """
 
+    _side_by_side = True
+
     def __init__(
         self,
         file_or_alternatives: str | os.PathLike[str] | Sequence[Alternative] = (),

@@ -79,6 +79,8 @@ class Keeper(Manager):
     name of a group of the file, whose members are loaded as parts. Kubernetes calls such a manager a controller.
     """
 
+    _side_by_side = True
+
     def __init__(self, file: str | os.PathLike[str], backoff: Backoff = BACKOFF) -> None:
         """Read what is to be kept from a TOML file. `backoff`: the waiting times before a replica is loaded again.
 
