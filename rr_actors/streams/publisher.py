@@ -459,19 +459,20 @@ class Publisher:
             if not self._closed:
                 self._ready.register(self._listener, select.EPOLLIN)
         while not self._closed:
-            polled = self._ready.poll(None if self._accepts_at is None else _ACCEPT_S)
-            self._tasks.append(functools.partial(self._hear, polled))
+            self._ready.poll(None if self._accepts_at is None else _ACCEPT_S)
+            self._tasks.append(self._hear)
             self._work(waits=True)
         self._tasks.append(self._end)
         self._work(waits=True)
 
-    def _hear(self, polled: list[tuple[int, int]]) -> None:
+    def _hear(self) -> None:
+        """Take in and hear the readers that are ready now. What was ready before the turn may be another one now."""
         if self._accepts_at is not None and time.monotonic() >= self._accepts_at:
             self._accepts_at = None
             with self._door:
                 if not self._closed:
                     self._ready.register(self._listener, select.EPOLLIN)
-        for fd, events in polled:
+        for fd, events in self._ready.poll(0):
             consumer = self._consumers.get(fd)
             if fd == self._woken.fileno():
                 with contextlib.suppress(BlockingIOError):
