@@ -432,6 +432,24 @@ def test_errors_are_those_of_the_system(client: rr.Client, provider: rr.Registra
     assert worker.load("provider/camera", "x").response
 
 
+def test_a_client_that_comes_again_has_its_name_when_what_it_held_is_released(
+    state_dir: Path, provider: rr.Registrar
+) -> None:
+    gate, camera = Gate(), serve(provider, "camera")
+    camera.do_unload = lambda request, response: gate()
+    for _ in range(30):
+        with rr.connect(state_dir) as client:
+            client.open_registrar("worker")
+    first = rr.connect(state_dir)
+    first.open_registrar("worker").load("provider/camera", "x")
+    first.close()
+    with rr.connect(state_dir) as second:
+        threading.Timer(0.5, gate.open).start()
+        assert second.open_registrar("worker").name == "client.worker"
+        with rr.connect(state_dir) as third, pytest.raises(NameTaken):
+            third.open_registrar("worker")
+
+
 def test_what_is_too_long_is_refused_and_the_next_call_finds_the_system(
     client: rr.Client, provider: rr.Registrar
 ) -> None:

@@ -13,8 +13,9 @@ import functools
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import Protocol
 
-from rr_actors.base.errors import RrError, UnknownQuery, UnknownRegistrar, shown
+from rr_actors.base.errors import NameTaken, RrError, UnknownQuery, UnknownRegistrar, shown
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.model.rows import State
@@ -27,12 +28,22 @@ logger = Log("rr_actors")
 
 _BATCH_BYTES = 2**20  # of the messages and responses in one answer, which is complete with the one that reaches them
 _SHORT = 10_000  # characters of a message
+_CLOSED_S = 10.0  # so long a name may wait for the end of the registrar before
+
+
+class Caller(Protocol):
+    """The connection by which a request came. What a client opens lives as long."""
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether the client has left. From any thread."""
+        ...
 
 
 class ClientsRegistrar:
     """The registrar of one client, and the statuses that the client has not heard yet. From any thread."""
 
-    def __init__(self, owner: object, registrar: Registrar) -> None:
+    def __init__(self, owner: Caller, registrar: Registrar) -> None:
         self.owner = owner
         self.registrar = registrar
         self._lock = threading.Lock()
@@ -106,19 +117,39 @@ class ClientRegistrars:
     """The clients' registrars of one system. In workers, except has_statuses()."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()
         self._open: dict[str, ClientsRegistrar] = {}
+        self._closing: set[str] = set()
 
-    def add(self, owner: object, registrar: Registrar) -> None:
-        """Keep the registrar that was opened for a connection, until the connection ends."""
+    def open(self, owner: Caller, name: str, open: Callable[[str], Registrar]) -> None:
+        """Open a registrar for a connection, until that ends. One whose client has left is waited for.
+
+        Raises:
+            NameTaken: another client has this name.
+        """
+        try:
+            registrar = open(name)
+        except NameTaken:
+            if not self._have_left(name):
+                raise
+            registrar = open(name)
         with self._lock:
-            self._open[registrar.name] = ClientsRegistrar(owner, registrar)
+            self._open[name] = ClientsRegistrar(owner, registrar)
+
+    def _have_left(self, name: str) -> bool:
+        """Wait until the registrar of a client that has left is closed. Return False if its client is here."""
+        with self._lock:
+            client = self._open.get(name)
+            if client is not None and not client.owner.is_gone:
+                return False
+            return self._lock.wait_for(lambda: not (name in self._open or name in self._closing), _CLOSED_S)
 
     def close(self, owner: object) -> None:
         """Close the registrars of a connection that has ended, and release what they hold."""
         with self._lock:
             mine = [name for name, client in self._open.items() if client.owner is owner]
             closing = [self._open.pop(name) for name in mine]
+            self._closing.update(mine)
         for client in closing:
             client.end()
             registrar = client.registrar
@@ -129,6 +160,10 @@ class ClientRegistrars:
                 logger.exception(
                     "registrar %s: its client has gone, and not all that it held is released", registrar.name
                 )
+            finally:
+                with self._lock:
+                    self._closing.discard(registrar.name)
+                    self._lock.notify_all()
 
     def has_statuses(self, registrar: str, owner: object, arrived: Callable[[], None]) -> bool:
         """Return whether AwaitStatuses has an answer; if not, have `arrived` called, from any thread, once it has."""

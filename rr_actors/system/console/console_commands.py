@@ -36,7 +36,8 @@ from rr_actors.runtime.processes.process import signal_name
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_view import REGISTRAR, Caller, Command, View
+from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.console_view import REGISTRAR, Command, View
 
 # -- resources -------------------------------------------------------------------------------------------------------
 
@@ -433,7 +434,7 @@ class OpenRegistrar(Command[c.Done], frozen=True):
 
     def _carry_out(self, view: View, caller: Caller) -> c.Done:
         name = check_name(CLIENTS + check_name(self.name, "registrar name"), "registrar name")
-        view.clients.add(caller, view.open_registrar(name))
+        view.clients.open(caller, name, view.open_registrar)
         return c.Done(f"opened registrar {name}", {"registrar": name})
 
 

@@ -11,7 +11,8 @@ from rr_actors.base.errors import NotSerializable
 from rr_actors.registrar.declarations import Declaring
 from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_view import Caller, Verb, View, room_for
+from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.console_view import Verb, View, room_for
 from rr_actors.system.snapshots import ask_each
 
 _A = TypeVar("_A")

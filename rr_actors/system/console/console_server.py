@@ -23,10 +23,11 @@ from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.registrar.engine.node import Node
 from rr_actors.supervision.event_history import TreeLog
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_commands import AwaitStatuses, Hold, OpenRegistrar
 from rr_actors.system.console.console_feed import Feed, Reader
 from rr_actors.system.console.console_protocol import REQUESTS, decoder_of
-from rr_actors.system.console.console_view import Caller, Command, Verb, View, Viewed
+from rr_actors.system.console.console_view import Command, Verb, View, Viewed
 from rr_actors.system.console.running_systems import ListedSystem
 from rr_actors.system.event_subscribers import Subscribers
 from rr_actors.system.recording.recordings import Recordings
@@ -191,8 +192,13 @@ class Connection(asyncio.Protocol):
 
     @property
     def is_gone(self) -> bool:
-        """Whether the client has left, or is being left."""
-        return self._ended
+        """Whether the client has left, or is being left. From any thread: the loop may not have noticed it yet."""
+        poll = select.poll()
+        try:
+            poll.register(self._transport.get_extra_info("socket"), select.POLLRDHUP)
+            return self._ended or bool(poll.poll(0))
+        except ValueError:  # the loop has just closed it
+            return True
 
     @property
     def unread_bytes(self) -> int:
@@ -242,9 +248,7 @@ class Connection(asyncio.Protocol):
         self._looks = False
         if self._ended or self._transport.is_reading():
             return
-        poll = select.poll()
-        poll.register(self._transport.get_extra_info("socket"), select.POLLRDHUP)
-        if poll.poll(0):
+        if self.is_gone:
             self._transport.abort()
         else:
             self._look_later()

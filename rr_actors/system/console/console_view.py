@@ -36,7 +36,7 @@ from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.event_history import Record, TreeLog, records_below, records_of
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.client_registrars import ClientRegistrars
+from rr_actors.system.console.client_registrars import Caller, ClientRegistrars
 from rr_actors.system.recording.figures import Figure
 from rr_actors.system.registrar_lookup import open_registrar, registrar_in
 from rr_actors.system.snapshots import ask_each, describe_supervisor
@@ -392,15 +392,6 @@ def room_for(rows: Sequence[ResourceRow | c.UsageRow | StreamRow | Record], note
     limit = c.RESPONSE_LIMIT_BYTES - len(msgspec.msgpack.encode(notes))
     sizes = itertools.accumulate(len(msgspec.msgpack.encode(row)) for row in rows)
     return sum(size <= limit for size in sizes)
-
-
-class Caller(Protocol):
-    """The connection by which a request came. What a client opens lives as long."""
-
-    @property
-    def is_gone(self) -> bool:
-        """Whether the client has left."""
-        ...
 
 
 class Verb(c.Message, Generic[_A], frozen=True):
