@@ -47,6 +47,7 @@ from rr_actors.registrar.arguments import (
     target_id,
 )
 from rr_actors.registrar.declarations import Declared
+from rr_actors.registrar.engine.cut import CatalogCopy, take_part
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
@@ -694,6 +695,11 @@ class Registrar(Consumer):
         if stored is not None:
             self._actor.commit_rows([Put(StoredServer(name, stored))])
         return kept if known is None else 0
+
+    @for_handles(repeatable=False)
+    def _take_part(self, registrar: str, socket: str, place: str) -> list[CatalogCopy]:
+        """Copy the catalogs of this process at the moment that the processes of the system agree on. In a worker."""
+        return take_part(self._node, registrar, socket, Path(place))
 
     @for_handles(repeatable=False)
     def _register_stored(self, blob: bytes) -> None:

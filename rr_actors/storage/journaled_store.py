@@ -139,6 +139,9 @@ class JournaledStore:
         self._tables.keep_lock()
         return True
 
+    def copy(self, content: Content, path: Path) -> None:
+        self._tables.copy(content, path)
+
     def close(self, *, erase: bool = False) -> None:
         """Close the store as the contract says. The next opening folds the changes that cannot be folded now."""
         with self._tidying:

@@ -219,25 +219,50 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
         CatalogVersion: another version of rr_actors wrote the catalog. `.path`, `.expected`, `.got`
         CatalogError: the catalog cannot be read. `.path`
     """
-    path = Path(path).absolute()
+    return rows_of(_read_unlocked(Path(path).absolute())[1])
+
+
+def copy_catalog(path: Path, witness: Witness, to: Path) -> Content:
+    """Copy a catalog that nobody has open to a new path, as Store.copy() does, and return its rows.
+
+    It is read as by read_rows(). One without rows, or without files, is not copied.
+
+    Raises:
+        CatalogError: as read_rows() describes; or the copy cannot be written. `.path`
+    """
+    meta, content, left = _read_unlocked(path)
+    known = witness.known()
+    if any(content.values()):
+        epoch = max(meta.epoch, left.epoch, 0 if known is None else known.epoch)
+        sqlite_store.write_copy(to, msgspec.structs.replace(meta, epoch=epoch, registrar=witness.registrar), content)
+    return content
+
+
+def catalog_id(path: Path) -> str:
+    """Return a catalog's id, read as by read_rows(), with its errors; "" without a catalog."""
+    return _read_unlocked(path)[0].id
+
+
+def _read_unlocked(path: Path) -> tuple[sql_tables.Meta, Content, _Left]:
+    """Return what _read() does, of a catalog whose lock another process may have, as it is after some commit."""
     with errors_named(path):
         try:
             folder = Folder.at(path.parent, to_read=True)
         except FileNotFoundError:
-            return []
+            return sqlite_store.NONE, content_of(()), _Left()
         with folder:
             for _ in range(_READINGS - 1):
                 before = _look(folder, path)
                 try:
-                    content = _read(folder, path)[1]
+                    found = _read(folder, path)
                 except (CatalogDamaged, Damage, NotAFile, sqlite3.Error, FileNotFoundError):
                     if _look(folder, path) == before:
                         raise
                 else:
                     after = _look(folder, path)
                     if before == after or (before.is_open and after.is_open):
-                        return rows_of(content)
-            return rows_of(_read(folder, path)[1])
+                        return found
+            return _read(folder, path)
 
 
 class _Look(msgspec.Struct, frozen=True):

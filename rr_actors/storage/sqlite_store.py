@@ -22,7 +22,7 @@ from typing import Literal
 import msgspec
 
 from rr_actors.base.errors import CatalogError, CatalogVersion
-from rr_actors.base.folder import Folder
+from rr_actors.base.folder import Folder, make_directories
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.model.rows import Change, Content, content_of
 from rr_actors.storage import sql_tables
@@ -317,6 +317,9 @@ class SqliteStore:
                     return
             self._settle(number)
 
+    def copy(self, content: Content, path: Path) -> None:
+        write_copy(path, self.meta, content)
+
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
         """Close the store as the contract says. `settled`: whether the journal has no change of its own."""
         if not erase and self._wal_bytes():
@@ -380,10 +383,31 @@ def segments_among(names: Iterable[str], path: Path) -> list[str]:
     return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
-def create(folder: Folder, path: Path, durability: Literal["process", "power"], meta: sql_tables.Meta) -> None:
-    """Make a catalog with this meta row alone, under another name, and rename it: a crash leaves all of it or nothing.
+def write_copy(path: Path, meta: sql_tables.Meta, content: Content) -> None:
+    """Make a catalog with this meta row and these rows, in a directory of its own; it is on the disk at the end.
+
+    Raises:
+        CatalogError: it cannot be written.
+    """
+    with errors_named(path):
+        make_directories(path.parent, synced=True)
+        with Folder.at(path.parent) as folder:
+            create(folder, path, "power", meta, content)
+
+
+def create(
+    folder: Folder,
+    path: Path,
+    durability: Literal["process", "power"],
+    meta: sql_tables.Meta,
+    content: Content | None = None,
+) -> None:
+    """Make a catalog with this meta row, under another name, and rename it: a crash leaves all of it or nothing.
 
     SQLite makes it in memory, and it is written at once.
+
+    Args:
+        content: its other rows; None: it has none.
     """
     new = path.with_name(path.name + ".new")
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
@@ -392,6 +416,11 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
     with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
         connection.deserialize(_without_meta())
         connection.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
+        if content is not None:
+            connection.execute("BEGIN")
+            for sql, parameters in sql_tables.statements(sql_tables.Net(content, {}, 0)):
+                connection.execute(sql, parameters)
+            connection.execute("COMMIT")
         image = connection.serialize()
     image = image[: _WAL_MODE_AT.start] + _WAL_MODE + image[_WAL_MODE_AT.stop :]
     try:

@@ -114,7 +114,7 @@ def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> 
     """
     found: dict[str, str] = {}
     tell_of_missing(state_dir)
-    for name, catalog in _catalogs(config, state_dir).items():
+    for name, catalog in catalogs_on_disk(config, state_dir).items():
         if name in except_for:
             continue
         try:
@@ -145,7 +145,7 @@ def gone_and_serving(node: Node) -> list[str]:
     return found
 
 
-def _catalogs(config: SystemConfig, state_dir: Path) -> dict[str, Path]:
+def catalogs_on_disk(config: SystemConfig, state_dir: Path) -> dict[str, Path]:
     """Return the catalogs on disk, by the names of their registrars, which are sorted."""
     placed = {name: config.registrar(name).catalog_path(state_dir) for name in config.registrars}
     others = {place / CATALOG_FILE for place in state_dir.iterdir()} - {*placed.values()}
@@ -191,7 +191,7 @@ def _take_over(config: SystemConfig, state_dir: Path, name: str, old: str) -> No
     changes = functools.partial(_in_the_name_of, name, old)
     if is_there(after):
         change(config.registrar(name), state_dir, changes, formerly=old)
-    for peer, catalog in _catalogs(config, state_dir).items():
+    for peer, catalog in catalogs_on_disk(config, state_dir).items():
         if peer not in (name, old):
             try:
                 if changes(content_of(read_rows(catalog)), 0):

@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, Self, cast
 
@@ -64,7 +64,7 @@ from rr_actors.runtime.event_loop import (
 )
 from rr_actors.runtime.processes.process import keep_standard_fds
 from rr_actors.runtime.shielding import Flag, shielded
-from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.time_limits import finite_time, time_limit
 from rr_actors.runtime.workers import Workers
 from rr_actors.storage.child_records import ChildRecords
 from rr_actors.storage.opening import open_catalog, remove_catalogs
@@ -77,6 +77,7 @@ from rr_actors.supervision.hosted import Hosted, check_hostable, prepare
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
 from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of, renamed_managers
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
+from rr_actors.system.backups import Backup, back_up, restore
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
@@ -173,6 +174,7 @@ class System:
         _check_tree(self.root, self.root.id)
         self._top = self.root.id  # the paths of this tree begin with it
         self._lock = threading.RLock()  # held by the thread that starts or stops the system
+        self._backing_up = threading.Lock()
         self._starting: _Starting | None = None
         self._winding: asyncio.Task[None] | None = None  # of a stop
         self._hurries = False  # whether the stop was interrupted
@@ -776,6 +778,48 @@ class System:
             A function that ends the subscription.
         """
         return self._subscribers.add(callback)
+
+    def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
+        """Copy the catalogs of all registrars as they are at one moment, and the files beside them, to a new directory.
+
+        All registrars hold still for that moment, which the result has as `held_s`; nothing fails because of it. If a
+        registrar is being restarted, or its process does not answer, it is tried again. The directory is complete, or
+        is not made. It is as private as a state directory: who can write it can run code as you when it is restored.
+
+        Raises:
+            ConfigError: the directory is not empty, or cannot be made.
+            RegistrarDown, Unavailable: a registrar did not hold still within `timeout_s` seconds. The error names it.
+            CatalogError: a catalog cannot be read, or a copy cannot be written.
+            UsageError: the system does not run, or the call would hang here.
+        """
+        check_may_block("System.backup()")
+        node, limit_s = self._running(), finite_time(timeout_s, "timeout_s")
+        with self._backing_up:
+            return back_up(node, state_path(directory), limit_s)
+
+    @staticmethod
+    def restore(
+        directory: str | os.PathLike[str],
+        state_dir: str | os.PathLike[str],
+        *,
+        locations: Mapping[str, str | os.PathLike[str]] | None = None,
+    ) -> Backup:
+        """Make a new state directory from a backup. A system that starts there goes on from the moment of the backup.
+
+        A catalog that was configured with a location outside of the state directory is put there again. All is made, or
+        nothing.
+
+        Args:
+            directory: the backup.
+            state_dir: a directory that does not exist, or is empty.
+            locations: other locations, by the names of registrars. Configure the new system with the same ones.
+
+        Raises:
+            ConfigError: `directory` is no backup, `state_dir` is not empty, or a location has a catalog.
+            CatalogDamaged: a file of the backup is missing or damaged. `.path`
+            CatalogVersion: a newer version of rr_actors has written it. `.path`, `.expected`, `.got`
+        """
+        return restore(state_path(directory), state_path(state_dir), locations or {})
 
     def serve_web(
         self, *, host: str = "127.0.0.1", port: int = 0, prefix: str = "", hosts: Sequence[str] = ()

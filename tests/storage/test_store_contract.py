@@ -106,6 +106,24 @@ def test_what_was_committed_is_loaded_after_it_was_opened_again(either: FileDisk
     store.close(erase=True)
 
 
+@given(commits=COMMITS)
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_copy_is_a_closed_catalog_with_the_rows_that_were_given(
+    either: FileDisk, tmp_path: Path, commits: list[list[Change]]
+) -> None:
+    store = either.open()
+    for changes in commits[:-1]:
+        store.commit(changes)
+    given = content_of(states(commits)[-1])
+    to = tmp_path / "copy" / "catalog.sqlite3"
+    store.copy(given, to)
+    assert sorted(path.name for path in to.parent.iterdir()) == ["catalog.sqlite3"]
+    again = open_store(to)
+    assert (again.load(), again.epoch) == (given, store.epoch + 1)
+    again.close(erase=True)
+    store.close(erase=True)
+
+
 def change_what_is_loaded(store: Store) -> None:
     for _ in range(2):
         loaded = store.load()

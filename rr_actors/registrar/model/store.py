@@ -10,12 +10,13 @@ Each implementation guarantees:
 - A catalog has one open store: a second `open` raises CatalogLocked until the first is closed or its process is dead.
 
 The caller's duties: if `commit` raises, it treats the changes as not made. It calls `close` once, and nothing after it.
-It uses a store from one thread at a time; only `upkeep` and `tidy` may run in another.
+It uses a store from one thread at a time; only `upkeep`, `tidy` and `copy` may run in another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol
 
 from rr_actors.registrar.model.rows import Change, Content, apply, content_of
@@ -65,6 +66,16 @@ class Store(Protocol):
         """
         ...
 
+    def copy(self, content: Content, path: Path) -> None:
+        """Write these rows, in the place of its own, as a closed catalog at a new path. From any thread.
+
+        The copy is on the disk when this returns. A store that is lost with its process copies nothing.
+
+        Raises:
+            CatalogError: the copy could not be written.
+        """
+        ...
+
     def close(self, *, erase: bool = False) -> None:
         """Release the lock; with `erase`, remove the catalog from disk as well.
 
@@ -99,6 +110,9 @@ class MemoryStore:
         """Do nothing."""
 
     def tidy(self) -> None:
+        """Do nothing."""
+
+    def copy(self, content: Content, path: Path) -> None:
         """Do nothing."""
 
     def close(self, *, erase: bool = False) -> None:

@@ -38,10 +38,11 @@ from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_di
 from rr_actors.registrar.registrar import Consumer
 from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, RemoteLoads, RemoteUnloads
 from rr_actors.runtime.time_limits import time_limit
+from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_queries import ClientQuery, ClientViews, SystemConnections, listen
 from rr_actors.system.console.console_client import find_console
-from rr_actors.system.console.console_commands import AskActor, GivePriority, Hold, OpenRegistrar, Release
+from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, OpenRegistrar, Release
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
 from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
 
@@ -111,6 +112,13 @@ class Client:
         limit_s = _limit(timeout_s)
         command = AskActor(actor, _encoded(message, f"message to {actor}"), limit_s)
         return Codec(None, "answer").show(self._connections.ask(command, limit_s + _GRACE_S).answer)
+
+    def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
+        """Have the system back itself up to a directory of its machine, as System.backup() does, with its errors."""
+        limit_s = _limit(timeout_s)
+        path = Path(os.path.abspath(os.path.expanduser(directory)))
+        self._connections.ask(BackUp(str(path), limit_s), limit_s + WRITING_S)
+        return read_backup(path)
 
     def close(self) -> None:
         """Close all registrars and connections. Their queries are released soon after. A second close does nothing."""

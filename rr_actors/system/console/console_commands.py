@@ -356,6 +356,20 @@ def _arguments(text: str) -> list[Any]:
         raise UsageError(f"arguments: expected a JSON list, got {shown(text)}: {error}") from error
 
 
+class BackUp(Command[c.Done], frozen=True):
+    """Back up the system to a directory, given by its absolute path, as System.backup() does."""
+
+    directory: c.Text
+    timeout_s: c.Seconds = 30.0
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        if self.dry_run:
+            return c.Done(f"would back up system {view.system.name} to {self.directory}", {"directory": self.directory})
+        backup = view.system.backup(self.directory, timeout_s=self.timeout_s)
+        return c.Done(backup.told(self.directory), backup.facts(self.directory))
+
+
 class ShutDown(Command[c.Done], frozen=True):
     """Stop the whole system, in order, as System.stop() does."""
 

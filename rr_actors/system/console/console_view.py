@@ -51,6 +51,14 @@ REGISTRAR = "console"
 _A = TypeVar("_A")
 
 
+class BackedUp(Protocol):
+    """What a console says of a backup. Backup has the docstrings."""
+
+    def told(self, where: str) -> str: ...
+
+    def facts(self, where: str) -> dict[str, Any]: ...
+
+
 class Viewed(Protocol):
     """The part of System that a console uses. System has the docstrings."""
 
@@ -71,6 +79,8 @@ class Viewed(Protocol):
     def dead_letters(self) -> DeadLetters: ...
 
     def figures(self) -> list[Figure]: ...
+
+    def backup(self, directory: str, *, timeout_s: float = 30.0) -> BackedUp: ...
 
 
 class View:

@@ -70,6 +70,12 @@ def _system() -> ModuleType:
     return system_verbs
 
 
+def _backup() -> ModuleType:
+    from rr_actors.tools.verbs import backup_verbs
+
+    return backup_verbs
+
+
 def _project() -> ModuleType:
     from rr_actors.tools.verbs import project_verbs
 
@@ -195,6 +201,14 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
             "inspect": "Show every registrar's resources, the queries on them, and the queries that it holds elsewhere",
             "tree": "Show each registrar's own queries, and below them the resources that they depend on",
             "check": "Check the catalogs against each other; exit code 1 if they disagree",
+        }
+    },
+    "Keep its state, and bring it back": {
+        _backup: {
+            "backup": (
+                "Copy all catalogs of a system as they are at one moment, while it runs or not, to a new directory"
+            ),
+            "restore": "Make a new state directory from a backup",
         }
     },
     "This machine, and projects": {
