@@ -185,6 +185,7 @@ class ProcessNode(abc.ABC):
             await steps.take_async("closing the links to other processes", self.transport.close())
         finally:
             steps.take("closing the directory of names", self.directory.close)
+            steps.take("closing the byte that says who watches", self.watched.close)
             self.dispatcher.loop.call_soon(release)  # after the callbacks of the closed transports
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:

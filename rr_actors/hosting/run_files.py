@@ -42,7 +42,7 @@ class Watched:
     def __init__(self, run_dir: str | os.PathLike[str]) -> None:
         self._run_dir = os.fspath(run_dir)
         self._file: os.stat_result
-        self.level = self._open()
+        self.level: mmap.mmap | bytearray = self._open()
 
     def _open(self) -> mmap.mmap:
         try:
@@ -69,6 +69,10 @@ class Watched:
         self.level = self._open()
         if wanted:
             self.level[0] = wanted
+
+    def close(self) -> None:
+        """Let the file go: nobody watches any more. Threads that still read the byte find 0."""
+        self.level = bytearray(1)
 
     def __bool__(self) -> bool:
         return self.level[0] != 0

@@ -57,18 +57,15 @@ class Dispatcher:
         self.more = False
         self.no_loop = "the loop of rr_actors has ended in this process"
         try:
-            self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+            self._bell: _Bell | None = _Bell()
         except OSError as error:
             raise Unavailable(f"rr-loop: no event loop can be started: {wanted_by(error) or error}") from error
-        # Closed when no thread can write to it any more, but not at exit, when the loop may still run.
-        closing = weakref.finalize(self, os.close, self._bell)
-        closing.atexit = False
         self.workers = Workers(self.call, self.hand_over)
         log.begin_thread(_may_block)
         try:
             self.thread = start_loop_thread(self._begin, "rr-loop")
         except Unavailable:
-            closing()
+            self._bell = None
             raise
 
     def call(self, fn: Callable[..., object], *args: Any) -> None:
@@ -105,11 +102,12 @@ class Dispatcher:
         if self._woken_for == self._turn or threading.get_ident() == self._ident:
             self.call(fn, *args)
             return
-        if self.closed:
+        bell = self._bell
+        if self.closed or bell is None:
             raise Unavailable(self.no_loop)
         self._calls.append((fn, args))
         turn = self._turn
-        os.eventfd_write(self._bell, 1)
+        os.eventfd_write(bell.fd, 1)
         self._woken_for = turn
 
     def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
@@ -185,8 +183,8 @@ class Dispatcher:
         self._ident = 0  # a thread of the child may have the same id
         self.workers.abandon()
 
-    def _rung(self) -> None:
-        os.eventfd_read(self._bell)
+    def _rung(self, bell: _Bell) -> None:
+        os.eventfd_read(bell.fd)
         self._drain()
 
     def _drain(self) -> None:
@@ -207,13 +205,27 @@ class Dispatcher:
         self._stop = asyncio.Event()
         self.loop = loop
         loop.set_exception_handler(log_exception)
-        loop.add_reader(self._bell, self._rung)
         return loop.create_task(self._until_closed())
 
     async def _until_closed(self) -> None:
+        bell = self._bell
+        assert bell is not None
+        self.loop.add_reader(bell.fd, self._rung, bell)
         await self._stop.wait()
-        self.loop.remove_reader(self._bell)
+        self.loop.remove_reader(bell.fd)
+        self._bell = None
         self._drain()
+
+
+class _Bell:
+    """Wakes the loop. Its descriptor is closed when no thread can write to it any more: each has a reference.
+
+    It is not closed at exit, when the loop may still run.
+    """
+
+    def __init__(self) -> None:
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self.fd).atexit = False
 
 
 class Course(Generic[T]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ import rr_actors as rr
 from rr_actors.actors.remote.hub import ActorHub
 from rr_actors.base.steps import Steps
 from rr_actors.hosting import run_files
-from rr_actors.hosting.run_files import RunKeeper
+from rr_actors.hosting.run_files import RunKeeper, Watched
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -63,6 +64,7 @@ SYNC: list[tuple[type[Any], str]] = [
     (StateDir, "close"),
     (Subscribers, "leave"),
     (RunKeeper, "stop"),
+    (Watched, "close"),
     (Directory, "mark"),
     (Directory, "close"),
     (RegistrarActor, "close"),
@@ -242,6 +244,24 @@ def raising(error: BaseException) -> Callable[[], NoReturn]:
         raise error
 
     return step
+
+
+def test_a_stopped_system_holds_no_descriptor(tmp_path: Path) -> None:
+    def descriptors() -> dict[str, str]:
+        links = {path.name: path for path in Path("/proc/self/fd").iterdir()}
+        return {number: os.readlink(path) for number, path in links.items() if path.is_symlink()}
+
+    with system_in(tmp_path, managers=1):
+        pass
+    gc.collect()  # of what other tests have left
+    before = descriptors()
+    gc.disable()
+    try:
+        with system_in(tmp_path, managers=1) as system:
+            system.open_registrar("app")
+        assert descriptors() == before
+    finally:
+        gc.enable()
 
 
 def test_steps_raise_one_error_as_it_is_several_as_a_group_and_an_interruption_before_them() -> None:
