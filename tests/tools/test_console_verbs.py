@@ -953,16 +953,17 @@ def test_a_shell_completes_what_the_running_system_has(app: rr.Registrar) -> Non
     assert completing("kill", "root/") == ["root/shop"]
     assert completing("load", "sh") == ["shop/thing"]
     assert completing("why", query.id[:8]) == [query.id]
+    assert completing("why", "sh") == ["shop"]
 
 
 def test_a_shell_completes_verbs_options_and_their_values() -> None:
-    assert completing("p") == ["ps", "priority"]
+    assert completing("p") == ["ps", "priority", "pause"]
     assert completing("--v") == ["--version"]
     assert completing("resources", "--st") == ["--status", "--state"]
     assert completing("resources", "--status", "OK", "--st") == ["--status", "--state"]  # it may be repeated
     assert completing("graph", "--state", "/nowhere", "--st") == []
     assert completing("ps", "--sort-by", "m") == ["memory"]
-    assert completing("nothing", "p") == ["ps", "priority"]  # as if it were not there
+    assert completing("nothing", "p") == ["ps", "priority", "pause"]  # as if it were not there
 
 
 def completing(*words: str) -> list[str]:

@@ -102,6 +102,10 @@ def _targets(client: ConsoleClient, incomplete: str) -> list[str]:
     return list(dict.fromkeys(_resources(client, incomplete) + _queries(client, incomplete)))
 
 
+def _children_or_targets(client: ConsoleClient, incomplete: str) -> list[str]:
+    return _children(client, incomplete) + _targets(client, incomplete)
+
+
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say what would be done.")]
 Timeout = Annotated[
     float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=c.TIMEOUT_LIMIT_S, help="How long it may take.")
@@ -655,7 +659,7 @@ def why(
         str,
         typer.Argument(
             help="The id of a query or resource, its beginning or end, or a resource's name; or an actor's id or path.",
-            autocompletion=_completing(_children_or_resources),
+            autocompletion=_completing(_children_or_targets),
         ),
     ],
     state: StateOption = None,
