@@ -23,7 +23,7 @@ from rr_actors.base.errors import CatalogDamaged, CatalogVersion, ConfigError, R
 from rr_actors.registrar.engine import cut
 from rr_actors.storage.opening import read_rows
 from rr_actors.system import backups
-from rr_actors.tools.inspection import check_state
+from rr_actors.tools.inspection import check, check_state, read_state
 from support import LIMIT_S, eventually, kill, pid_of, wait_respawned
 from support_cli import run_cli
 
@@ -163,6 +163,20 @@ def test_what_was_loaded_under_load_is_there_agrees_and_can_be_unloaded(
             again.unload_all()
             assert again.queries() == []
             eventually(lambda system=system: not system.registrar("parts").resources())
+
+
+def test_backups_while_managers_are_killed_agree_each(state_dir: Path, tmp_path: Path) -> None:
+    """RR_MANY=80: so many backups, with a SIGKILL after every second one."""
+    chosen = random.Random(1)
+    tree = rr.Supervisor(TREE, max_restarts=1000)
+    with rr.System(tree, state_dir=state_dir) as system, Load(system.open_registrar("app")) as load:
+        for number in range(int(os.environ.get("RR_MANY", "4"))):
+            eventually(lambda wanted=load.count + 5: load.count >= wanted)
+            if number % 2:
+                kill(system, chosen.choice(["parts", "wholes", "tops"]))
+            system.backup(tmp_path / "backup")
+            assert check(read_state(tmp_path / "backup" / "catalogs")) == []
+            shutil.rmtree(tmp_path / "backup")
 
 
 def test_a_load_in_flight_does_not_keep_a_backup_waiting_and_is_not_lost_track_of(
@@ -539,6 +553,29 @@ def test_a_restore_that_fails_takes_back_what_it_put_elsewhere(
         rr.System.restore(tmp_path / "backup", tmp_path / "new")
     assert list(elsewhere.iterdir()) == []
     assert list(tmp_path.glob("*new*")) == []
+
+
+class Port(rr.Manager):
+    def __init__(self, device: str) -> None:
+        self._device = device
+
+    @rr.server("port", recovery="keep")
+    def load(self, request: str) -> str:
+        return f"{self._device} {request}"
+
+
+def test_dynamic_children_with_an_id_come_back_with_what_they_serve(state_dir: Path, tmp_path: Path) -> None:
+    pool = rr.Supervisor([rr.ChildSpec(Port, id="port")], id="pool", strategy="simple_one_for_one")
+    with rr.System([pool], state_dir=state_dir) as system:
+        system.supervisor("pool").start_child(["/dev/ttyS0"], id="ttyS0")
+        system.open_registrar("app").load("ttyS0/port", "x")
+        system.backup(tmp_path / "backup")
+    rr.System.restore(tmp_path / "backup", tmp_path / "new")
+    with rr.System([pool], state_dir=tmp_path / "new") as system:
+        app = system.open_registrar("app")
+        assert [(query.response, query.state) for query in app.queries()] == [("/dev/ttyS0 x", rr.State.OK)]
+        assert app.load("ttyS0/port", "y").response == "/dev/ttyS0 y"
+        app.unload_all()
 
 
 def test_a_manager_that_was_renamed_since_has_what_it_had(backup: Path, tmp_path: Path) -> None:
