@@ -8,8 +8,7 @@ import pykka
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.actors.messaging.mailbox import Ended
-from rr_actors.actors.messaging.mailbox_looks import MailboxInfo, MessageInfo
-from rr_actors.actors.messaging.mailbox_orders import LOOK, PAUSE, RESUME, STEP, carry_out
+from rr_actors.actors.messaging.mailbox_looks import LOOK, PAUSE, RESUME, STEP, MailboxInfo, MessageInfo, carry_out
 from rr_actors.actors.refs import ActorRef, inquire, local_of, why_silent
 from rr_actors.base.errors import Unavailable
 from rr_actors.runtime.event_loop import check_may_block

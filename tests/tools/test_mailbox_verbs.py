@@ -14,7 +14,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.actors.messaging.mailbox_looks import MailboxInfo, MessageInfo
 from rr_actors.base.errors import NotFound, Unavailable
-from rr_actors.tools.mailbox_texts import explain_actor, mailbox_lines
+from rr_actors.tools.explanations import explain_actor, mailbox_lines
 from support import Workshop, eventually
 from support_cli import run_cli
 

@@ -1,18 +1,27 @@
-"""Looks at mailboxes: what waits, since when, and what is handled. The loop or any thread looks; the actor does not."""
+"""Looks at mailboxes: what waits, since when, and what is handled; and orders: pause, step, resume.
+
+The loop of the actor's process, or any thread of it, carries them out, and not the actor.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from time import monotonic
 from typing import Any, cast
 
 import msgspec
 import pykka
+from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors.messaging.ask_cycles import waits_of
 from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, Starting
+from rr_actors.actors.messaging.stepped_mailbox import SteppedMailbox
 from rr_actors.base.errors import UsageError, name_of_class
 from rr_actors.base.pickled_types import type_in
+
+LOOK, PAUSE, STEP, RESUME = "mailbox", "pause", "step", "resume"
+ORDERS = frozenset((LOOK, PAUSE, STEP, RESUME))
 
 COUNTED = 256
 """How many of the first messages a look counts by their types."""
@@ -115,3 +124,41 @@ def message_info(envelope: Any, at: float = 0.0) -> MessageInfo:
 
 def _message(envelope: Any) -> object:
     return cast("tuple[Any, str | None]", envelope)[0] if isinstance(envelope, tuple) else envelope.message
+
+
+def carry_out(ref: pykka.ActorRef[Any], order: str, done: Callable[[Any], None]) -> None:
+    """Carry out an order, and call done() with its result: a MailboxInfo; for STEP the MessageInfo, or None.
+
+    Of a step, done() is called by the actor's thread, when it has handled the message. From any thread.
+
+    Raises:
+        UsageError: the mailbox cannot be paused, or is not.
+    """
+    if order == LOOK:
+        done(look_at(ref))
+        return
+    mailbox = _steppable(ref)
+    if order == STEP:
+        if not mailbox.step(lambda envelope: done(_stepped(envelope))):
+            done(None)
+        return
+    if order == PAUSE:
+        mailbox.pause()
+    else:
+        mailbox.resume()
+    done(look_at(ref))
+
+
+def _steppable(ref: pykka.ActorRef[Any]) -> SteppedMailbox:
+    mailbox = ref.actor_inbox
+    if isinstance(mailbox, SteppedMailbox):
+        return mailbox
+    if getattr(ref.actor_class, "_lives_on_loop", False):
+        text = "it is an actor of the framework, which other actors need; only your actors and managers can be paused"
+        raise UsageError(f"{ref}: {text}")
+    start = "start it with System(debug=True), or rr-actors run --debug"
+    raise UsageError(f"{ref}: its system was not started for debugging, so it cannot be paused; {start}")
+
+
+def _stepped(envelope: PykkaEnvelope[Any] | None) -> MessageInfo | None:
+    return None if envelope is None else message_info(envelope)

@@ -13,7 +13,7 @@ from rr_actors.actors.messaging.ask_cycles import Chain, Target, check_chain
 from rr_actors.actors.messaging.exit_reports import ExitReport
 from rr_actors.actors.messaging.futures import ExcInfo, error_of
 from rr_actors.actors.messaging.mailbox import Envelope, Mailbox, Packed, StopActor, has_ended, put
-from rr_actors.actors.messaging.mailbox_orders import ORDERS, carry_out
+from rr_actors.actors.messaging.mailbox_looks import ORDERS, carry_out
 from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.actors.remote.protocol import (
     PATH_URN,

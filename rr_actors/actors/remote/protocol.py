@@ -44,7 +44,7 @@ class Tell(msgspec.Struct, frozen=True, array_like=True, tag=2):
 
 
 class Inquire(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """A question about the actor: "alive", "class" or "attributes"; or an order to its mailbox (mailbox_orders.py)."""
+    """A question about the actor: "alive", "class" or "attributes"; or an order to its mailbox (mailbox_looks.py)."""
 
     call: int
     to: str

@@ -39,8 +39,15 @@ from rr_actors.tools.cli_commands import (
     say_table,
     shown_again,
 )
-from rr_actors.tools.explanations import LOADS_HEADS, NO_LOAD_WAITS, WAITING_HEADS, explain, loads_cells, waiting_cells
-from rr_actors.tools.mailbox_texts import explain_actor
+from rr_actors.tools.explanations import (
+    LOADS_HEADS,
+    NO_LOAD_WAITS,
+    WAITING_HEADS,
+    explain,
+    explain_actor,
+    loads_cells,
+    waiting_cells,
+)
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
