@@ -93,7 +93,7 @@ class ActorRef(pykka.ActorRef[A]):
         """Send the message and wait for `left_s` seconds, what is left of `limit_s`."""
         give_up = self._send(message, reply, ask_cycles.chain(), stamp)
         try:
-            return self._heard(reply.get(timeout=left_s), stamp)
+            return self._heard(reply.take(timeout=left_s), stamp)
         except pykka.Timeout:
             if give_up is not None:
                 give_up()
@@ -389,7 +389,7 @@ class DistantRef(ActorRef[A]):
         waiting = ask_cycles.begin_wait(reply)
         try:
             if self._ask_now(process, message, reply, stamp, limit_s):
-                return self._heard(reply.get(), stamp)
+                return self._heard(reply.take(), stamp)
         finally:
             ask_cycles.end_wait(waiting, reply)
         return super()._ask(message, reply, stamp, limit_s, left_until(deadline))

@@ -189,7 +189,7 @@ class Group:
         self._check_order()
         self._loads.calls.dispatcher.check_may_block(f"{self._loads.actor.name}.load_all()")
         try:
-            return self.begin().get()
+            return self.begin().take()
         except RrError:
             raise
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the queries

@@ -166,7 +166,7 @@ class Calls:
         """
         self.check_may_wait()
         try:
-            return future.get(timeout=None if timeout_s is None else timeout_s + grace_s)
+            return future.take(timeout=None if timeout_s is None else timeout_s + grace_s)
         except pykka.Timeout:
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
 
@@ -411,7 +411,7 @@ class Loads:
             RrError: it has failed, or the loop does not say in time how it has ended.
         """
         try:
-            loading.get(timeout=within_s)
+            loading.take(timeout=within_s)
         except pykka.Timeout:
             raise error_of(_too_late(self.actor, loading.query, loading.timeout_s)) from None
 

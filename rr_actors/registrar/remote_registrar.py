@@ -68,7 +68,7 @@ class RemoteCalls(abc.ABC):
     def finish(self, reply: Reply[T], timeout_s: float | None) -> T:
         """Return the result of a call. The other process ends an overdue call; the thread waits a little longer."""
         try:
-            return reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S)
+            return reply.take(timeout=None if timeout_s is None else timeout_s + _GRACE_S)
         except pykka.Timeout:
             raise Unavailable(f"registrar {self.name!r}: no answer within {timeout_s:g} s{self.paused()}") from None
 

@@ -192,8 +192,21 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         if self._open is not None:
             self._unpack()
         if self._error is not None:
-            raise self._error
+            try:
+                raise self._error
+            finally:
+                del self  # the error has a traceback with this frame
         return self._value
+
+    def take(self, *, timeout: float | None = None) -> T:
+        """Return what get() does, and forget the error, for a caller that alone has the future.
+
+        Its frames have the future, and the error has its frames: nothing would free what they have but a collection.
+        """
+        try:
+            return self.get(timeout=timeout)
+        finally:
+            self._error = None
 
     def set(self, value: Any = None) -> None:
         """Set the value. After cancel(), this and the other methods that set it do nothing.
@@ -441,12 +454,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         with self._lock:
             if self._open is None:
                 return
-            try:
-                self._value = self._open()
-            except BaseException as error:  # kept, and raised by every get()
-                if isinstance(error, KeyboardInterrupt) and is_interruptible():
-                    raise  # the calling thread was interrupted: the next get() opens the reply again
-                self._error = error
+            self._value, self._error = _opened(self._open)
             self._open = None
 
     def overdue(self, timeout_s: float | None) -> pykka.Timeout:
@@ -522,3 +530,13 @@ def error_of(exc_info: ExcInfo | BaseException | None) -> BaseException:
     if traceback is not None and traceback_of(error) is not traceback:
         error = BaseException.with_traceback(error, traceback)
     return error
+
+
+def _opened(unpack: Callable[[], Any]) -> tuple[Any, BaseException | None]:
+    """Return what `unpack` returns or raises. The error's traceback has this frame, which does not have the error."""
+    try:
+        return unpack(), None
+    except BaseException as error:  # kept, and raised by every get()
+        if isinstance(error, KeyboardInterrupt) and is_interruptible():
+            raise  # the calling thread was interrupted: the next get() opens the reply again
+        return None, error

@@ -432,4 +432,7 @@ def _reraise(raised: HandlerRaised, origin: str) -> Any:
     if not isinstance(error, Exception):
         error = RrError(raised.text)
     add_note(error, f"raised by {origin}:\n{raised.trace.rstrip()}")
-    raise error
+    try:
+        raise error
+    finally:
+        del error  # its traceback has this frame
