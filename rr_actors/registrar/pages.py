@@ -1,15 +1,18 @@
 """Pages: a few of a registrar's resources or queries at a time, as plain text, for tools that show a running system.
 
-A registrar may serve 100,000 resources, and a screen shows fifty. So the registrar's process picks the rows, and sends
-only these. The calling thread lists the rows under the registrar's lock, and searches and decodes them without it.
+A registrar may serve 100,000 resources, and a screen shows fifty. So the registrar's process searches, sorts and cuts
+the rows, and sends only the wanted ones. The calling thread lists the rows under the registrar's lock, and searches and
+decodes them without it. What it needs of each row's neighbours it reads for a few hundred rows at a time.
 """
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Literal, TypeVar
 
 import msgspec
@@ -20,13 +23,15 @@ from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import Held, Hold, Phase, Resource, priority_of
+from rr_actors.registrar.model.rows import STANDBY, Held, Hold, Phase, Resource, priority_of
 from rr_actors.streams.stream import StreamRow
 
 HOLDERS_SHOWN = 20
 """How many holders, and how many dependencies, a resource's row lists at most. It also has their total numbers."""
 _PART = 4  # characters that a search for the beginning or end of an id needs
 _FOUND = 20
+_AT_ONCE = 500  # rows of which the neighbours are read while the lock is held
+_RUN = 5000  # names that are sorted by one call of C, which lets no other thread run
 
 _VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
 
@@ -40,6 +45,7 @@ _TAKEN = frozenset(("loaded", "pausing", "paused", "resuming"))  # phases of whi
 
 _Row = TypeVar("_Row", Resource, Held)
 _Found = TypeVar("_Found")
+_Sorted = TypeVar("_Sorted")
 
 
 What = Literal["resources", "queries", "id", "servers", "loads", "streams", "response"]
@@ -52,12 +58,19 @@ class Wanted(msgspec.Struct, frozen=True):
     this beginning or end of an id. With "servers", all servers with their counts. With "loads", how often and how long
     loads of each server wait, and the queries whose loads wait now. With "streams", the open streams. With "response",
     the whole response of the resource with this id.
+
+    Attributes:
+        sort: one of RESOURCE_ORDERS or STREAM_ORDERS; among equals, and with "", rows are as the registrar has them.
+        states, holder: only resources in one of these states, in small letters, and with a holder of this name.
     """
 
     what: What
     match: str = ""
     offset: int = 0
     limit: int = 100
+    sort: str = ""
+    states: tuple[str, ...] = ()
+    holder: str = ""
 
 
 def priority_text(priority: int | None) -> str:
@@ -210,7 +223,10 @@ class LoadRow(msgspec.Struct, frozen=True):
 class Page(msgspec.Struct, frozen=True):
     """The wanted rows, and how many rows match in all. `response`: as JSON.
 
-    `said`: with "loads", the last reports of this registrar's own load callbacks, by the queries that wait for them.
+    Attributes:
+        said: with "loads", the last reports of this registrar's own load callbacks, by the queries that wait for them.
+        counts: of rows that are sorted by a number, how many have each number, the most first.
+        keys: the number of each row, if they are sorted by one.
     """
 
     total: int
@@ -221,6 +237,30 @@ class Page(msgspec.Struct, frozen=True):
     streams: list[StreamRow] = []
     response: str = ""
     said: dict[str, str] = {}
+    counts: list[tuple[float, int]] = []
+    keys: list[float] = []
+
+
+STREAM_ORDERS: dict[str, Callable[[StreamRow], float]] = {
+    "rate": lambda row: row.info.rate_hz,
+    "bytes": lambda row: row.info.bytes_per_s,
+    "readers": lambda row: row.info.consumers,
+    "missed": lambda row: row.info.missed,
+}
+"""The numbers by which streams are sorted."""
+LOAD_ORDERS: dict[str, Callable[[LoadRow], float]] = {
+    "loads": lambda row: row.loads,
+    "shared": lambda row: row.shared,
+    "waited": lambda row: row.waited,
+    "failed": lambda row: row.failed,
+    "waiting now": lambda row: row.loading * 2**53 + row.loads,
+    "mean": lambda row: row.mean_s,
+    "p95": lambda row: row.p95_s,
+    "longest": lambda row: row.longest_s,
+}
+"""The numbers by which servers are sorted; of those where as many loads wait, the one with more loads comes first."""
+RESOURCE_ORDERS = ("resource", "state", "priority", "holders")
+"""The orders of resources: by server and request, the worst state, the highest priority, or the most holders first."""
 
 
 def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
@@ -231,11 +271,14 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
     """
     match wanted.what:
         case "resources":
-            chosen, total = _chosen(_read(actor, lambda catalog: list(catalog.resources.values())), wanted, actor.name)
-            return Page(total, resources=_resource_rows(actor, chosen))
+            rows = _matching(_read(actor, lambda catalog: list(catalog.resources.values())), wanted.match, actor.name)
+            rows, counts, keys = _in_order(actor, _of_state_and_holder(actor, rows, wanted), wanted.sort)
+            here = slice(wanted.offset, wanted.offset + wanted.limit)
+            return Page(len(rows), _resource_rows(actor, rows[here]), counts=counts, keys=keys[here])
         case "queries":
-            held, total = _chosen(_read(actor, lambda catalog: list(catalog.held.values())), wanted, actor.name)
-            return Page(total, queries=[_query_row(actor.name, row) for row in held])
+            held = _matching(_read(actor, lambda catalog: list(catalog.held.values())), wanted.match, actor.name)
+            shown = held[wanted.offset : wanted.offset + wanted.limit]
+            return Page(len(held), queries=[_query_row(actor.name, row) for row in shown])
         case "id":
             resources, queries = _of_id(actor, wanted.match)
             rows = _resource_rows(actor, resources)
@@ -244,13 +287,16 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
             servers = _server_rows(actor)
             return Page(len(servers), servers=servers)
         case "loads":
-            waiting, total = _chosen(waiting_loads(actor), wanted, actor.name)
+            waiting = _matching(waiting_loads(actor), wanted.match, actor.name)
             loads = [row for row in load_rows(actor) if wanted.match in row.server]
-            queries = [_query_row(actor.name, row) for row in waiting]
-            return Page(total, queries=queries, loads=loads, said=actor.progress.said())
+            queries = [_query_row(actor.name, row) for row in waiting[wanted.offset : wanted.offset + wanted.limit]]
+            return Page(len(waiting), queries=queries, loads=loads, said=actor.progress.said())
         case "streams":
-            streams = _stream_rows(actor, wanted.match)
-            return Page(len(streams), streams=streams[wanted.offset : wanted.offset + wanted.limit])
+            streams, counts, keys = _stream_rows(actor, wanted.match), list[tuple[float, int]](), list[float]()
+            if (key := STREAM_ORDERS.get(wanted.sort)) is not None:
+                streams, counts, keys = _by_number(streams, map(key, streams))
+            here = slice(wanted.offset, wanted.offset + wanted.limit)
+            return Page(len(streams), streams=streams[here], counts=counts, keys=keys[here])
         case "response":
             row = _read(actor, lambda catalog: catalog.find(wanted.match))
             raw = None if row is None else row.response
@@ -347,23 +393,86 @@ def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
         return reader(actor.whole())
 
 
-def _chosen(rows: list[_Row], wanted: Wanted, name: str) -> tuple[list[_Row], int]:
-    if wanted.match:
-        text, raw = wanted.match, wanted.match.encode("utf-8", "replace")
-        in_json = json_of(text)[1:-1]
-        # To decode a request takes 5 us. It must be done if the text may be in it though its bytes are not.
-        decodes = _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
+def _matching(rows: list[_Row], text: str, name: str) -> list[_Row]:
+    """Return the rows of the registrar `name` that have the text in them."""
+    if not text:
+        return rows
+    raw, in_json = text.encode("utf-8", "replace"), json_of(text)[1:-1]
+    # To decode a request takes 5 us. It must be done if the text may be in it though its bytes are not.
+    decodes = _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
-        def matches(row: Resource | Held) -> bool:
-            if any(text in value for value in _texts(row, name)):
-                return True
-            if not (decodes or raw in row.request):
-                return False
-            request = json_of(shown_plain(row.request))  # a number or a length may be the same byte as a letter
-            return text in request or in_json in request
+    def matches(row: Resource | Held) -> bool:
+        if any(text in value for value in _texts(row, name)):
+            return True
+        if not (decodes or raw in row.request):
+            return False
+        request = json_of(shown_plain(row.request))  # a number or a length may be the same byte as a letter
+        return text in request or in_json in request
 
-        rows = [row for row in rows if matches(row)]
-    return rows[wanted.offset : wanted.offset + wanted.limit], len(rows)
+    return [row for row in rows if matches(row)]
+
+
+def _of_state_and_holder(actor: RegistrarActor, rows: list[Resource], wanted: Wanted) -> list[Resource]:
+    def is_chosen(catalog: Catalog, row: Resource) -> bool:
+        said = {_condition_in(catalog, row).lower(), str(row.state).lower() if row.phase is Phase.LOADED else ""}
+        if wanted.states and not said.intersection(wanted.states):
+            return False
+        queries = catalog.holders.get(row.id, ()) if wanted.holder else ()
+        return not wanted.holder or any(catalog.queries[id].origin == wanted.holder for id in queries)
+
+    if not (wanted.states or wanted.holder):
+        return rows
+    return list(itertools.compress(rows, _of_each(actor, rows, is_chosen)))
+
+
+_ORDERS: dict[str, Callable[[Catalog, Resource], float]] = {
+    "state": lambda catalog, row: -CONDITIONS.index(_condition_in(catalog, row)),
+    "priority": lambda catalog, row: STANDBY - 1 if row.id not in catalog.holders else catalog.priority_of(row.id),
+    "holders": lambda catalog, row: len(catalog.holders.get(row.id, ())),
+}
+
+
+def _condition_in(catalog: Catalog, row: Resource) -> str:
+    return _condition(row.phase.value, str(row.state), revoked=row.id in catalog.revocations)
+
+
+def _of_each(
+    actor: RegistrarActor, rows: Sequence[Resource], fact: Callable[[Catalog, Resource], _Found]
+) -> list[_Found]:
+    """Return a fact of each resource. The lock is held for a few hundred of them at a time."""
+
+    def facts(part: Sequence[Resource], catalog: Catalog) -> list[_Found]:
+        return [fact(catalog, row) for row in part]
+
+    begins = range(0, len(rows), _AT_ONCE)
+    return [one for begin in begins for one in _read(actor, partial(facts, rows[begin : begin + _AT_ONCE]))]
+
+
+def _in_order(
+    actor: RegistrarActor, rows: list[Resource], sort: str
+) -> tuple[list[Resource], list[tuple[float, int]], list[float]]:
+    """Return resources in the order `sort`, with the counts and keys of a Page, if they are sorted by a number."""
+    if (key := _ORDERS.get(sort)) is not None:
+        return _by_number(rows, _of_each(actor, rows, key))
+    if sort == "resource":
+        named = [(row.server, text_of_value(row.request), at) for at, row in enumerate(rows)]
+        parts = [sorted(named[begin : begin + _RUN]) for begin in range(0, len(named), _RUN)]
+        rows = [rows[at] for *_, at in heapq.merge(*parts)]
+    return rows, [], []
+
+
+def _by_number(
+    rows: Iterable[_Sorted], keys: Iterable[float]
+) -> tuple[list[_Sorted], list[tuple[float, int]], list[float]]:
+    """Return the rows by their keys, the highest first, with the counts and keys of a Page.
+
+    Many rows have few keys. So only the keys are sorted: other threads run meanwhile.
+    """
+    having: dict[float, list[_Sorted]] = {}
+    for row, key in zip(rows, keys, strict=True):
+        having.setdefault(key, []).append(row)
+    counts = [(key, len(having[key])) for key in sorted(having, reverse=True)]
+    return [row for key, _ in counts for row in having[key]], counts, [key for key, n in counts for _ in range(n)]
 
 
 def _texts(row: Resource | Held, name: str) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import asyncio
 import functools
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Unpack, cast, overload
@@ -125,6 +125,7 @@ NO_FIELDS: dict[str, object] = {}
 _ALL_STREAMS = Wanted("streams", limit=sys.maxsize)
 """The request of a load that gives none."""
 
+_IN_ONE_STEP = 200  # rows: an answer with more holds Python's lock for longer than 5 ms
 _SHOWN = 50  # rows of a picture in a notebook
 _AT_ONCE = 64  # usage callbacks that begin together
 _PATIENCE_S = 0.25  # after that, the next ones begin: some that hang do not hold them up
@@ -932,14 +933,27 @@ class Registrar(Consumer):
 
     # -- looking -------------------------------------------------------------------------------------------------
 
-    @for_handles(repeatable=True)
     def queries(self) -> list[Query]:
-        """Return every query that this registrar holds, with the dependencies of its resources, oldest first."""
-        return self._calls.call(self._queries_now)
+        """Return every query that this registrar holds, with the dependencies of its resources, oldest first.
 
-    def _queries_now(self) -> list[Query]:
-        held = [row for row in self._held_now() if row.hold is Hold.HELD]
-        return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
+        It reads a few hundred at a time. Each is as it was at one moment; others may be loaded or released meanwhile.
+        """
+        return [query for ids in _batched(self._query_ids()) for query in self._queries_of(ids)]
+
+    @for_handles(repeatable=True)
+    def _query_ids(self) -> list[str]:
+        held = [row for row in self._calls.call(self._held_now) if row.hold is Hold.HELD]
+        return [row.id for row in sorted(held, key=lambda row: row.seq)]
+
+    @for_handles(repeatable=True)
+    def _queries_of(self, ids: list[str]) -> list[Query]:
+        return self._calls.call(self._queries_now, ids)
+
+    def _queries_now(self, ids: list[str]) -> list[Query]:
+        with self._actor.enter():
+            held = self._actor.whole().held
+            rows = [row for id in ids if (row := held.get(id)) is not None and row.hold is Hold.HELD]
+        return [self._views.of(row) for row in rows]
 
     @for_handles(repeatable=True)
     def fetch_state(self, query_or_id: Query | str) -> str:
@@ -1042,15 +1056,33 @@ class Registrar(Consumer):
             held = [catalog.held[id] for id in reversed(parts)]
         return [self._views.of(row) for row in held]
 
-    @for_handles(repeatable=True)
     def resources(self) -> list[ResourceInfo]:
-        """Return every resource served here, with its state, response and holders."""
-        return [self._info(*row) for row in self._calls.call(self._resources_now)]
+        """Return every resource served here, with its state, response and holders.
 
-    def _resources_now(self) -> list[tuple[Resource, RunningServer | None, list[QueryRow]]]:
+        It reads a few hundred at a time. Each is as it was at one moment; others may come or go meanwhile.
+        """
+        return [info for ids in _batched(self._resource_ids()) for info in self._infos(ids)]
+
+    @for_handles(repeatable=True)
+    def _resource_ids(self) -> list[str]:
+        return self._calls.call(self._resource_ids_now)
+
+    def _resource_ids_now(self) -> list[str]:
+        with self._actor.enter():
+            return list(self._actor.whole().resources)
+
+    @for_handles(repeatable=True)
+    def _infos(self, ids: list[str]) -> list[ResourceInfo]:
+        return [self._info(*row) for row in self._calls.call(self._resources_now, ids)]
+
+    def _resources_now(
+        self, ids: Iterable[str] | None = None
+    ) -> list[tuple[Resource, RunningServer | None, list[QueryRow]]]:
         with self._actor.enter():
             catalog, server_of = self._actor.whole(), self._actor.servers.get
-            return [(row, server_of(row.server), catalog.queries_of(row.id)) for row in catalog.resources.values()]
+            known = catalog.resources
+            rows = known.values() if ids is None else [known[id] for id in ids if id in known]
+            return [(row, server_of(row.server), catalog.queries_of(row.id)) for row in rows]
 
     def _info(self, resource: Resource, server: RunningServer | None, queries: list[QueryRow]) -> ResourceInfo:
         """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
@@ -1282,6 +1314,12 @@ def has_all_streams(registrar: Registrar, query_id: str) -> bool:
     views = registrar._views  # pyright: ignore[reportPrivateUsage]  # same file
     query = views.known(query_id)
     return query is not None and views.has_all_streams(query)
+
+
+def _batched(ids: list[str]) -> Iterator[list[str]]:
+    """Yield the ids in parts so small that a look at the rows of one stops nobody."""
+    for begin in range(0, len(ids), _IN_ONE_STEP):
+        yield ids[begin : begin + _IN_ONE_STEP]
 
 
 def page(registrar: Registrar, wanted: Wanted) -> Page:

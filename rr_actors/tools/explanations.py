@@ -10,7 +10,7 @@ from rr_actors.actors.messaging.mailbox_looks import COUNTED, ON_START, MailboxI
 from rr_actors.base.errors import NotFound, Unavailable, UnknownQuery, UsageError, few, shown
 from rr_actors.base.names import short_id, short_ids
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
-from rr_actors.registrar.pages import HolderRow, LoadRow, QueryRow, ResourceRow
+from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
 from rr_actors.streams.stream import StreamRow
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Found
@@ -67,28 +67,6 @@ def name_of_resource(ask: Callable[[Find], Found], id: str, registrar: str) -> s
                 _names.clear()
             _names[id] = name
     return name
-
-
-WAITING_HEADS = ("who waits", "for what", "to load", "waits for", "because")
-"""The heads of waiting_cells()."""
-LOADS_HEADS = ("server", "loads", "shared", "waited", "failed", "waiting now", "mean", "p95", "longest")
-"""The heads of loads_cells()."""
-NO_LOAD_WAITS = "No load waits now."
-
-
-def waiting_cells(ask: Callable[[Find], Found], row: QueryRow) -> tuple[str, ...]:
-    """Return who waits for a load, for what, for which resource of its own, how long already, and what is reported."""
-    whose = name_of_resource(ask, row.parent, row.origin) if row.parent else "itself"
-    at = since(row.id)
-    waited = "" if at is None else seconds_text(max(0.0, time.time() - at))
-    return row.origin, row.name, whose, waited, row.said
-
-
-def loads_cells(row: LoadRow) -> tuple[str, ...]:
-    """Return how often and how long loads of a server waited, as texts."""
-    counts = (row.loads, row.shared, row.waited, row.failed, row.loading)
-    times = (row.mean_s, row.p95_s, row.longest_s) if row.longest_s else ()
-    return row.server, *(f"{count:,}" for count in counts), *(map(seconds_text, times) if times else ("",) * 3)
 
 
 def seconds_text(seconds: float) -> str:

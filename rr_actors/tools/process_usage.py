@@ -6,8 +6,11 @@ import os
 import time
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 import msgspec
+
+from rr_actors.system.console.console_messages import ChildRow
 
 _TICKS = os.sysconf("SC_CLK_TCK")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -26,6 +29,13 @@ def usage_of(pid: int) -> Usage | None:
         return None
     used_s, lived_s, memory_bytes = read
     return Usage(round(100 * used_s / lived_s, 1), memory_bytes)
+
+
+def facts_of(row: ChildRow) -> dict[str, Any]:
+    """Return a child for programs, with the usage of its process since its start."""
+    usage = None if row.pid is None else usage_of(row.pid)
+    used = {"cpu_percent": None, "memory_bytes": None} if usage is None else msgspec.to_builtins(usage)
+    return {name: getattr(row, name) for name in row.__struct_fields__} | used
 
 
 def _read(pid: int) -> tuple[float, float, int] | None:

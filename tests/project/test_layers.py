@@ -28,10 +28,10 @@ PLACES = {
     "rich": (
         "registrar/progress_bar.py",
         "tools/cli_commands.py",
-        "tools/terminal/terminal_app.py",
+        "tools/terminal/terminal_pane.py",
         "tools/verbs/state_verbs.py",
     ),
-    "textual": ("tools/terminal/terminal_app.py",),
+    "textual": ("tools/terminal/terminal_app.py", "tools/terminal/terminal_pane.py"),
     "nicegui": ("tools/web/",),
     "opentelemetry": ("system/recording/otel_export.py",),
     "yaml": ("managers/pipes/temoto_files.py",),

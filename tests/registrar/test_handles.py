@@ -64,6 +64,31 @@ def test_a_call_of_a_handle_is_answered_by_the_registrar(system: rr.System, hand
         assert query.wait_status("WARNING", timeout_s=LIMIT_S).message == "dim"
 
 
+def test_a_look_at_many_resources_or_queries_reads_a_few_at_a_time(
+    system: rr.System, handle: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = system.open_registrar("app")
+    queries = app.load_all([("far/thing", f"lamp {number}") for number in range(1203)], timeout_s=LIMIT_S)
+    answers: list[int] = []
+
+    def counted(method: Any) -> Any:
+        def call(self: rr.Registrar, ids: list[str]) -> Any:
+            answers.append(len(found := method(self, ids)))
+            return found
+
+        return call
+
+    for kind, name in ((RegistrarHandle, "_infos"), (rr.Registrar, "_queries_of")):
+        monkeypatch.setattr(kind, name, counted(inspect.getattr_static(kind, name)))
+    resources = handle.resources()
+    held = app.queries()
+    assert [info.request for info in resources] == [f"lamp {number}" for number in range(1203)]
+    assert {info.holders for info in resources} == {("app",)}
+    assert [query.id for query in held] == [query.id for query in queries]
+    assert sum(answers) == 2 * 1203
+    assert max(answers) <= 500
+
+
 @pytest.mark.parametrize("name", ["usage", "send_status", "unload", "set_priority", "_load"])
 def test_a_call_that_changes_something_or_runs_code_of_users_is_not_repeatable(name: str) -> None:
     assert is_for_handles(name)

@@ -274,6 +274,60 @@ def test_a_page_over_several_registrars_has_their_rows_in_order_wherever_it_begi
             assert (page.total, found) == (7, names[offset : offset + limit]), (offset, limit)
 
 
+def test_a_sorted_page_over_several_registrars_has_the_most_first_wherever_it_begins_and_ends(
+    system: rr.System, app: rr.Registrar, console: ConsoleClient
+) -> None:
+    other, expected = system.open_registrar("other"), list[tuple[str, str, int, int]]()
+    for name, count in (("a", 3), ("b", 2), ("c", 4)):
+        registrar = system.open_registrar(name)
+        serve(registrar, "thing")
+        for number in range(count):
+            query = app.load(f"{name}/thing", number, priority=number % 3)
+            state = ("OK", "WARNING", "ERROR")[number % 3]
+            registrar.send_status(query, rr.Status(state))
+            if number % 2:
+                other.load(f"{name}/thing", number, priority=-5)
+            expected.append((f"{name}/thing", str(number), number % 3, 1 + number % 2))
+
+    def rows(sort: str, offset: int = 0, limit: int = 500) -> list[tuple[str, str]]:
+        page = console.ask(ListResources(offset=offset, limit=limit, sort=sort))
+        assert page.total == 9
+        return [(row.server, row.request) for row in page.rows]
+
+    orders = {
+        "state": sorted(expected, key=lambda row: -row[2]),
+        "priority": sorted(expected, key=lambda row: -row[2]),
+        "holders": sorted(expected, key=lambda row: -row[3]),
+        "resource": expected,
+    }
+    for sort, ordered in orders.items():
+        names = [row[:2] for row in ordered]
+        assert rows(sort) == names, sort
+        for offset in range(10):
+            for limit in (1, 3, 8):
+                assert rows(sort, offset, limit) == names[offset : offset + limit], (sort, offset, limit)
+    with pytest.raises(rr.UsageError, match="expected one of resource, state, priority, holders, got 'age'"):
+        rows("age")
+
+
+def test_resources_are_chosen_by_state_and_holder_where_they_are(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+) -> None:
+    serve(provider, "thing")
+    dirty, clean = (app.load("provider/thing", name) for name in ("dirty", "clean"))
+    system.open_registrar("other").load("provider/thing", "clean")
+    provider.send_status(dirty, rr.Status("WARNING", "dust"))
+
+    def chosen(**wanted: Any) -> tuple[int, list[str]]:
+        page = console.ask(ListResources(limit=1, **wanted))
+        return page.total, [row.id for row in page.rows]
+
+    assert chosen(states=("warning",)) == (1, [dirty.resource_id])
+    assert chosen(states=("WARNING", "ok"))[0] == 2
+    assert chosen(holder="other") == (1, [clean.resource_id])
+    assert chosen(holder="other", states=("warning",)) == (0, [])
+
+
 @pytest.mark.slow
 def test_a_list_waits_once_for_all_managers_that_do_not_answer(
     start: Start, workshop: Workshop, state_dir: Path

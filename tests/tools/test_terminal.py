@@ -27,10 +27,12 @@ from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.tools import process_usage
 from rr_actors.tools.process_usage import UsageWatch
+from rr_actors.tools.tables.sheets import SHEETS
+from rr_actors.tools.tables.table import tables_of
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import Keys, Pane, Terminal
 from rr_actors.tools.terminal.terminal_rows import Served, Window
-from rr_actors.tools.terminal.terminal_tables import TreeTable
+from rr_actors.tools.terminal.terminal_tables import SheetRows
 from support import LIMIT_S, TEST_PATHS, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_respawned
 from support_managers import Order, Shop
 
@@ -138,10 +140,14 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_key_each(shop: rr.Syst
         await person.sees(lambda: f"sent SIGKILL to root/shop (pid {pid})" in person.terminal.status)
         await person.sees(lambda: "restarted" in person.events and "1x" in person.tree)
         await person.sees(lambda: "SIGKILL" in person.chosen and "restarted" in person.chosen)
-        await person.press("t")
+        await person.press("t", "y")
         await person.sees(lambda: "stopped root/shop" in person.terminal.status)
         await person.sees(lambda: "stopped" in person.tree)
         assert child(shop, "shop").state == "stopped"
+        await person.press("K")
+        await person.sees(lambda: "kill: root/shop: it is stopped, and has no process" in person.terminal.status)
+        await person.press("t")
+        await person.sees(lambda: "stop: root/shop: it is stopped" in person.terminal.status)
         await person.press("r")
         await person.sees(lambda: "started root/shop again" in person.terminal.status)
 
@@ -158,8 +164,8 @@ def test_the_keys_of_vi_move_and_a_kill_asks_first(shop: rr.System, state_dir: P
         await person.press("j", "y", "K")
         await person.sees(lambda: "kill root/shop? y: yes" in person.terminal.status)
         await person.press("escape")
-        await person.sees(lambda: "root/shop was not killed" in person.terminal.status)
-        await person.press("y", "t")
+        await person.sees(lambda: "not done: kill root/shop" in person.terminal.status)
+        await person.press("y", "t", "y")
         await person.sees(lambda: "stopped root/shop" in person.terminal.status)
         assert "SIGKILL" not in person.events
 
@@ -262,6 +268,8 @@ def test_a_resource_of_several_holders_is_taken_from_one_of_them_or_from_all(sta
         assert len(served.unloads) == 0
         await person.press("escape")
         await person.press("U")
+        await person.sees(lambda: "Its holders lose it at once, and hear FATAL." in person.terminal.status)
+        await person.press("y")
         await person.sees(lambda: "away from 2 holders" in person.terminal.status)
 
     sit_down(state_dir, scene)
@@ -281,7 +289,7 @@ def test_a_resource_is_revoked_after_a_question(shop: rr.System, state_dir: Path
         await person.press("R")
         await person.sees(lambda: "y: yes, Esc: no" in person.terminal.status)
         await person.press("escape")
-        await person.sees(lambda: "was not revoked" in person.terminal.status)
+        await person.sees(lambda: "not done: revoke shop/thing" in person.terminal.status)
         assert len(app.queries()) == 1
         await person.press("R", "y")
         await person.sees(lambda: "revoked shop/thing" in person.terminal.status)
@@ -565,7 +573,7 @@ def test_a_window_goes_on_from_one_list_to_the_next(start: Start, state_dir: Pat
     start()
     crowd = Crowd(state_dir)
     try:
-        listed = TreeTable().list(crowd, Window(offset=498, limit=10))
+        listed = SheetRows(SHEETS[0], tables_of(SHEETS[0])).list(crowd, Window(offset=498, limit=10))
     finally:
         crowd.close()
 

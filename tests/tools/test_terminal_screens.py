@@ -21,13 +21,14 @@ import pytest
 from rich.cells import cell_len
 from textual.pilot import Pilot
 
-from rr_actors.registrar.pages import HolderRow, LoadRow, QueryRow, ResourceRow
+from rr_actors.registrar.pages import CONDITIONS, LOAD_ORDERS, HolderRow, LoadRow, QueryRow, ResourceRow
 from rr_actors.streams.stream import ReaderRow, StreamInfo, StreamRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.recording import event_texts
 from rr_actors.tools import explanations
+from rr_actors.tools.tables import load_tables
 from rr_actors.tools.terminal import event_lines, terminal_app, terminal_rows
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import Terminal
@@ -114,9 +115,11 @@ class Stage(ConsoleLink):
             case questions.ListRegistrars(match, offset, limit):
                 registrars = [row for row in REGISTRARS if match in row.name]
                 return c.Registrars(len(registrars), registrars[offset : offset + limit])
-            case questions.ListResources(match, offset, limit, registrar):
+            case questions.ListResources(match, offset, limit, registrar, sort):
                 served = SERVED.get(registrar, []) if registrar else [row for rows in SERVED.values() for row in rows]
                 served = [row for row in served if match in row.request]
+                if sort:
+                    served.sort(key={"state": lambda row: CONDITIONS.index(row.condition)}[sort])
                 return c.Resources(len(served), served[offset : offset + limit])
             case questions.ListStreams(match, offset, limit):
                 streams = [row for row in STREAMS if match in row.info.id]
@@ -129,8 +132,9 @@ class Stage(ConsoleLink):
                 part = QueryRow(id, "cameras", "lenses/lens", LENS, FRONT, '"front"', "held", "WARNING")
                 found = [row for rows in SERVED.values() for row in rows if row.id == id]
                 return c.Found(found, [part] if id == id_of(9, 88) else [])
-            case questions.ListLoads():
-                return c.Loads(1, [WAITS], LOADS)
+            case questions.ListLoads(_, offset, limit, _, sort):
+                key = LOAD_ORDERS.get(sort, lambda row: 0.0)
+                return c.Loads(1, [WAITS][offset : offset + limit], sorted(LOADS, key=key, reverse=True))
             case _:
                 return c.QueryPage(0, [])
 
@@ -150,7 +154,7 @@ def _it_is_always_now(monkeypatch: pytest.MonkeyPatch) -> None:
         return time.strftime(form, time.gmtime(NOW) if at is None else at)
 
     clock = types.SimpleNamespace(time=lambda: NOW, monotonic=time.monotonic, localtime=time.gmtime, strftime=strftime)
-    for module in (event_texts, event_lines, explanations, terminal_app, terminal_rows):
+    for module in (event_texts, event_lines, explanations, load_tables, terminal_app, terminal_rows):
         monkeypatch.setattr(module, "time", clock)
 
 

@@ -72,7 +72,8 @@ def test_a_button_that_takes_something_away_has_the_colour_of_what_is_bad(shop: 
         tab.goes_to(page.url)
         tab.do(tab.locate(node("root/shop")).click())
         tab.sees(".rr-panel", "kill -9", "stop", "restart")
-        script = "[...document.querySelectorAll('.rr-panel .q-btn')].map((one) => getComputedStyle(one).color)"
+        seen = "[...document.querySelectorAll('.rr-panel .q-btn')].filter((one) => one.offsetParent)"
+        script = f"{seen}.map((one) => getComputedStyle(one).color)"
         kill_9, stop, restart = tab.do(tab.page.evaluate(script))
         assert kill_9 == stop != restart
 
@@ -88,16 +89,18 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.S
         tab.waits(lambda: not tab.do(tab.locate(".q-dialog").count()), "the end of the question")
         assert pid_of(shop, "shop") == pid
         tab.clicks("kill -9")
-        tab.clicks("kill")
+        tab.clicks("kill it")
         tab.sees("body", f"sent SIGKILL to root/shop (pid {pid})")
         tab.sees(node("root"), "1/3")  # first: the window empties by itself
         tab.sees(node("root/shop"), "↻1", "running")
         tab.sees(".rr-rows", "SIGKILL", "restarted")
         tab.sees(node("root"), "0/3")
         tab.clicks("stop")
+        tab.sees(".q-dialog", "Stop root/shop?", "until it is started")
+        tab.clicks("stop it")
         tab.sees(node("root/shop"), "■", "stopped")
         assert child(shop, "shop").state == "stopped"
-        tab.clicks("restart")
+        tab.clicks("start")
         tab.sees(node("root/shop"), "●", "running")
     assert pid_of(shop, "shop") != pid
 
@@ -135,7 +138,7 @@ def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
             tab.presses("Tab")
         tab.presses("Enter")
         tab.sees(".q-dialog", "Kill root/shop?")
-        while tab.do(tab.page.evaluate(focused)) != "kill":
+        while tab.do(tab.page.evaluate(focused)) != "kill it":
             tab.presses("Tab")
         tab.presses("Enter")
         tab.sees("body", f"sent SIGKILL to root/shop (pid {pid})")
@@ -143,16 +146,23 @@ def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
 
 
 @pytest.mark.slow
-def test_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
+def test_only_what_can_be_done_has_a_button_and_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
+    def buttons() -> list[str]:
+        seen = "[...document.querySelectorAll('.rr-panel .q-btn')].filter((one) => one.offsetParent)"
+        return tab.do(tab.page.evaluate(f"{seen}.map((one) => one.innerText)"))
+
     with shop.serve_web() as page:
         tab.goes_to(page.url)
         tab.do(tab.locate(node("root/shop")).click())
         tab.sees(".rr-rows", "running, pid")
+        assert buttons() == ["kill -9", "stop", "restart"]
+        tab.clicks("kill -9")
+        tab.sees(".q-dialog", "It cannot finish what it does.")
         shop.supervisor().terminate_child("shop")
         tab.sees(node("root/shop"), "stopped")
-        tab.clicks("kill -9")
-        tab.clicks("kill")
+        tab.clicks("kill it")
         tab.sees(".q-notification", "kill -9:", "root/shop")
+        tab.waits(lambda: buttons() == ["start"], "the button that starts it")
 
 
 @pytest.mark.slow
@@ -177,6 +187,7 @@ def test_two_browsers_see_the_same_and_what_the_other_does(shop: rr.System, tab:
             one.sees(node("root/shop"), "running")
         tab.do(tab.locate(node("root/shop")).click())
         tab.clicks("stop")
+        tab.clicks("stop it")
         for one in (tab, other):
             one.sees(node("root/shop"), "■", "stopped")
 
@@ -415,6 +426,7 @@ def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System,
         tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
         tab.sees(".rr-rows", "held by 1")
         tab.clicks("unload from all")
+        tab.clicks("unload it")
         tab.sees("body", "away from 1 holder")
         tab.waits(lambda: not app.queries(), "taken away")
         app.load("provider/other", "stool")
@@ -808,6 +820,7 @@ def test_a_page_that_stays_open_shows_the_system_that_starts_again(
             tab.waits(lambda: "waiting" not in tab.text(".rr-status"), "all is well")
             tab.do(tab.locate(node("root/shop")).click())
             tab.clicks("stop")
+            tab.clicks("stop it")
             tab.sees(node("root/shop"), "stopped")
 
 

@@ -24,7 +24,7 @@ from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.recording.figures import Figure
 
-VERSION = 5
+VERSION = 6
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request. The longest part of any is a resource's request as JSON."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from collections.abc import Collection
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgspec
 
 from rr_actors.actors.mailbox_refs import MailboxRef
-from rr_actors.base.errors import NotSerializable
+from rr_actors.base.errors import NotSerializable, UsageError, shown
 from rr_actors.registrar.declarations import Declaring
+from rr_actors.registrar.pages import LOAD_ORDERS, RESOURCE_ORDERS, STREAM_ORDERS, Page, Wanted, What
 from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import Caller
@@ -24,6 +26,23 @@ class Listing(Verb[_A], frozen=True):
     match: c.Text = ""
     offset: c.Offset = 0
     limit: c.Limit = c.PAGE_LIMIT
+
+
+class ListRows(Listing[_A], frozen=True):
+    """A page of the rows of one registrar, or of all. They are searched, sorted and cut where they are.
+
+    `sort`: one of `orders`, which has the most first; "": as their registrars have them.
+    """
+
+    registrar: c.Text = ""
+    sort: c.Text = ""
+    orders: ClassVar[Collection[str]] = ()
+
+    def _page(self, view: View, what: What, **more: Any) -> tuple[Page, list[str]]:
+        if self.sort and self.sort not in self.orders:
+            raise UsageError(f"sort: expected one of {', '.join(self.orders) or 'none'}, got {shown(self.sort)}")
+        wanted = Wanted(what, self.match, self.offset, self.limit, self.sort, **more)
+        return view.page(wanted, self.registrar)
 
 
 class ListChildren(Listing[c.Children], frozen=True):
@@ -42,13 +61,19 @@ class ListRegistrars(Listing[c.Registrars], frozen=True):
         return c.Registrars(len(names), ask_each(wanted, view.described))
 
 
-class ListResources(Listing[c.Resources], frozen=True):
-    """A page of the resources of one registrar, or of all: the rows with `match` in id, server, request or status."""
+class ListResources(ListRows[c.Resources], frozen=True):
+    """A page of the resources of one registrar, or of all: the rows with `match` in id, server, request or status.
 
-    registrar: c.Text = ""
+    `states`, `holder`: only those in one of these states, and with a holder of this name.
+    """
+
+    states: Annotated[tuple[c.Text, ...], msgspec.Meta(max_length=50)] = ()
+    holder: c.Text = ""
+    orders = RESOURCE_ORDERS
 
     def _carry_out(self, view: View, caller: Caller) -> c.Resources:
-        found, notes = view.page("resources", self.registrar, self.match, self.offset, self.limit)
+        states = tuple(state.lower() for state in self.states)
+        found, notes = self._page(view, "resources", states=states, holder=self.holder)
         return c.Resources(found.total, found.resources[: room_for(found.resources, notes)], notes)
 
 
@@ -56,35 +81,37 @@ class ListServers(Verb[c.Servers], frozen=True):
     """The servers of all registrars: how many resources of each are in each state, and what these hold elsewhere."""
 
     def _carry_out(self, view: View, caller: Caller) -> c.Servers:
-        found, notes = view.page("servers", "", "")
+        found, notes = view.page(Wanted("servers"))
         return c.Servers(found.total, found.servers[: c.SERVERS_LIMIT], notes)
 
 
-class ListLoads(Listing[c.Loads], frozen=True):
+class ListLoads(ListRows[c.Loads], frozen=True):
     """A page of the loads that wait, of one registrar or of all, and how often and how long those of its servers did.
 
-    With `match`: those with this text in ids, server or request, and the servers with it in their names.
+    With `match`: those with this text in ids, server or request, and the servers with it in their names. `sort` is the
+    order of the servers.
     """
 
-    registrar: c.Text = ""
+    orders = LOAD_ORDERS
 
     def _carry_out(self, view: View, caller: Caller) -> c.Loads:
-        found, notes = view.page("loads", self.registrar, self.match, self.offset, self.limit)
+        found, notes = self._page(view, "loads")
         said = found.said
         providers = dict.fromkeys(row.server.partition("/")[0] for row in found.queries if self.registrar)
         for reported in ask_each(list(providers), view.load_reports):
             said |= reported
         rows = [msgspec.structs.replace(row, said=said.get(row.id, "")) for row in found.queries]
-        return c.Loads(found.total, rows, found.loads[: c.SERVERS_LIMIT], notes)
+        servers = sorted(found.loads, key=LOAD_ORDERS[self.sort], reverse=True) if self.sort else found.loads
+        return c.Loads(found.total, rows, servers[: c.SERVERS_LIMIT], notes)
 
 
-class ListUsages(Listing[c.Usages], frozen=True):
+class ListUsages(ListRows[c.Usages], frozen=True):
     """A page of resources as ListResources finds them, with what each of them uses now."""
 
-    registrar: c.Text = ""
+    orders = RESOURCE_ORDERS
 
     def _carry_out(self, view: View, caller: Caller) -> c.Usages:
-        found, notes = view.page("resources", self.registrar, self.match, self.offset, self.limit)
+        found, notes = self._page(view, "resources")
         usages, failures = view.usages([(row.server.partition("/")[0], row.id) for row in found.resources], notes)
         rows = [
             c.UsageRow(row.id, row.server, row.request, usages.get(row.id, {}), failures.get(row.id, ""))
@@ -93,23 +120,21 @@ class ListUsages(Listing[c.Usages], frozen=True):
         return c.Usages(found.total, rows[: room_for(rows, notes)], notes)
 
 
-class ListStreams(Listing[c.Streams], frozen=True):
+class ListStreams(ListRows[c.Streams], frozen=True):
     """A page of the open streams of one registrar's resources, or of all: those with `match` in name or resource."""
 
-    registrar: c.Text = ""
+    orders = STREAM_ORDERS
 
     def _carry_out(self, view: View, caller: Caller) -> c.Streams:
-        found, notes = view.page("streams", self.registrar, self.match, self.offset, self.limit)
+        found, notes = self._page(view, "streams")
         return c.Streams(found.total, found.streams[: room_for(found.streams, notes)], notes)
 
 
-class ListQueries(Listing[c.QueryPage], frozen=True):
+class ListQueries(ListRows[c.QueryPage], frozen=True):
     """A page of the queries that one registrar holds, or all: the rows with `match` in ids, server or request."""
 
-    registrar: c.Text = ""
-
     def _carry_out(self, view: View, caller: Caller) -> c.QueryPage:
-        found, notes = view.page("queries", self.registrar, self.match, self.offset, self.limit)
+        found, notes = self._page(view, "queries")
         return c.QueryPage(found.total, found.queries, notes)
 
 
@@ -154,7 +179,7 @@ class ReadResponse(Verb[c.Response], frozen=True):
     registrar: c.Text
 
     def _carry_out(self, view: View, caller: Caller) -> c.Response:
-        text = view.page("response", self.registrar, self.id)[0].response
+        text = view.page(Wanted("response", self.id), self.registrar)[0].response
         if len(text.encode()) > c.RESPONSE_LIMIT_BYTES:
             raise NotSerializable(f"resource {self.id}: its response is longer than {c.RESPONSE_LIMIT_BYTES:,} bytes")
         return c.Response(text)

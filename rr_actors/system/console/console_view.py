@@ -29,7 +29,7 @@ from rr_actors.base.errors import ActorUnavailable, NotFound, RrError, Unavailab
 from rr_actors.base.names import child_meant, no_child
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.pages import Page, ResourceRow, Wanted, What
+from rr_actors.registrar.pages import Page, ResourceRow, Wanted
 from rr_actors.registrar.registrar import Registrar, Usages, page
 from rr_actors.runtime.processes.lifeline import stopped
 from rr_actors.streams.stream import StreamRow
@@ -247,19 +247,18 @@ class View:
         except RrError as error:
             return c.RegistrarRow(name, status.value, error=readable(text_of(error)))
 
-    def page(self, what: What, registrar: str, match: str, offset: int = 0, limit: int = 0) -> tuple[Page, list[str]]:
-        """Return a page over several registrars, and notes on registrars that do not answer.
+    def page(self, wanted: Wanted, registrar: str = "") -> tuple[Page, list[str]]:
+        """Return a page over one registrar or all that are up, and notes on registrars that do not answer.
 
         All are asked at once how many rows they have, and then those with rows in the page for these.
         """
         names = self.up(registrar)
         if len(names) == 1:
-            pages, notes = self._pages({names[0]: Wanted(what, match, offset, limit)})
-        else:
-            pages, notes = self._pages(dict.fromkeys(names, Wanted(what, match, limit=0)))
-            rows, more = self._pages(_parts(pages, Wanted(what, match, offset, limit)))
-            pages, notes = pages | rows, notes + more
-        return _joined(list(pages.values())), notes
+            pages, notes = self._pages({names[0]: wanted})
+            return _joined(list(pages.values())), notes
+        pages, notes = self._pages(dict.fromkeys(names, msgspec.structs.replace(wanted, offset=0, limit=0)))
+        rows, more = self._pages(_parts(pages, wanted))
+        return _joined(list((pages | rows).values())), notes + more
 
     def _pages(self, wanted: Mapping[str, Wanted]) -> tuple[dict[str, Page], list[str]]:
         """Return a page of each registrar that answers, in the order of `wanted`, and notes on the others."""
@@ -278,7 +277,7 @@ class View:
     def load_reports(self, registrar: str) -> dict[str, str]:
         """Return the last reports of a registrar's load callbacks, by the queries that wait; none if it is gone."""
         try:
-            return self.page("loads", registrar, "")[0].said
+            return self.page(Wanted("loads"), registrar)[0].said
         except RrError:
             return {}
 
@@ -315,10 +314,10 @@ class View:
         server, space, request = id.partition(" ")
         if space and "/" in server:
             part = request.partition("…")[0]
-            found, notes = self.page("resources", server.partition("/")[0], part, limit=c.PAGE_LIMIT)
+            found, notes = self.page(Wanted("resources", part, limit=c.PAGE_LIMIT), server.partition("/")[0])
             rows = [row for row in found.resources if id in (row.name, f"{row.server} {row.request}")]
             return c.Found(rows or self._as_its_holder_names_it(id, part), [], notes)
-        found, notes = self.page("id", registrar, id)
+        found, notes = self.page(Wanted("id", id), registrar)
         resources, queries = found.resources, found.queries
         if any(row.id == id for row in (*resources, *queries)):
             resources = [row for row in resources if id in (row.id, *(holder.query_id for holder in row.holders))]
@@ -327,33 +326,44 @@ class View:
 
     def _as_its_holder_names_it(self, name: str, part: str) -> list[ResourceRow]:
         """Return the resource of this name at its holders: they have 60 in a request that its server reads as 60.0."""
-        queries = self.page("queries", "", part, limit=c.PAGE_LIMIT)[0].queries
+        queries = self.page(Wanted("queries", part, limit=c.PAGE_LIMIT))[0].queries
         named = [row for row in queries if name in (row.name, f"{row.server} {row.request}")]
-        found = ask_each(named[:_ALIKE], lambda row: self.page("id", row.server.partition("/")[0], row.id)[0].resources)
+        found = ask_each(
+            named[:_ALIKE], lambda row: self.page(Wanted("id", row.id), row.server.partition("/")[0])[0].resources
+        )
         return list({row.id: row for rows in found for row in rows}.values())
 
 
 def _parts(pages: Mapping[str, Page], wanted: Wanted) -> dict[str, Wanted]:
-    """Return which rows of a page each registrar has, given how many rows it has in all."""
+    """Return which rows of a page each registrar has, given how many rows it has in all, and of which keys."""
+    runs = [(key, name, count) for name, found in pages.items() for key, count in found.counts or [(0.0, found.total)]]
+    runs.sort(key=lambda run: run[0], reverse=True)  # those of one key stay in the order of the registrars
     parts, before = dict[str, Wanted](), 0
-    for name, found in pages.items():
-        begin = max(wanted.offset, before)
-        end = min(wanted.offset + wanted.limit, before + found.total)
+    passed = Counter[str]()
+    for _, name, count in runs:
+        begin, end = max(wanted.offset, before), min(wanted.offset + wanted.limit, before + count)
         if begin < end:
-            parts[name] = msgspec.structs.replace(wanted, offset=begin - before, limit=end - begin)
-        before += found.total
+            first = parts.get(name) or msgspec.structs.replace(wanted, offset=passed[name] + begin - before, limit=0)
+            parts[name] = msgspec.structs.replace(first, limit=first.limit + end - begin)
+        passed[name] += count
+        before += count
     return parts
 
 
 def _joined(pages: Sequence[Page]) -> Page:
-    """Return the rows of several registrars as one page."""
+    """Return the rows of several registrars as one page, in the order of their keys."""
+
+    def rows(of: Callable[[Page], Sequence[_A]]) -> list[_A]:
+        found = [one for page in pages for one in zip(page.keys or itertools.repeat(0.0), of(page), strict=False)]
+        return [row for _, row in sorted(found, key=lambda one: one[0], reverse=True)]
+
     return Page(
         sum(found.total for found in pages),
-        [row for found in pages for row in found.resources],
+        rows(lambda found: found.resources),
         [row for found in pages for row in found.queries],
         [row for found in pages for row in found.servers],
         [row for found in pages for row in found.loads],
-        [row for found in pages for row in found.streams],
+        rows(lambda found: found.streams),
         next((found.response for found in pages if found.response), ""),
         {id: text for found in pages for id, text in found.said.items()},
     )

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rr_actors.base.notebook import escape
 from rr_actors.system.console.console_messages import ChildRow, RegistrarRow
-from rr_actors.tools.process_usage import RateWatch, UsageWatch
+from rr_actors.tools.tables.child_tables import Figures, TreeTables
 
 STEP_S = 5.0
 STEPS = 120
@@ -77,9 +77,8 @@ class FigureCurves:
     """The figures of the children of one system. take() is called by one thread, the rest by any."""
 
     def __init__(self) -> None:
-        self._usages = UsageWatch()
+        self._tree = TreeTables()
         self._points: dict[str, dict[str, deque[tuple[int, float]]]] = {}
-        self._rates = RateWatch()
         self._taken_at = -_LEAST_S
         self.step = 0  # that the newest figures are of
 
@@ -89,20 +88,11 @@ class FigureCurves:
             return
         self._taken_at, step = now, int(now // STEP_S)
         counts = {row.name: row.counts for row in registrars}
-        rates = {name: self._rates.look(name, one["loads"]) for name, one in counts.items() if "loads" in one}
         kept = {row.path: self._points.get(row.path, {}) for row in children[:_CHILDREN]}
-        seen: set[int] = set()
-        for row in children[:_CHILDREN]:
-            figures = {**self._usage_of(row, seen), **_of_registrar(row.id, counts, rates)}
-            for name, value in figures.items():
-                _add(kept[row.path].setdefault(name, deque(maxlen=STEPS)), step, value)
-            seen.add(row.pid or 0)
+        for of in self._tree.figures(children[:_CHILDREN], counts, as_path=True):
+            for name, value in _values(of):
+                _add(kept[of.row.path].setdefault(name, deque(maxlen=STEPS)), step, value)
         self._points, self.step = kept, step
-
-    def _usage_of(self, row: ChildRow, seen: Collection[int]) -> dict[str, float]:
-        """Return the CPU and memory of a child's process; of several children in one, the first one has them."""
-        usage = None if row.pid is None or row.pid in seen else self._usages.look(row.pid)
-        return {} if usage is None else {"CPU": usage.cpu_percent, "memory": usage.memory_bytes / 2**20}
 
     def curves(self, match: str = "", limit: int = _CHILDREN) -> dict[str, list[Curve]]:
         """Return the curves of the first children with the text `match` in their paths, by path."""
@@ -114,15 +104,13 @@ class FigureCurves:
         }
 
 
-def _of_registrar(
-    name: str, counts: Mapping[str, Mapping[str, int]], rates: Mapping[str, float | None]
-) -> dict[str, float]:
-    """Return the figures of the registrar of a child; none if it is no manager, or does not answer."""
-    if not (known := counts.get(name)):
-        return {}
-    figures = {key: float(known[key]) for key in ("mailbox", "resources") if key in known}
-    rate = rates.get(name)
-    return figures if rate is None else figures | {"loads": rate}
+def _values(of: Figures) -> Iterator[tuple[str, float]]:
+    """Yield the figures of a child that are known."""
+    if of.usage is not None:
+        yield from (("CPU", of.usage.cpu_percent), ("memory", of.usage.memory_bytes / 2**20))
+    yield from ((key, float(of.counts[key])) for key in ("mailbox", "resources") if key in of.counts)
+    if of.loads is not None:
+        yield "loads", of.loads
 
 
 def _add(points: deque[tuple[int, float]], step: int, value: float) -> None:

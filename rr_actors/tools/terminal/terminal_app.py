@@ -15,54 +15,42 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import ClassVar, TypeVar
 
-from rich.cells import cell_len
-from rich.segment import Segment
-from rich.style import Style
-from rich.text import Text
-from textual import events, on
+from textual import on
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal
 from textual.message import Message
 from textual.screen import ModalScreen
-from textual.strip import Strip
-from textual.widget import Widget
 from textual.widgets import Footer, Input, Static
 
-from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.errors import RrError, UsageError
 from rr_actors.base.names import short_id
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import NotRunning
 from rr_actors.system.console.console_questions import ListHistory
 from rr_actors.system.console.console_view import Command
+from rr_actors.tools.tables.row_commands import (
+    CHILD_COMMANDS,
+    KEYS,
+    RESOURCE_COMMANDS,
+    ROW_COMMANDS,
+    RowCommand,
+    no_query,
+)
+from rr_actors.tools.tables.sheets import SHEETS
+from rr_actors.tools.tables.table import Row, tables_of
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.event_lines import EventLines, event_of, missed_line
-from rr_actors.tools.terminal.terminal_rows import (
-    Happenings,
-    Listed,
-    Neighbours,
-    Nothing,
-    Past,
-    Row,
-    Rows,
-    Served,
-    Window,
-    refused,
-)
-from rr_actors.tools.terminal.terminal_tables import AllLoads, AllResources, AllStreams, TreeTable
+from rr_actors.tools.terminal.terminal_pane import Pane, plain
+from rr_actors.tools.terminal.terminal_rows import Happenings, Listed, Neighbours, Nothing, Past, Rows, Served, Window
+from rr_actors.tools.terminal.terminal_tables import SheetRows
 
 _T = TypeVar("_T")
 _THREADS = 16  # for the panes, the feed, and commands that wait
 _LOOK_S = 0.2
 """The interval at which the screen looks for news."""
-_OFTEN_S = 0.5
-_SELDOM_S = 2.0
-"""The age at which a pane's rows are asked for again: while events happen, and while none do."""
-_SHARE = 10
-"""A pane waits so many times as long as its last answer took: so it keeps the system busy a tenth of the time."""
-_LONGEST_S = 5.0
-"""The longest such wait, in seconds: a system that hung may answer quickly again."""
+_WELCOME_S = 2.0  # for the events that have happened before
 _AGAIN_S = 0.5
 
 
@@ -78,209 +66,6 @@ def watch(state_dir: str | os.PathLike[str] | None = None) -> None:
     Terminal(ConsoleLink(state_dir)).run()
 
 
-class Pane(Widget, can_focus=True):
-    """A list with a cursor. It knows only its visible rows.
-
-    Args:
-        look: a function that asks for the rows of a window, in a thread.
-    """
-
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("up,k", "move(-1)", show=False),
-        Binding("down,j", "move(1)", show=False),
-        Binding("pageup", "page(-1)", show=False),
-        Binding("pagedown", "page(1)", show=False),
-        Binding("home", "move(-1_000_000_000)", show=False),
-        Binding("end", "move(1_000_000_000)", show=False),
-        Binding("enter", "open", "open"),
-    ]
-
-    class Picked(Message):
-        """The cursor of a pane is on another row, or the pane shows another list."""
-
-        def __init__(self, pane: Pane, row: Row | None) -> None:
-            super().__init__()
-            self.pane, self.row = pane, row
-
-    class Opened(Message):
-        """Enter was pressed on a row."""
-
-        def __init__(self, pane: Pane, row: Row) -> None:
-            super().__init__()
-            self.pane, self.row = pane, row
-
-    class Failed(Message):
-        """The system did not answer; with None, it answers again."""
-
-        def __init__(self, error: Unavailable | None) -> None:
-            super().__init__()
-            self.error = error
-
-    def __init__(self, id: str, rows: Rows, look: Callable[[Rows, Window], asyncio.Future[Listed]]) -> None:
-        super().__init__(id=id)
-        self.match = ""
-        self.rows = rows
-        self._look = look
-        self._listed = Listed(0, [])
-        self._offset = 0  # of the first known row
-        self._top = 0
-        self.cursor = 0
-        self._wanted = asyncio.Event()
-        self._asked_at = 0.0
-        self._took_s = 0.0
-        self._has_failed = False
-
-    @property
-    def row(self) -> Row | None:
-        """The row under the cursor; None while the pane does not know it."""
-        return self._known(self.cursor)
-
-    def show(self, rows: Rows, match: str = "", cursor: int = 0) -> None:
-        """Show another list, or the same with another filter, with the cursor on row number `cursor`."""
-        if (rows, match) == (self.rows, self.match):
-            return
-        self.rows, self.match = rows, match
-        self._listed, self._offset = Listed(0, []), 0
-        self.cursor = cursor
-        self._top = max(0, cursor - self._room // 2)
-        self.ask()
-
-    def ask(self) -> None:
-        """Ask for the visible rows now."""
-        self._wanted.set()
-        self._draw()
-
-    def ask_again(self, is_news: bool) -> None:
-        """Ask for the visible rows, if the known ones are old enough."""
-        age_s = _OFTEN_S if is_news else _SELDOM_S
-        if time.monotonic() > self._asked_at + max(age_s, min(_SHARE * self._took_s, _LONGEST_S)):
-            self._wanted.set()
-
-    def on_mount(self) -> None:
-        """Start the worker that asks for rows."""
-        self.run_worker(self._keep_asking(), group="panes")
-        self.ask()
-
-    def on_resize(self) -> None:
-        """Show as many rows as there is room for."""
-        self._go(self.cursor)
-        self.ask()
-
-    def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
-        """Move the cursor up by three rows."""
-        self.action_move(-3)
-
-    def on_mouse_scroll_down(self, event: events.MouseScrollDown) -> None:
-        """Move the cursor down by three rows."""
-        self.action_move(3)
-
-    def on_click(self, event: events.Click) -> None:
-        """Move the cursor to the row that was clicked."""
-        self._go(self._top + event.get_content_offset_capture(self).y - bool(self._listed.heads))
-
-    def action_move(self, by: int) -> None:
-        """Move the cursor by so many rows."""
-        self._go(self.cursor + by)
-
-    def action_page(self, by: int) -> None:
-        """Move the cursor by a screen."""
-        self._go(self.cursor + by * max(1, self._room - 1))
-
-    def action_open(self) -> None:
-        """Open the row under the cursor."""
-        if (row := self.row) is not None:
-            self.post_message(self.Opened(self, row))
-
-    def _go(self, to: int) -> None:
-        before = self.cursor, self._top
-        height = max(1, self._room)
-        self.cursor = max(0, min(to, self._listed.total - 1))
-        self._top = max(min(self._top, self.cursor), self.cursor - height + 1, 0)
-        if (self.cursor, self._top) != before:
-            if self._top != before[1] or self.row is None:
-                self._wanted.set()
-            self._draw()
-            self.post_message(self.Picked(self, self.row))
-
-    async def _keep_asking(self) -> None:
-        while True:
-            await self._wanted.wait()
-            self._wanted.clear()
-            if not self.size.height:
-                continue
-            rows, match = self.rows, self.match
-            limit = min(self.size.height, c.PAGE_LIMIT)
-            window = Window(match, self._top, limit, self.size.width)
-            self._asked_at = time.monotonic()
-            try:
-                listed = await self._look(rows, window)
-            except Unavailable as error:
-                self._has_failed = True
-                self.post_message(self.Failed(error))
-                continue
-            except RrError as error:
-                listed = refused(error, window)
-            finally:
-                self._took_s = time.monotonic() - self._asked_at
-            if self._has_failed:
-                self._has_failed = False
-                self.post_message(self.Failed(None))
-            if (rows, match) == (self.rows, self.match):
-                self._take(listed, window.offset)
-
-    def _take(self, listed: Listed, offset: int) -> None:
-        """Show the rows of an answer. The cursor stays on its row, if that is still visible."""
-        before = self.row
-        self._listed, self._offset = listed, offset
-        if before is not None and before.key and (now := self.row) is not None and now.key != before.key:
-            places = [offset + at for at, row in enumerate(listed.rows) if row.key == before.key]
-            self.cursor = places[0] if places else self.cursor
-        self._go(self.cursor)
-        if self.row != before:
-            self.post_message(self.Picked(self, self.row))
-        self._draw()
-
-    @property
-    def _room(self) -> int:
-        """The number of rows that have room below the heads."""
-        return self.size.height - bool(self._listed.heads)
-
-    def _known(self, number: int) -> Row | None:
-        at = number - self._offset
-        return self._listed.rows[at] if 0 <= at < len(self._listed.rows) else None
-
-    def _draw(self) -> None:
-        parts = (
-            self.rows.title,
-            f"{min(self.cursor + 1, self._listed.total)}/{self._listed.total}",
-            f"filter: {self.match}" if self.match else "",
-            f"not asked: {self._listed.notes[0]}" if self._listed.notes else "",
-        )
-        self.border_title = Text(_plain("  ".join(filter(None, parts))))  # Textual reads a str as markup
-        self.refresh()
-
-    def render_line(self, y: int) -> Strip:
-        """Draw a line, as Textual asks for it."""
-        width, heads, base = self.size.width, self._listed.heads, self.rich_style
-        if heads and y == 0:
-            return Strip([Segment(heads.rjust(width), base + Style(bold=True))]).adjust_cell_length(width, base)
-        number = self._top + y - bool(heads)
-        if number >= self._listed.total:
-            return Strip.blank(width, base)
-        row = self._known(number) or Row("", "…", style="dim")
-        style = base + Style.parse(row.style)
-        if number == self.cursor:
-            style += Style(reverse=True, bold=self.has_focus)
-        columns = _plain(row.columns)
-        width_left = width - cell_len(columns)
-        note = _fitted(_plain(row.note), width_left // 2)
-        room = width_left - cell_len(note) - (1 if note else 0)
-        text = Strip([Segment(_fitted(_plain(row.text), room), style)]).adjust_cell_length(
-            width_left - cell_len(note), style
-        )
-        return Strip([*text, Segment(note, style), Segment(columns, style)]).adjust_cell_length(width, style)
-
-
 _KEYS = """\
  1 to 5      the tree; resources; the events alone; streams; loads
  z           the pane alone, and back
@@ -291,11 +76,11 @@ _KEYS = """\
  /           filters the pane as you type; Enter keeps the filter
              in the events also event:KIND, child:ID and server:NAME
 
- K           kills the chosen child, after a question: y is yes
- t  r        stops the chosen child; starts it again
+ K  t        kills the chosen child; stops it; each after a question: y is yes
+ r           restarts the chosen child, or starts it if it is stopped
  u  p        unloads the query of the chosen row; gives it a priority
- U           takes the chosen resource away from all its holders
- R           revokes the chosen resource: y is yes
+ U  R        takes the chosen resource away from all its holders; revokes it;
+             each after a question
  q           leaves
 
  CPU is that since the last look. Of several children in one process the first
@@ -343,23 +128,15 @@ class Terminal(App[None]):
     #status.bad { color: $text-error; text-style: bold; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("K", "kill", "kill"),
         Binding("y", "confirm", show=False),
-        Binding("t", "terminate", "stop"),
-        Binding("r", "restart", "restart"),
-        Binding("u", "unload", "unload"),
-        Binding("U", "take_away", "all"),
-        Binding("R", "revoke", show=False),
+        *(Binding(key, f"do('{key}')", label, show=bool(label)) for key, label in KEYS.items()),
         Binding("p", "give_priority", show=False),
         Binding(
             "slash", "filter", "filter", key_display="/", priority=True
         ),  # the characters typed after it are never commands
         Binding("escape", "leave", "back", key_display="esc"),
-        Binding("1", "list_tree", show=False),
-        Binding("2", "list_resources", show=False),
+        *(Binding(sheet.key, f"list('{sheet.key}')", show=False) for sheet in SHEETS),
         Binding("3", "show_events", show=False),
-        Binding("4", "list_streams", show=False),
-        Binding("5", "list_loads", show=False),
         Binding("z", "zoom", show=False),
         Binding("s", "sort", show=False),
         Binding("question_mark", "help", "help", key_display="?"),
@@ -380,9 +157,8 @@ class Terminal(App[None]):
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
         self._happened = EventLines()
         # Kept, not looked up on the screen: an answer may arrive when the user leaves and the screen is empty.
-        self._tree, self._resources = TreeTable(), AllResources()  # sorted as last
-        self._streams, self._loads = AllStreams(), AllLoads()
-        self.left = Pane("tree", self._tree, self._look)
+        self._sheets = {sheet.key: SheetRows(sheet, tables_of(sheet)) for sheet in SHEETS}  # sorted as last
+        self.left = Pane("tree", next(iter(self._sheets.values())), self._look)
         self.right = Pane("chosen", Nothing(), self._look)
         self.events = Pane("events", Happenings(self._happened), self._look)
         self._sides = Horizontal(id="panes")
@@ -440,7 +216,7 @@ class Terminal(App[None]):
         self._show_status()
 
     def _show_status(self) -> None:
-        self._status_line.update(_plain(self.status))
+        self._status_line.update(plain(self.status))
         self._status_line.set_class(bool(self._lost) or self._is_bad, "bad")
 
     def _look_again(self) -> None:
@@ -481,40 +257,19 @@ class Terminal(App[None]):
             self._before.append((self.right.rows, self.right.match, self.right.cursor))
             self.right.show(Neighbours(message.row.resource, message.row.name))
 
-    def action_list_tree(self) -> None:
-        """Show the tree on the left."""
-        self._list(self._tree)
-
-    def action_list_resources(self) -> None:
-        """Show all resources on the left."""
-        self._list(self._resources)
-
-    def action_list_streams(self) -> None:
-        """Show all streams on the left."""
-        self._list(self._streams)
-
-    def action_list_loads(self) -> None:
-        """Show on the left the loads that wait, and how long those of each server did."""
-        self._list(self._loads)
-
-    def _list(self, rows: TreeTable | AllResources | AllStreams | AllLoads) -> None:
+    def action_list(self, key: str) -> None:
+        """Show the sheet of this key on the left."""
         if self._alone is not self.left:
             self._give_screen_to(None)
-        self.left.show(rows)
+        self.left.show(self._sheets[key])
         self.screen.set_focus(self.left)
 
     def action_sort(self) -> None:
         """Sort the list on the left by its next column."""
         rows = self.left.rows
-        if isinstance(rows, TreeTable):
-            self._tree = rows = rows.by_next()
-        elif isinstance(rows, AllResources):
-            self._resources = rows = rows.by_next()
-        elif isinstance(rows, AllStreams):
-            self._streams = rows = rows.by_next()
-        elif isinstance(rows, AllLoads):
-            self._loads = rows = rows.by_next()
-        self.left.show(rows, self.left.match)
+        if isinstance(rows, SheetRows):
+            self._sheets[rows.sheet.key] = rows = rows.by_next()
+            self.left.show(rows, self.left.match)
 
     def action_show_events(self) -> None:
         """Give the whole screen to the events."""
@@ -589,14 +344,26 @@ class Terminal(App[None]):
 
     # -- what is done ------------------------------------------------------------------------------------------------
 
-    def action_kill(self) -> None:
-        """Ask whether to kill the process of the chosen child."""
-        if (path := self._chosen_child("kill")) is not None:
-            self._ask_first(f"kill {path}", commands.Kill(path), f"{path} was not killed")
+    def action_do(self, key: str) -> None:
+        """Do what the key does to the chosen thing, or ask whether to, or say why it cannot be done."""
+        several = [one for one in ROW_COMMANDS if one.key == key]
+        row = self._chosen(several[0])
+        one = next((one for one in several if not one.obstacle(row)), None)
+        if one is None:
+            self._say(f"{several[0].label or several[0].name}: {several[0].obstacle(row)}", bad=True)
+        elif one.warning:
+            self._say(f"{one.said_of(row)}? y: yes, Esc: no. {one.warning}")
+            self._asked, self._declined = (one.said_of(row), one.command(row)), f"not done: {one.said_of(row)}"
+            self._question = self._said
+        else:
+            self._begin(one.said_of(row), one.command(row))
 
-    def _ask_first(self, what: str, command: Command[c.Done], declined: str) -> None:
-        self._say(f"{what}? y: yes, Esc: no")
-        self._asked, self._declined, self._question = (what, command), declined, self._said
+    def _chosen(self, command: RowCommand) -> Row:
+        """Return the row that a command is for: a child in the tree, or what is chosen in the pane with the focus."""
+        pane = self.left if command in CHILD_COMMANDS else self._focused_pane()
+        if isinstance(pane.rows, Neighbours) and command in RESOURCE_COMMANDS:
+            return Row(pane.rows.id, "", resource=pane.rows.id, name=pane.rows.name)
+        return pane.row or Row("", "")
 
     def action_confirm(self) -> None:
         """Do what the status line asks about; do nothing if the status line shows no question."""
@@ -604,47 +371,16 @@ class Terminal(App[None]):
             self._question = ""
             self._begin(*self._asked)
 
-    def action_terminate(self) -> None:
-        """Stop the chosen child."""
-        self._to_child("terminate", commands.Terminate)
-
-    def action_restart(self) -> None:
-        """Start the chosen child again."""
-        self._to_child("restart", commands.Restart)
-
-    def _to_child(self, verb: str, command: Callable[[str], Command[c.Done]]) -> None:
-        if (path := self._chosen_child(verb)) is not None:
-            self._begin(f"{verb} {path}", command(path))
-
-    def _chosen_child(self, verb: str) -> str | None:
-        row = self.left.row
-        if row is None or row.child is None:
-            self._say(f"{verb}: choose a child in the tree", bad=True)
-            return None
-        return row.child.path
-
-    def action_unload(self) -> None:
-        """Release the query of the chosen row."""
-        if query := self._chosen_query("unload", "; U takes it away from all"):
-            self._begin(f"unload query {short_id(query)}", commands.Unload(query))
-
-    def _chosen_query(self, verb: str, instead: str = "") -> str:
-        """Return the query of the chosen row, or "", and say that it has none."""
-        row = self._focused_pane().row
-        if row is None or not (row.query or row.resource):
-            self._say(f"{verb}: choose a resource or a holder on the right (Tab goes there)", bad=True)
-            return ""
-        if not row.query:
-            self._say(f"{verb}: it has not one holder: Enter shows them{instead}", bad=True)
-        return row.query
-
     def action_give_priority(self) -> None:
         """Have a priority typed for the query of the chosen row."""
-        if query := self._chosen_query("priority"):
-            self._needy = self._focused_pane(), query
-            self._number.value = ""
-            self._number.display = True
-            self.screen.set_focus(self._number)
+        row = self._focused_pane().row or Row("", "")
+        if why := no_query(row):
+            self._say(f"priority: {why.partition(';')[0]}", bad=True)
+            return
+        self._needy = self._focused_pane(), row.query
+        self._number.value = ""
+        self._number.display = True
+        self.screen.set_focus(self._number)
 
     @on(Input.Submitted, "#priority")
     def _give_priority(self, message: Input.Submitted) -> None:
@@ -662,27 +398,6 @@ class Terminal(App[None]):
         self.screen.set_focus(pane)
         self._number.display = False
         return query
-
-    def action_take_away(self) -> None:
-        """Take the chosen resource away from all its holders."""
-        if (chosen := self._chosen_resource("unload from all")) is not None:
-            id, name = chosen
-            self._begin(f"unload {name} from all", commands.Unload(id, force=True))
-
-    def action_revoke(self) -> None:
-        """Ask whether to revoke the chosen resource."""
-        if (chosen := self._chosen_resource("revoke")) is not None:
-            id, name = chosen
-            self._ask_first(f"revoke {name}", commands.Revoke(id, "revoked in top"), f"{name} was not revoked")
-
-    def _chosen_resource(self, verb: str) -> tuple[str, str] | None:
-        """Return the id and the name of the chosen resource, or say that none is chosen."""
-        row, shown = self._focused_pane().row, self._focused_pane().rows
-        id = shown.id if isinstance(shown, Neighbours) else row.resource if row and row.key == row.resource else ""
-        if row is None or not id:
-            self._say(f"{verb}: choose a resource on the right (Tab goes there)", bad=True)
-            return None
-        return id, (shown.name if isinstance(shown, Neighbours) else row.name) or short_id(id)
 
     def _begin(self, what: str, command: Command[c.Done]) -> None:
         self._say(f"{what} …")
@@ -724,7 +439,7 @@ class Terminal(App[None]):
         """Post the message that the system was reached, and take what has happened before. In a thread."""
         if self._welcome is None:
             with contextlib.suppress(RrError):
-                for record in self._link.ask(ListHistory(), _LOOK_S * _SHARE).records:
+                for record in self._link.ask(ListHistory(), _WELCOME_S).records:
                     self._happened.take(event_of(record))
                 self._heard += 1
         self.post_message(self.Found(welcome))
@@ -749,7 +464,7 @@ class Terminal(App[None]):
             self._say(f"system {welcome.system} was started again: pid {welcome.pid}")
         else:
             self._say(f"system {welcome.system} is reached again")
-        self._headline.update(_plain(f"rr-actors top  system {welcome.system}  pid {welcome.pid}  {welcome.state_dir}"))
+        self._headline.update(plain(f"rr-actors top  system {welcome.system}  pid {welcome.pid}  {welcome.state_dir}"))
         self.left.ask()
         self.right.ask()
 
@@ -764,17 +479,3 @@ class Terminal(App[None]):
         elif self._silence and self._said.endswith(self._silence):
             self._silence = ""
             self._say("the system answers again")
-
-
-def _plain(text: str) -> str:
-    """Return a text in which dots replace the characters that could control a terminal."""
-    return text if text.isprintable() else "".join(char if char.isprintable() else "·" for char in text)
-
-
-def _fitted(text: str, width: int) -> str:
-    """Return a text cut to a width in cells."""
-    if cell_len(text) <= width:
-        return text
-    while text and (over := cell_len(text) + 1 - width) > 0:
-        text = text[: -max(1, over // 2)]  # a character has two cells at most
-    return f"{text}…" if width > 0 else ""

@@ -23,6 +23,7 @@ from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.explanations import bytes_text, name_of_resource, rate_text, since
 from rr_actors.tools.process_usage import usage_of
+from rr_actors.tools.tables.table import STATE_STYLES, Asks, Row
 from rr_actors.tools.terminal.child_logs import line_texts
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_of
 
@@ -33,38 +34,16 @@ _LEVEL_STYLES = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red"}
 _A = TypeVar("_A")
 
 
-class Asks(Protocol):
-    """An object that answers questions to the system: a ConsoleLink."""
+@dataclass(frozen=True)
+class Hasty:
+    """A link to the system on which each question has a time limit."""
+
+    link: Asks
+    limit_s: float
 
     def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
         """Send a question or a command, and return its answer."""
-        ...
-
-
-@dataclass(frozen=True)
-class Row:
-    """A line of a pane.
-
-    Attributes:
-        key: the id of the thing that it shows; the cursor stays on the row of the same key.
-        text, note: at the left and the right of the line.
-        columns: cells of fixed widths, at the right of the note.
-        style: Rich's words for its colour.
-        child, registrar, resource: the thing that Enter opens; None or "" for none.
-        query: the query that `unload` releases on this row.
-        name: the name of the resource that Enter opens.
-    """
-
-    key: str
-    text: str
-    note: str = ""
-    style: str = ""
-    child: c.ChildRow | None = None
-    registrar: str = ""
-    resource: str = ""
-    query: str = ""
-    name: str = ""
-    columns: str = ""
+        return self.link.ask(request, timeout_s or self.limit_s)
 
 
 Lines: TypeAlias = list[Row]
@@ -351,7 +330,6 @@ def _age(id: str) -> str:
 
 
 _BAD = frozenset(("load_failed", "unload_failed", "pause_failed", "start_failed", "gave_up", "dead_letter"))
-STATE_STYLES = {"WARNING": "yellow", "ERROR": "red", "FATAL": "red", "revoked": "red"}
 
 
 def _resource(row: ResourceRow) -> Row:

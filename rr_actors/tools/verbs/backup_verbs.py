@@ -13,7 +13,7 @@ from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import BackUp
 from rr_actors.system.system import System
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json
-from rr_actors.tools.verbs.console_verbs import DryRun, Timeout
+from rr_actors.tools.verbs.console_options import DryRun, Timeout
 
 app = typer.Typer()
 

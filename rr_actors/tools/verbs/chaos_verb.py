@@ -12,7 +12,7 @@ import typer
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_table
 from rr_actors.tools.random_kills import KillPlan, KillReport, RandomKills
-from rr_actors.tools.verbs.console_verbs import DryRun, Timeout, complete_child
+from rr_actors.tools.verbs.console_options import DryRun, Timeout, complete_child
 
 app = typer.Typer()
 

@@ -3,445 +3,60 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import msgspec
 import typer
 
-from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import NotRunning, RrError, UnknownQuery, UsageError, did_you_mean, shown
-from rr_actors.base.names import short_ids
+from rr_actors.base.errors import NotRunning, UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.hosting.forwarded_logs import LogLine
-from rr_actors.registrar.pages import CONDITIONS, LoadRow, ResourceRow
 from rr_actors.supervision.event_history import Record, left_records, records_of
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
-from rr_actors.system.console.console_client import ConsoleClient, find_console
-from rr_actors.system.console.console_view import Command
+from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools import graphs
-from rr_actors.tools.cli_commands import (
-    JsonOption,
-    StateOption,
-    WatchOption,
-    say,
-    say_json,
-    say_lines,
-    say_picture,
-    say_table,
-    shown_again,
-)
-from rr_actors.tools.explanations import (
-    LOADS_HEADS,
-    NO_LOAD_WAITS,
-    WAITING_HEADS,
-    explain,
-    explain_actor,
-    loads_cells,
-    waiting_cells,
-)
-from rr_actors.tools.process_usage import usage_of
+from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_picture
+from rr_actors.tools.explanations import explain, explain_actor
+from rr_actors.tools.process_usage import facts_of
 from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
 from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
+from rr_actors.tools.verbs.console_options import (
+    SHOWN,
+    ChildArgument,
+    DryRun,
+    Limit,
+    ParentOption,
+    Timeout,
+    carry_out,
+    client_of,
+    completing,
+    list_children,
+    list_children_or_resources,
+    list_children_or_targets,
+    list_registrars,
+    list_resources,
+    list_servers,
+    list_targets,
+)
 
 app = typer.Typer()
 
-_GRACE_S = 10.0  # for an answer, added to the time limit of the command
 _UNLOAD_S = 60.0  # for the unload callbacks, after a grace
 _LATEST = 10  # records of a child that its status shows
-_SHOWN = 200  # rows of a list, unless more are asked for
-_COMPLETED = 50
+_PART = "its beginning or end, or a resource's name"
 _TICK_S = 0.1  # while nothing happens, lines that are settled are printed so often
 
 
-# -- options that commands share -------------------------------------------------------------------------------------
-
-
-def _completing(list_them: Callable[[ConsoleClient, str], list[str]]) -> Callable[[typer.Context, str], list[str]]:
-    """Return a function that lists a shell's completions of an argument; none if no running system can be asked."""
-
-    def complete(context: typer.Context, incomplete: str) -> list[str]:
-        try:
-            with _client(context.params.get("state")) as client:
-                found = list_them(client, incomplete)
-        except (RrError, OSError):
-            return []
-        return [text for text in found if text.startswith(incomplete)][:_COMPLETED]
-
-    return complete
-
-
-def _children(client: ConsoleClient, incomplete: str) -> list[str]:
-    rows = [row for row in client.children().rows if row.depth]
-    return [row.path if "/" in incomplete else row.id for row in rows]
-
-
-def _servers(client: ConsoleClient, _incomplete: str) -> list[str]:
-    return [server for row in client.registrars().rows for server in row.servers]
-
-
-def _registrars(client: ConsoleClient, _incomplete: str) -> list[str]:
-    return [row.name for row in client.registrars().rows]
-
-
-def _resources(client: ConsoleClient, incomplete: str) -> list[str]:
-    return [row.id for row in client.resources(match=incomplete, limit=_COMPLETED).rows]
-
-
-def _children_or_resources(client: ConsoleClient, incomplete: str) -> list[str]:
-    return _children(client, incomplete) + _resources(client, incomplete)
-
-
-def _queries(client: ConsoleClient, incomplete: str) -> list[str]:
-    return [row.id for row in client.queries(match=incomplete, limit=_COMPLETED).rows]
-
-
-def _targets(client: ConsoleClient, incomplete: str) -> list[str]:
-    return list(dict.fromkeys(_resources(client, incomplete) + _queries(client, incomplete)))
-
-
-def _children_or_targets(client: ConsoleClient, incomplete: str) -> list[str]:
-    return _children(client, incomplete) + _targets(client, incomplete)
-
-
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say what would be done.")]
-Timeout = Annotated[
-    float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=c.TIMEOUT_LIMIT_S, help="How long it may take.")
-]
-Limit = Annotated[int, typer.Option("--limit", min=1, help="Show at most so many.")]
-RowLimit = Annotated[
-    int | None,
-    typer.Option("--limit", min=1, show_default=False, help=f"Show at most so many; {_SHOWN} in a table, else all."),
-]
-complete_child = _completing(_children)
-ChildArgument = Annotated[
-    str, typer.Argument(metavar="ID", help="A child's id, or its path.", autocompletion=complete_child)
-]
-
-
-Output = Annotated[
-    Literal["json", "wide", "name"] | None,
-    typer.Option(
-        "--output", "-o", help="json: as --json; wide: shorten nothing; name: a name that commands take a line."
-    ),
-]
-
-
-def _client(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleClient:
-    return ConsoleClient(find_console(state), timeout_s=timeout_s + _GRACE_S)
-
-
-def _carry_out(state: Path | None, command: Command[c.Done], as_json: bool = False, timeout_s: float = 60.0) -> c.Done:
-    """Send a command to the running system, and print what it has done."""
-    with _client(state, timeout_s) as client:
-        done = client.ask(command)
-    if as_json:
-        say_json({"done": done.text, **done.facts})
-    else:
-        say(done.text)
-    return done
-
-
 # -- looking ---------------------------------------------------------------------------------------------------------
-
-
-@app.command(epilog="Example: rr-actors ps --json | jq '.[] | select(.state != \"running\")'")
-def ps(
-    output: Output = None,
-    sort_by: Annotated[
-        Literal["up", "restarts", "cpu", "memory"] | None, typer.Option("--sort-by", help="The most first.")
-    ] = None,
-    watch: WatchOption = False,
-    state: StateOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its start) and memory."""
-    shown_again(watch, lambda: _show_children(state, sort_by, output, as_json))
-
-
-def _show_children(state: Path | None, sort_by: str | None, output: str | None, as_json: bool) -> None:
-    with _client(state) as client:
-        rows = client.children().rows
-    usages = {row.pid: usage_of(row.pid) for row in rows if row.pid is not None}
-    if sort_by is not None:
-        key = {"up": "up_s", "cpu": "cpu_percent", "memory": "memory_bytes"}.get(sort_by, sort_by)
-        rows = sorted(rows, key=lambda row: _child_facts(row, usages)[key] or 0, reverse=True)
-    if as_json or output == "json":
-        say_json([_child_facts(row, usages) for row in rows])
-        return
-    if output == "name":
-        say_lines("\n".join(row.path for row in rows))
-        return
-    heads = ("child", "state", "pid", "up", "restarts", "cpu", "memory", "")
-    table: list[tuple[str, ...]] = []
-    seen: set[int] = set()
-    for row in rows:
-        usage = usages.get(row.pid) if row.pid is not None and row.pid not in seen else None
-        seen.add(row.pid or 0)
-        cells = (
-            "  " * row.depth + row.id if sort_by is None else row.path,
-            row.state,
-            "" if row.pid is None else str(row.pid),
-            "" if row.up_s is None else ago(row.up_s),
-            str(row.restarts),
-            "" if usage is None else f"{usage.cpu_percent:.1f} %",
-            "" if usage is None else f"{usage.memory_bytes / 2**20:.0f} MiB",
-            row.error or row.note or row.strategy,
-        )
-        table.append(cells)
-    say_table(heads, table, gives_way=("",), right=("pid", "up", "restarts", "cpu"))
-
-
-def _child_facts(row: c.ChildRow, usages: dict[int, Any]) -> dict[str, Any]:
-    usage = None if row.pid is None else usages.get(row.pid)
-    used = {"cpu_percent": None, "memory_bytes": None} if usage is None else msgspec.to_builtins(usage)
-    return {name: getattr(row, name) for name in row.__struct_fields__} | used
-
-
-@app.command(epilog="Example: rr-actors resources /dev/video --registrar cameras")
-def resources(
-    match: Annotated[
-        str, typer.Argument(help="Only those with this text in their id, server, request or status.")
-    ] = "",
-    registrar: Annotated[str, typer.Option(help="Only this one's.", autocompletion=_completing(_registrars))] = "",
-    limit: RowLimit = None,
-    status: Annotated[
-        list[str] | None, typer.Option(help="Only those in this state, OK or loading for instance; may be repeated.")
-    ] = None,
-    holder: Annotated[
-        str, typer.Option(help="Only those that this registrar holds.", autocompletion=_completing(_registrars))
-    ] = "",
-    sort_by: Annotated[
-        Literal["resource", "state", "holders"] | None, typer.Option("--sort-by", help="The most holders first.")
-    ] = None,
-    wide: Annotated[bool, typer.Option("--wide", help="Shorten no request to fit the terminal.")] = False,
-    output: Output = None,
-    watch: WatchOption = False,
-    state: StateOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """List the resources of the running system, and who holds each."""
-    shown_again(
-        watch,
-        lambda: _show_resources(
-            state,
-            match,
-            registrar,
-            limit,
-            status,
-            holder,
-            sort_by,
-            "wide" if wide and output is None else output,
-            as_json,
-        ),
-    )
-
-
-def _show_resources(
-    state: Path | None,
-    match: str,
-    registrar: str,
-    limit: int | None,
-    status: list[str] | None,
-    holder: str,
-    sort_by: str | None,
-    output: str | None,
-    as_json: bool,
-) -> None:
-    known = {one.lower() for one in CONDITIONS}
-    if wrong := [one for one in status or () if one.lower() not in known]:
-        raise UsageError(f"--status: expected one of {', '.join(reversed(CONDITIONS))}, got {shown(wrong[0])}")
-    chooses = bool(status or holder or sort_by)
-    most = _most(limit, "json" if as_json else output)
-    with _client(state) as client:
-        page = client.resources(registrar, match, sys.maxsize if chooses else most)
-    if chooses:
-        page = _chosen(page, {one.lower() for one in status or ()}, holder, sort_by, most)
-    if as_json or output == "json":
-        say_json(page.rows)
-        _say_what_is_missing(page.total - len(page.rows), page.notes)
-        return
-    if not page.rows:
-        chosen = match or registrar or status or holder
-        say("no resource matches" if chosen else "there are no resources", err=True)
-    if output == "name":
-        say_lines("\n".join(f"{row.server} {row.request}" for row in page.rows))
-        _say_what_is_missing(page.total - len(page.rows), page.notes)
-        return
-    table: list[tuple[str, ...]] = []
-    ids = short_ids(row.id for row in page.rows)
-    for row in page.rows:
-        shown_state = row.condition if row.phase == "loaded" else f"{row.condition} {row.message}".rstrip()
-        name = f"{row.server} {row.request}"
-        table.append((name, shown_state, row.needed, str(row.holder_count), row.held_by, ids[row.id]))
-    if table:
-        heads = ("resource", "state", "priority", "holders", "held by", "id")
-        right = ("priority", "holders")
-        say_table(heads, table, gives_way=("resource", "state"), right=right, wide=output == "wide")
-    _say_what_is_missing(page.total - len(page.rows), page.notes)
-
-
-def _most(limit: int | None, output: str | None) -> int:
-    """Return how many rows are shown at most: all in a form for programs, which would take a part for the whole."""
-    if limit is not None:
-        return limit
-    return sys.maxsize if output in ("json", "name") else _SHOWN
-
-
-def _say_what_is_missing(left_out: int, notes: Sequence[str], more: str = "more") -> None:
-    """Say on the error output how many rows are left out, and who was not asked."""
-    if left_out > 0:
-        say(f"{left_out} {more}: choose with MATCH, or raise --limit", err=True)
-    for note in notes:
-        say(f"not asked: {note}", err=True)
-
-
-def _chosen(page: c.Resources, states: set[str], holder: str, sort_by: str | None, limit: int) -> c.Resources:
-    """Return the rows of these states and this holder, in order. Of a resource's holders the first 20 are known."""
-    rows = [
-        row
-        for row in page.rows
-        if (not states or states & {row.condition.lower(), row.state.lower()})
-        and (not holder or any(one.origin == holder for one in row.holders))
-    ]
-    keys: dict[str, Callable[[ResourceRow], Any]] = {
-        "resource": lambda row: (row.server, row.request),
-        "state": lambda row: row.condition,
-        "holders": lambda row: -row.holder_count,
-    }
-    if sort_by is not None:
-        rows.sort(key=keys[sort_by])
-    return c.Resources(len(rows), rows[:limit], page.notes)
-
-
-@app.command(epilog="Example: rr-actors usage --sort-by memory_bytes --registrar programs")
-def usage(
-    match: Annotated[
-        str, typer.Argument(help="Only those with this text in their id, server, request or status.")
-    ] = "",
-    registrar: Annotated[str, typer.Option(help="Only this one's.", autocompletion=_completing(_registrars))] = "",
-    sort_by: Annotated[
-        str, typer.Option("--sort-by", metavar="NUMBER", help="The most of it first: cpu or memory_bytes, say.")
-    ] = "",
-    limit: RowLimit = None,
-    output: Output = None,
-    watch: WatchOption = False,
-    state: StateOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Show what each resource uses now, CPU and memory for instance, of servers that can say it."""
-    shown_again(watch, lambda: _show_usages(state, match, registrar, sort_by, limit, output, as_json))
-
-
-def _show_usages(
-    state: Path | None, match: str, registrar: str, sort_by: str, limit: int | None, output: str | None, as_json: bool
-) -> None:
-    with _client(state) as client:
-        page = client.usages(registrar, match)
-    rows = [row for row in page.rows if row.usage or row.failure]
-    names = list(dict.fromkeys(name for row in rows for name in row.usage))
-    if sort_by:
-        if sort_by not in names:
-            raise UsageError(f"--sort-by: expected one of {', '.join(names) or 'no numbers'}, got {shown(sort_by)}")
-        rows.sort(key=lambda row: row.usage.get(sort_by, -math.inf), reverse=True)
-    total, rows = len(rows), rows[: _most(limit, "json" if as_json else output)]
-    if as_json or output == "json":
-        say_json([msgspec.structs.asdict(row) for row in rows])
-        _say_what_is_missing(total - len(rows), page.notes)
-        return
-    if output == "name":
-        say_lines("\n".join(f"{row.server} {row.request}" for row in rows))
-        _say_what_is_missing(total - len(rows), page.notes)
-        return
-    ids = short_ids(row.id for row in rows)
-    table = [
-        (f"{row.server} {row.request}", *(_amount(name, row.usage.get(name)) for name in names), ids[row.id])
-        for row in rows
-        if row.usage
-    ]
-    if table:
-        heads = ("resource", *(name.removesuffix("_bytes") for name in names), "id")
-        say_table(heads, table, gives_way=("resource",), right=heads[1:-1], wide=output == "wide")
-    elif not rows:
-        say("no resource says what it uses", err=True)
-    for row in rows:
-        if row.failure:
-            say(f"not known: {row.name} ({ids[row.id]}): {row.failure}", err=True)
-    _say_what_is_missing(total - len(rows), page.notes)
-
-
-@app.command(epilog="Example: rr-actors loads cameras --sort-by p95 --watch")
-def loads(
-    match: Annotated[str, typer.Argument(help="Only those with this text in their id, server or request.")] = "",
-    registrar: Annotated[
-        str,
-        typer.Option(
-            help="Only loads that this one waits for, and its servers.", autocompletion=_completing(_registrars)
-        ),
-    ] = "",
-    sort_by: Annotated[
-        Literal["loads", "shared", "waited", "failed", "mean", "p95", "longest"] | None,
-        typer.Option("--sort-by", help="The server with the most of it first."),
-    ] = None,
-    limit: Limit = _SHOWN,
-    watch: WatchOption = False,
-    state: StateOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Show which loads wait now, and how often and how long loads of each server had to wait.
-
-    A load is shared if it joins a resource that is loaded, or is being loaded. It has waited if it was not answered at
-    once. The times are those of load callbacks: the mean and the longest of all, p95 of the newest 500.
-    """
-    shown_again(watch, lambda: _show_loads(state, match, registrar, sort_by, limit, as_json))
-
-
-def _show_loads(state: Path | None, match: str, registrar: str, sort_by: str | None, limit: int, as_json: bool) -> None:
-    with _client(state) as client:
-        found = client.loads(registrar, match)
-        servers = found.servers
-        if sort_by is not None:
-            servers = sorted(servers, key=_LOAD_ORDERS[sort_by], reverse=True)
-        if as_json:
-            say_json({"waiting": found.rows, "servers": servers})
-            _say_what_is_missing(found.total - len(found.rows), found.notes, "more wait")
-            return
-        waiting = [waiting_cells(client.ask, row) for row in found.rows[:limit]]
-    if waiting:
-        say_table(WAITING_HEADS, waiting, gives_way=("to load", "for what", "because"), right=("waits for",))
-    else:
-        say(NO_LOAD_WAITS)
-    if servers:
-        say("")
-        say_table(LOADS_HEADS, [loads_cells(row) for row in servers], gives_way=("server",), right=LOADS_HEADS[1:])
-    _say_what_is_missing(found.total - len(waiting), found.notes, "more wait")
-
-
-_LOAD_ORDERS: dict[str, Callable[[LoadRow], float]] = {
-    "loads": lambda row: row.loads,
-    "shared": lambda row: row.shared,
-    "waited": lambda row: row.waited,
-    "failed": lambda row: row.failed,
-    "mean": lambda row: row.mean_s,
-    "p95": lambda row: row.p95_s,
-    "longest": lambda row: row.longest_s,
-}
-
-
-def _amount(name: str, number: float | None) -> str:
-    """Return the text for one number of a usage."""
-    if number is None:
-        return ""
-    return f"{number / 2**20:.0f} MiB" if name.endswith("_bytes") else f"{number:.6g}"
 
 
 @app.command(epilog="Example: rr-actors events --follow --event exited --event restarted --json")
@@ -450,10 +65,10 @@ def events(
     event: Annotated[list[str] | None, typer.Option(help="Only events of this kind; may be repeated.")] = None,
     about: Annotated[str, typer.Option(help="Only those with this text in their kind, subject or words.")] = "",
     child: Annotated[
-        str, typer.Option(help="Only of this child and all below it.", autocompletion=_completing(_children))
+        str, typer.Option(help="Only of this child and all below it.", autocompletion=completing(list_children))
     ] = "",
     server: Annotated[
-        str, typer.Option(help="Only of this server or registrar.", autocompletion=_completing(_servers))
+        str, typer.Option(help="Only of this server or registrar.", autocompletion=completing(list_servers))
     ] = "",
     count: Annotated[int | None, typer.Option(min=1, help="End after so many.")] = None,
     state: StateOption = None,
@@ -477,7 +92,7 @@ def events(
         for line in known.lines(wanted)[-(count or 20) :]:
             say(str(line))
         return
-    with _client(state) as client:
+    with client_of(state) as client:
         left = sys.maxsize if count is None else count
         for lines in _following(client, wanted, as_json):
             for line in lines[:left]:
@@ -516,7 +131,7 @@ def _say_facts(events: list[c.Event]) -> None:
 def _history(state: Path | None, child: str, limit: int) -> list[Record]:
     """Return the records of a running system, or those that it has left in its state directory."""
     try:
-        with _client(state) as client:
+        with client_of(state) as client:
             found = client.ask(questions.ListHistory(child, limit))
     except NotRunning:
         records = left_records(state) if state is not None else []
@@ -539,7 +154,7 @@ def _say_missed(missed: c.Missed, as_json: bool) -> None:
 
 @app.command(epilog="Example: rr-actors history root/cameras")
 def history(
-    child: Annotated[str, typer.Argument(metavar="[ID]", autocompletion=_completing(_children))] = "",
+    child: Annotated[str, typer.Argument(metavar="[ID]", autocompletion=completing(list_children))] = "",
     limit: Limit = 100,
     state: StateOption = None,
     as_json: JsonOption = False,
@@ -572,7 +187,7 @@ def logs(
     """
     if follow and previous:
         raise UsageError("--previous: expected no --follow with it, as a process that has ended logs no more")
-    with _client(state) as client:
+    with client_of(state) as client:
         log = log_of(client, child, lines, previous=previous)
         text = LogText(log.path, [] if as_json else records_of_child(client, log.path))
         _say_log(log.path, log.lines, text, as_json)
@@ -603,7 +218,7 @@ def stack(
     child: ChildArgument, timeout_s: Timeout = 5.0, state: StateOption = None, as_json: JsonOption = False
 ) -> None:
     """Show where each thread of a child's process is now, also if the child is stuck."""
-    with _client(state, timeout_s) as client:
+    with client_of(state, timeout_s) as client:
         found = client.ask(questions.ListStacks(child, timeout_s))
     if as_json:
         say_json({"path": found.path, **msgspec.to_builtins(found.stacks)})
@@ -617,17 +232,6 @@ def stack(
             place, *source = frame.splitlines()
             say(f"    {place}")
             say_lines("\n".join(source), "        ")
-
-
-@app.command("dead-letters", epilog="Example: rr-actors dead-letters --limit 5")
-def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
-    """Show how many messages could not be delivered, and the newest of them."""
-    with _client(state) as client:
-        letters = client.ask(questions.ListDeadLetters(min(limit, c.PAGE_LIMIT)))
-    if as_json:
-        say_json({"count": letters.count, "letters": letters.letters})
-    else:
-        say_lines(str(DeadLetters(letters.count, letters.letters)))
 
 
 @app.command(epilog="Example: rr-actors top --state rr_state")
@@ -666,7 +270,7 @@ def why(
         str,
         typer.Argument(
             help="The id of a query or resource, its beginning or end, or a resource's name; or an actor's id or path.",
-            autocompletion=_completing(_children_or_targets),
+            autocompletion=completing(list_children_or_targets),
         ),
     ],
     state: StateOption = None,
@@ -675,7 +279,7 @@ def why(
 
     An actor that asks waits for the one that it has asked. If these wait for each other, the ring is named.
     """
-    with _client(state) as client:
+    with client_of(state) as client:
         for line in explain_actor(lambda one: client.ask(questions.LookAtMailbox(one)).mailbox, id) or explain(
             client, id
         ):
@@ -695,7 +299,7 @@ def graph(
         typer.Option("--format", help="dot is for Graphviz; png needs the program rsvg-convert."),
     ] = "mermaid",
     of: Annotated[Literal["tree", "dependencies", "both"], typer.Option("--of", help="What to draw.")] = "both",
-    limit: Limit = _SHOWN,
+    limit: Limit = SHOWN,
     inputs: Annotated[str, typer.Option(metavar="JSON", help="Of `run`: what the first actions are given.")] = "{}",
     start: Annotated[str, typer.Option("--from", metavar="ACTION", help="Of `change`: what runs then.")] = "",
     timeout_s: Timeout = 3600.0,
@@ -722,7 +326,7 @@ def graph(
         else:
             action_graphs.run(file, state, inputs, timeout_s)
         return
-    with _client(state) as client:
+    with client_of(state) as client:
         rows = client.children().rows
         page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
     draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
@@ -737,7 +341,7 @@ def wait(
         str,
         typer.Argument(
             help="A child's id or path; or a resource's name, or its id, or the beginning or end of that.",
-            autocompletion=_completing(_children_or_resources),
+            autocompletion=completing(list_children_or_resources),
         ),
     ],
     wanted: Annotated[
@@ -755,7 +359,7 @@ def wait(
 ) -> None:
     """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if in vain."""
     began = time.monotonic()
-    done, seen = wait_for(lambda: _client(state), target, wanted, timeout_s)
+    done, seen = wait_for(lambda: client_of(state), target, wanted, timeout_s)
     waited_s = round(time.monotonic() - began, 1)
     if as_json:
         say_json({"target": target, "state": seen, "waited_s": waited_s, "done": done})
@@ -770,7 +374,7 @@ def wait(
 
 @app.command(epilog="Example: rr-actors load cameras/camera '\"/dev/video0\"' --hold")
 def load(
-    server: Annotated[str, typer.Argument(help="REGISTRAR/SERVER.", autocompletion=_completing(_servers))],
+    server: Annotated[str, typer.Argument(help="REGISTRAR/SERVER.", autocompletion=completing(list_servers))],
     request: Annotated[str, typer.Argument(metavar="REQUEST-AS-JSON", help="The request: '\"front\"', '{\"x\": 1}'.")],
     hold: Annotated[
         bool, typer.Option("--hold", help="Hold it, by the system's registrar `console`, until unload.")
@@ -778,7 +382,7 @@ def load(
     holder: Annotated[
         str,
         typer.Option(
-            "--as", metavar="NAME", help="Hold it in this registrar's name.", autocompletion=_completing(_registrars)
+            "--as", metavar="NAME", help="Hold it in this registrar's name.", autocompletion=completing(list_registrars)
         ),
     ] = "",
     priority: Annotated[str, typer.Option(help="From -1000 to 1000, or `standby`.")] = "0",
@@ -791,7 +395,7 @@ def load(
     keep = hold or bool(holder)
     urgency = commands.priority_from("--priority", priority)
     command = commands.Load(server, request, holder, keep, timeout_s, dry_run, urgency)
-    done = _carry_out(state, command, as_json, timeout_s)
+    done = carry_out(state, command, as_json, timeout_s)
     if "response" in done.facts and not as_json:
         say_json(done.facts["response"])
 
@@ -802,7 +406,7 @@ def load(
 )
 def priority(
     id: Annotated[
-        str, typer.Argument(help="The id of a query, its beginning or end.", autocompletion=_completing(_targets))
+        str, typer.Argument(help="The id of a query, its beginning or end.", autocompletion=completing(list_targets))
     ],
     value: Annotated[str, typer.Argument(metavar="PRIORITY", help="From -1000 to 1000, or `standby`.")],
     state: StateOption = None,
@@ -810,7 +414,7 @@ def priority(
     dry_run: DryRun = False,
 ) -> None:
     """Give a query of any holder a priority; what its resource depends on follows."""
-    _carry_out(state, commands.GivePriority(id, commands.priority_from("PRIORITY", value), dry_run), as_json)
+    carry_out(state, commands.GivePriority(id, commands.priority_from("PRIORITY", value), dry_run), as_json)
 
 
 @app.command(epilog="Example: rr-actors unload 01a2085d3f7c")
@@ -820,7 +424,7 @@ def unload(
         typer.Argument(
             help="The id of a query, its beginning or end, or a resource's name; with --force also a resource's id, or "
             "a server that is not registered.",
-            autocompletion=_completing(_targets),
+            autocompletion=completing(list_targets),
         ),
     ],
     force: Annotated[bool, typer.Option("--force", help="Take the resource away from all its holders.")] = False,
@@ -830,17 +434,12 @@ def unload(
     dry_run: DryRun = False,
 ) -> None:
     """Release a query of any holder; with --force take a resource away from all its holders, which hear FATAL."""
-    _carry_out(state, commands.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
+    carry_out(state, commands.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
 
 
 @app.command(epilog="Example: rr-actors revoke 'cameras/camera \"/dev/video0\"' 'low battery' --grace 10")
 def revoke(
-    id: Annotated[
-        str,
-        typer.Argument(
-            help="The resource's id, its beginning or end, or its name.", autocompletion=_completing(_resources)
-        ),
-    ],
+    id: Annotated[str, typer.Argument(help=f"The resource's id, {_PART}.", autocompletion=completing(list_resources))],
     why: Annotated[str, typer.Argument(help="The reason, which its holders hear.")],
     grace_s: Annotated[
         float,
@@ -853,7 +452,7 @@ def revoke(
     dry_run: DryRun = False,
 ) -> None:
     """Take a resource away from its holders in its owner's name: what depends on it ends first, or replaces it."""
-    _carry_out(state, commands.Revoke(id, why, grace_s, dry_run), as_json, grace_s + _UNLOAD_S)
+    carry_out(state, commands.Revoke(id, why, grace_s, dry_run), as_json, grace_s + _UNLOAD_S)
 
 
 @app.command(epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'")
@@ -863,7 +462,7 @@ def status(
         typer.Argument(
             metavar="CHILD|SERVER/RESOURCE",
             help="A child's id or path; or a resource's id, its beginning or end, after its server; or its name.",
-            autocompletion=_completing(_children_or_resources),
+            autocompletion=completing(list_children_or_resources),
         ),
     ],
     said: Annotated[str, typer.Argument(metavar="[STATE]", help="OK, UPDATE, WARNING, ERROR or FATAL.")] = "",
@@ -881,23 +480,23 @@ def status(
         raise UsageError(f"STATE: expected {', '.join(states)}, got {shown(said)}")
     before, _, id = target.rpartition("/") if " " not in target else ("", "", target)
     registrar = before.partition("/")[0]
-    _carry_out(state, commands.SendStatus(id, cast("Any", said.upper()), message, registrar, dry_run), as_json)
+    carry_out(state, commands.SendStatus(id, cast("Any", said.upper()), message, registrar, dry_run), as_json)
 
 
 def _show_status(state: Path | None, target: str, as_json: bool) -> None:
     """Show a child with its latest history, or explain a resource; exit code 1 if a child does not run."""
-    with _client(state) as client:
+    with client_of(state) as client:
         if (row := child_of(client, target)) is None:
             try:
                 lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
             except UnknownQuery as error:
-                hint = did_you_mean(target, _children(client, target))
+                hint = did_you_mean(target, list_children(client, target))
                 raise UnknownQuery(f"{error}{hint}", query_id=target) from error
             say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
             return
         served = [one for one in client.registrars().rows if one.name == row.id]
         records = client.ask(questions.ListHistory(row.path, _LATEST)).records
-    facts = _child_facts(row, {row.pid: usage_of(row.pid)} if row.pid is not None else {})
+    facts = facts_of(row)
     if as_json:
         say_json(facts | {"registrars": served, "history": [_facts(event_of(record)) for record in records]})
     else:
@@ -932,7 +531,7 @@ def kill(
     dry_run: DryRun = False,
 ) -> None:
     """Send a signal to a child's process; if the child ends, its supervisor handles that as any end."""
-    _carry_out(state, commands.Kill(child, _signal_number(signal_name), dry_run), as_json)
+    carry_out(state, commands.Kill(child, _signal_number(signal_name), dry_run), as_json)
 
 
 def _signal_number(text: str) -> int:
@@ -949,7 +548,7 @@ def terminate(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
     """Stop a child in order. It stays stopped until restart; a temporary child is forgotten."""
-    _carry_out(state, commands.Terminate(child, dry_run), as_json)
+    carry_out(state, commands.Terminate(child, dry_run), as_json)
 
 
 @app.command(epilog="Example: rr-actors restart cameras")
@@ -957,7 +556,7 @@ def restart(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
     """Start a child again. If it runs, it is stopped in order first."""
-    _carry_out(state, commands.Restart(child, dry_run), as_json)
+    carry_out(state, commands.Restart(child, dry_run), as_json)
 
 
 @app.command(epilog="Example: rr-actors start lidar.toml --under root/sensors")
@@ -969,9 +568,7 @@ def start(
             help="actor = 'module:class', id = ...; or a supervisor. With --id: a JSON list of arguments.",
         ),
     ],
-    under: Annotated[
-        str, typer.Option(help="The path of its supervisor. Default: the root.", autocompletion=_completing(_children))
-    ] = "",
+    under: ParentOption = "",
     id: Annotated[str, typer.Option(help="The id of a child of a dynamic supervisor, which has the class.")] = "",
     state: StateOption = None,
     as_json: JsonOption = False,
@@ -982,7 +579,7 @@ def start(
         text = spec if id else Path(spec).read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{spec}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    _carry_out(state, commands.StartChild(text, under, "" if id else spec, dry_run, id), as_json)
+    carry_out(state, commands.StartChild(text, under, "" if id else spec, dry_run, id), as_json)
 
 
 @app.command(epilog="Example: rr-actors shutdown --state rr_state")
@@ -994,10 +591,10 @@ def shutdown(
 ) -> None:
     """Stop the whole system in order, as its own stop() does. A program that waits for the system's end goes on."""
     if not wait or dry_run:
-        _carry_out(state, commands.ShutDown(dry_run), as_json)
+        carry_out(state, commands.ShutDown(dry_run), as_json)
         return
-    with _client(state) as client:
+    with client_of(state) as client:
         happens = client.follow(c.Follow())
-        _carry_out(state, commands.ShutDown(), as_json)
+        carry_out(state, commands.ShutDown(), as_json)
         for _ in happens:  # until the system's console ends, after its children
             pass

@@ -14,7 +14,7 @@ from rr_actors.system.console.console_questions import LookAtMailbox
 from rr_actors.system.console.console_view import Command
 from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_json, say_lines, shown_again
 from rr_actors.tools.explanations import mailbox_lines
-from rr_actors.tools.verbs.console_verbs import complete_child
+from rr_actors.tools.verbs.console_options import complete_child
 
 app = typer.Typer()
 _ANSWER_S = 30.0

@@ -20,6 +20,7 @@ from rr_actors.base import __version__
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import UsageError
 from rr_actors.runtime.garbage import left_alone
+from rr_actors.tools.tables.sheets import SHEETS
 
 
 def _console() -> ModuleType:
@@ -28,16 +29,16 @@ def _console() -> ModuleType:
     return console_verbs
 
 
+def _lists() -> ModuleType:
+    from rr_actors.tools.verbs import list_verbs
+
+    return list_verbs
+
+
 def _planner() -> ModuleType:
     from rr_actors.tools.verbs import planner_verbs
 
     return planner_verbs
-
-
-def _streams() -> ModuleType:
-    from rr_actors.tools.verbs import stream_verbs
-
-    return stream_verbs
 
 
 def _mailboxes() -> ModuleType:
@@ -84,19 +85,17 @@ def _project() -> ModuleType:
 
 VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
     "Look at a running system": {
-        _console: {
-            "ps": (
-                "Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its "
-                "start) and memory"
-            ),
-            "resources": "List the resources of the running system, and who holds each",
+        _lists: {
+            **{sheet.verb: sheet.says.partition("\n")[0].rstrip(".") for sheet in SHEETS},
             "usage": "Show what each resource uses now, CPU and memory for instance, of servers that can say it",
-            "loads": "Show which loads wait now, and how often and how long loads of each server had to wait",
+            "dead-letters": "Show how many messages could not be delivered, and the newest of them",
+            "stream": "Show a stream's rate; or read it as one reader more, and show its frames or save one",
+        },
+        _console: {
             "events": "Show the latest events of the tree; with --follow show new events, also those of resources",
             "history": "Show the starts and exits of a child and all below it, or of all children, with reasons",
             "logs": "Show the last log lines of a child, also of the processes that it had before",
             "stack": "Show where each thread of a child's process is now, also if the child is stuck",
-            "dead-letters": "Show how many messages could not be delivered, and the newest of them",
             "top": "Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys",
             "web": (
                 "Serve a live web page of a running system: its tree, its resources, the last minutes; "
@@ -125,13 +124,6 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
                 "Show the pools of a Budgets: how much each has, what is used and free, and how many "
                 "loads wait for room"
             ),
-        },
-        _streams: {
-            "streams": (
-                "List the open streams: frames and bytes a second, the age of the newest frame, readers, "
-                "and what they missed"
-            ),
-            "stream": "Show a stream's rate; or read it as one reader more, and show its frames or save one",
         },
     },
     "Change its resources": {

@@ -22,8 +22,8 @@ from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.recording.recordings import Recording, add
 from rr_actors.system.recording.sequence_diagrams import sequence_of
+from rr_actors.tools.web.page_parts import Page
 from rr_actors.tools.web.watch import Moment, Watch
-from rr_actors.tools.web.web_pages import Page
 
 _LIMIT = 20_000  # entries of a page's recording
 _LISTED = 30

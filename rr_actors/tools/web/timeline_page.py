@@ -12,8 +12,8 @@ from nicegui import ui
 
 from rr_actors.system.recording.timelines import Timeline, looks
 from rr_actors.tools.web import timeline_file
+from rr_actors.tools.web.page_parts import Page
 from rr_actors.tools.web.watch import Moment, Watch
-from rr_actors.tools.web.web_pages import Page
 
 _BYTES_A_SECOND = 400_000
 """How much a page sends of a timeline that changes all the time."""

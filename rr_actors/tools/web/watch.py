@@ -145,6 +145,7 @@ class Watch:
         heard: the number of all events.
         version: grows with each change that a page could show.
         figures: the figures of the children over the last minutes.
+        pages: the names of the pages that are served.
     """
 
     state_dir: str | os.PathLike[str] | None
@@ -155,6 +156,7 @@ class Watch:
     version: int = 0
     welcome: c.Welcome | None = None
     lines: EventLines = field(default_factory=EventLines)
+    pages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.link = ConsoleLink(self.state_dir)

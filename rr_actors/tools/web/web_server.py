@@ -26,13 +26,17 @@ from rr_actors.runtime.processes import lifeline
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.recording.figures import prometheus_text
 from rr_actors.system.web_process import check_proxy
+from rr_actors.tools.tables.resource_table import RESOURCES
+from rr_actors.tools.tables.sheets import SHEETS
 from rr_actors.tools.web.lab.lab_pages import add_lab
-from rr_actors.tools.web.resource_table import add_rows
+from rr_actors.tools.web.list_page import ListPage
+from rr_actors.tools.web.page_parts import address_of
+from rr_actors.tools.web.row_grid import add_rows
 from rr_actors.tools.web.sequence_page import Recorder, SequencePage, end_unseen
 from rr_actors.tools.web.timeline_page import TimelinePage
 from rr_actors.tools.web.watch import Watch
 from rr_actors.tools.web.web_access import Access, Keys, is_loopback
-from rr_actors.tools.web.web_pages import FiguresPage, LoadsPage, ResourcesPage, TreePage
+from rr_actors.tools.web.web_pages import FiguresPage, ResourcesPage, TreePage
 
 _CLOSE_S = 1
 _LOOK_S = 20.0
@@ -83,16 +87,18 @@ def serve(
     else:
         watch = Watch(state_dir)
         recorder = Recorder(watch)
-        for path, name, page in (
-            ("/", "tree", partial(TreePage, watch)),
-            ("/timeline", "timeline", partial(TimelinePage, watch)),
-            ("/resources", "resources", partial(ResourcesPage, watch)),
-            ("/loads", "loads", partial(LoadsPage, watch)),
-            ("/figures", "figures", partial(FiguresPage, watch)),
-            ("/sequence", "sequence", partial(SequencePage, watch, recorder)),
-        ):
-            ui.page(path, title=f"rr-actors: {name}")(page)
-        add_rows(watch)
+        pages = {
+            "Tree": partial(TreePage, watch),
+            "Timeline": partial(TimelinePage, watch),
+            "Resources": partial(ResourcesPage, watch),
+            **{sheet.name.capitalize(): partial(ListPage, watch, sheet) for sheet in SHEETS if sheet.note},
+            "Figures": partial(FiguresPage, watch),
+            "Sequence": partial(SequencePage, watch, recorder),
+        }
+        watch.pages = tuple(pages)
+        for name, page in pages.items():
+            ui.page(address_of(name), title=f"rr-actors: {name.lower()}")(page)
+        add_rows(watch, RESOURCES)
         _add_metrics(watch)
         app.on_startup(watch.start)
         app.on_startup(partial(_begin_to_look, recorder))

@@ -22,7 +22,7 @@ from rr_actors.tools.web.lab.lab_notebook import notebook_of
 from rr_actors.tools.web.lab.lab_player import Player
 from rr_actors.tools.web.lab.lab_questions import QUESTIONS, Asked
 from rr_actors.tools.web.lab.lab_runs import AT_ONCE, Place, Run
-from rr_actors.tools.web.web_pages import CSS
+from rr_actors.tools.web.page_parts import CSS
 
 _LOOK_S = 0.2
 _CSS = (

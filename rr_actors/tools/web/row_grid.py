@@ -1,4 +1,4 @@
-"""The table of all resources. The browser asks for the rows that it shows, and the system searches them."""
+"""A table as a grid. The browser asks for the rows that it shows, and the system searches and sorts them."""
 
 # pyright: reportUnknownMemberType=false
 # Some signatures of NiceGUI are not fully typed.
@@ -14,71 +14,73 @@ from nicegui import app, ui
 
 from rr_actors.base.errors import RrError
 from rr_actors.base.names import short_ids
-from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console import console_questions as questions
+from rr_actors.tools.tables.table import Look, Table
+from rr_actors.tools.terminal.terminal_rows import Hasty
 from rr_actors.tools.web.watch import Watch
 
-_PATH = "/rows/resources"
 _BLOCK = 100  # rows that are asked for at once
 _REFRESH_S = 1.0
 _LOOK_S = 20.0
-_COLUMNS = (
-    ("resource", 5), ("state", 1.8), ("message", 2), ("priority", 1), ("holders", 1), ("held_by", 2), ("short_id", 1.3),
-)  # fmt: skip
+_NAME_FLEX = 5.0  # of the first column, where others have a tenth of their width in a terminal
 _NAME_PX = 320  # a narrower cell would show the same beginning of all names of a server; a narrow table is scrolled
 _SIGNS = """({
   "rr-row-bad": (row) => row.data && ["ERROR", "FATAL"].includes(row.data.state),
   "rr-row-warm": (row) => row.data && row.data.state === "WARNING",
 })"""
-_SOURCE = f"""{{
-  getRows: (wanted) => {{
-    const match = encodeURIComponent(window.rrMatch || ""), path = `${{window.path_prefix}}{_PATH}`;
-    fetch(`${{path}}?match=${{match}}&offset=${{wanted.startRow}}&limit=${{wanted.endRow - wanted.startRow}}`)
+_SOURCE = """{
+  getRows: (wanted) => {
+    const match = encodeURIComponent(window.rrMatch || ""), sort = encodeURIComponent(wanted.sortModel[0]?.colId || "");
+    const part = `offset=${wanted.startRow}&limit=${wanted.endRow - wanted.startRow}`;
+    fetch(`${window.path_prefix}/rows/NAME?match=${match}&sort=${sort}&${part}`)
       .then((answer) => answer.json())
       .then((page) => wanted.successCallback(page.rows, page.total))
       .catch(() => wanted.failCallback());
-  }},
-}}"""
+  },
+}"""
 
 
-class ResourceTable:
-    """A table of resources with a search field.
+class Grid:
+    """A table with a search field; a click on a column's head sorts it.
 
     Args:
-        on_choose: called with the id of the resource whose row was clicked, or chosen with the space key.
+        table: the table; add_rows() has added its rows to the server.
+        search: the label of the search field.
+        on_choose: called with the key of the row that was clicked, or chosen with the space key.
     """
 
-    def __init__(self, on_choose: Callable[[str], Awaitable[None]]) -> None:
+    def __init__(self, table: Table[Any], search: str, on_choose: Callable[[str], Awaitable[None]]) -> None:
+        self._table = table
         self._refreshed = time.monotonic()
         self._on_choose = on_choose
         self._grid: ui.aggrid | None = None
-        search = ui.input("search in id, server, request and status", on_change=lambda event: self._find(event.value))
-        search.props("dense outlined clearable debounce=200").classes("w-full")
+        field = ui.input(search, on_change=lambda event: self._find(event.value))
+        field.props("dense outlined clearable debounce=200").classes("w-full")
         self._place = ui.element("div").classes("w-full").style("height: max(260px, 36vh)")
 
     def fill(self) -> None:
         """Add the table itself, which asks for its first rows. Its library takes a while to load."""
         columns = [
             {
-                "field": name,
-                "headerName": name.replace("_", " "),
-                "flex": width,
-                "minWidth": _NAME_PX if name == "resource" else 65 + 25 * width,
-                "tooltipField": name,
+                "field": column.head,
+                "headerName": column.head,
+                "sortable": column.sorts,
+                "flex": column.width / 10 if place else _NAME_FLEX,
+                "minWidth": 80 + 2.5 * column.width if place else _NAME_PX,
+                "tooltipField": column.head,
             }
-            for name, width in _COLUMNS
+            for place, column in enumerate(self._table.shown_in("page"))
         ]
         options: dict[str, Any] = {
             "columnDefs": columns,
-            "defaultColDef": {"sortable": False, "resizable": True},
+            "defaultColDef": {"sortingOrder": ["desc", None], "resizable": True},
             "rowModelType": "infinite",
             "cacheBlockSize": _BLOCK,
             "maxBlocksInCache": 4,
             "rowSelection": {"mode": "singleRow", "checkboxes": False, "enableClickSelection": True},
-            ":getRowId": "(row) => row.data.id",
+            ":getRowId": "(row) => row.data.key",
             ":rowClassRules": _SIGNS,
-            ":datasource": _SOURCE,
+            ":datasource": _SOURCE.replace("NAME", self._table.name),
         }
         with self._place:
             self._grid = grid = ui.aggrid(options, auto_size_columns=False).classes("w-full").style("height: 100%")
@@ -86,7 +88,7 @@ class ResourceTable:
         async def selected() -> None:  # the event does not say which row is chosen
             answer = grid.run_grid_method("getSelectedRows", timeout=_LOOK_S)
             if rows := cast("list[dict[str, Any]]", await answer):
-                await self._on_choose(rows[0]["id"])
+                await self._on_choose(rows[0]["key"])
 
         grid.on("selectionChanged", selected, args=[])
 
@@ -101,22 +103,21 @@ class ResourceTable:
         ui.run_javascript(f"window.rrMatch = {json.dumps(text or '')};{purge}")
 
 
-def add_rows(watch: Watch) -> None:
-    """Add the address to the web server at which the browser's table asks for rows."""
+def add_rows(watch: Watch, table: Table[Any]) -> None:
+    """Add the address to the web server at which the browser's grid asks for rows."""
 
-    @app.get(_PATH)
-    def _(match: str = "", offset: int = 0, limit: int = _BLOCK) -> dict[str, Any]:
+    @app.get(f"/rows/{table.name}")
+    def _(match: str = "", offset: int = 0, limit: int = _BLOCK, sort: str = "") -> dict[str, Any]:
         """Return a page of rows. As it is no coroutine, it runs in a thread."""
-        request = questions.ListResources(match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)))
+        look = Look(match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)), sort)
         try:
-            page = watch.link.ask(request, _LOOK_S)
+            part = table.look(Hasty(watch.link, _LOOK_S), look)
         except RrError as error:
             return {"total": 0, "rows": [], "problem": str(error)}
-        ids = short_ids(row.id for row in page.rows)
-        rows = [_cells(row) | {"short_id": ids[row.id]} for row in page.rows]
-        return {"total": page.total, "rows": rows, "problem": "; ".join(page.notes)}
-
-
-def _cells(row: ResourceRow) -> dict[str, Any]:
-    cells = {"id": row.id, "resource": row.name, "state": row.condition, "message": row.message}
-    return cells | {"priority": row.needed, "holders": row.holder_count, "held_by": row.held_by}
+        rows = [{"key": table.line(row, True).key} for row in part.rows]
+        for column in table.shown_in("page"):
+            texts = [column.text(row) for row in part.rows]
+            ids = short_ids(texts) if column.is_id else {}
+            for cells, text in zip(rows, texts, strict=True):
+                cells[column.head] = ids.get(text, text)
+        return {"total": part.total, "rows": rows, "problem": "; ".join(part.notes)}
