@@ -227,6 +227,20 @@ def test_one_that_had_ended_or_could_not_start_before_the_kill_does_not_come_bac
     assert "ttyS0" not in system.dormant()
 
 
+def test_a_backup_has_it_and_it_comes_back_with_what_is_restored(
+    start: Start, tmp_path: Path, workshop: Workshop, args: list[str]
+) -> None:
+    system = start(tree())
+    system.supervisor("pool").start_child(args, id="ttyS0")
+    system.open_registrar("app").load("ttyS0/thing", THING)
+    system.backup(tmp_path / "backup")
+    system.stop()
+    rr.System.restore(tmp_path / "backup", tmp_path / "restored")
+    system = start(tree(), state_dir=tmp_path / "restored")
+    app = system.open_registrar("app")
+    eventually(lambda: holds(app, system))
+
+
 # -- orderly ends ----------------------------------------------------------------------------------------------------
 
 
