@@ -12,6 +12,7 @@ import rr_actors as rr
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.links.provider_link import ProviderLink
+from rr_actors.streams.publisher import Publisher
 from rr_actors.system.console.console_server import Console
 
 T = TypeVar("T")
@@ -43,6 +44,11 @@ def console_of(system: rr.System) -> Console:
     console = system._console  # pyright: ignore[reportPrivateUsage]
     assert console is not None
     return console
+
+
+def readers_of(publisher: Publisher) -> int:
+    """Return how many readers a publisher has taken in."""
+    return len(publisher._consumers)  # pyright: ignore[reportPrivateUsage]
 
 
 class HeldBack:

@@ -17,6 +17,7 @@ from rr_actors.streams.stream import Stream
 from rr_actors.streams.stream_sockets import address_of
 from rr_actors.wire.segments import Segments
 from support import eventually
+from support_inside import readers_of
 
 
 class Interleaved(deque[Callable[[], None]]):
@@ -65,10 +66,10 @@ def test_a_new_reader_is_not_taken_for_one_that_has_ended(monkeypatch: pytest.Mo
         return end
 
     first = connected()
-    eventually(lambda: publisher._consumers)
+    eventually(lambda: readers_of(publisher) == 1)
     monkeypatch.setattr(publisher, "_ready", Epoll(publisher._ready))
     other = connected()  # after this one the publisher's thread polls as above
-    eventually(lambda: len(publisher._consumers) == 2)
+    eventually(lambda: readers_of(publisher) == 2)
     monkeypatch.setattr(publisher, "_tasks", tasks)
     first.close()
     eventually(lambda: tasks)
