@@ -241,3 +241,9 @@ def event_of(record: Record) -> Event:
 def missed_line(missed: Missed) -> str:
     """Return a sentence that says how many events a reader of the feed has missed."""
     return f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow"
+
+
+def facts_in(event: Event) -> dict[str, Any]:
+    """Return an event for programs."""
+    seq = {"seq": event.seq} if event.seq else {}
+    return {**seq, "event": event.event, "at": event.at, **event.facts}

@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any
 
 import msgspec
 import typer
 
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import NotRunning, UnknownQuery, UsageError, did_you_mean, shown
-from rr_actors.hosting.forwarded_logs import LogLine
+from rr_actors.base.errors import NotRunning, UsageError, shown
 from rr_actors.supervision.event_history import Record, left_records, records_of
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import ConsoleClient
-from rr_actors.system.recording.event_texts import ago
-from rr_actors.tools import graphs
-from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_picture
+from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
 from rr_actors.tools.explanations import explain, explain_actor
-from rr_actors.tools.process_usage import facts_of
-from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
-from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, event_of, missed_line
-from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
+from rr_actors.tools.terminal.event_lines import (
+    EventFilter,
+    EventLine,
+    EventLines,
+    event_line,
+    event_of,
+    facts_in,
+    missed_line,
+)
 from rr_actors.tools.verbs.console_options import (
-    SHOWN,
     ChildArgument,
     DryRun,
     Limit,
@@ -40,7 +39,6 @@ from rr_actors.tools.verbs.console_options import (
     client_of,
     completing,
     list_children,
-    list_children_or_resources,
     list_children_or_targets,
     list_registrars,
     list_resources,
@@ -51,7 +49,6 @@ from rr_actors.tools.verbs.console_options import (
 app = typer.Typer()
 
 _UNLOAD_S = 60.0  # for the unload callbacks, after a grace
-_LATEST = 10  # records of a child that its status shows
 _PART = "its beginning or end, or a resource's name"
 _TICK_S = 0.1  # while nothing happens, lines that are settled are printed so often
 
@@ -110,7 +107,7 @@ def _following(client: ConsoleClient, wanted: EventFilter, as_json: bool) -> Ite
         if isinstance(part, c.Missed):
             _say_missed(part, as_json)
         elif as_json:
-            yield [_facts(one) for one in part.events if wanted.accepts(EventLine.of(one))]
+            yield [facts_in(one) for one in part.events if wanted.accepts(EventLine.of(one))]
         else:
             for one in part.events:
                 known.take(one)
@@ -118,14 +115,9 @@ def _following(client: ConsoleClient, wanted: EventFilter, as_json: bool) -> Ite
     yield list(filter(wanted.accepts, known.take_settled(all_of_them=True)))
 
 
-def _facts(event: c.Event) -> dict[str, Any]:
-    seq = {"seq": event.seq} if event.seq else {}
-    return {**seq, "event": event.event, "at": event.at, **event.facts}
-
-
 def _say_facts(events: list[c.Event]) -> None:
     for event in events:
-        say_json(_facts(event))
+        say_json(facts_in(event))
 
 
 def _history(state: Path | None, child: str, limit: int) -> list[Record]:
@@ -168,49 +160,6 @@ def history(
         say(event_line(event_of(record)))
         if record.traceback:
             say_lines(record.traceback.rstrip(), "    ")
-
-
-@app.command(epilog="Example: rr-actors logs cameras --previous --lines 20")
-def logs(
-    child: ChildArgument,
-    lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="The newest so many.")] = c.PAGE_LIMIT,
-    previous: Annotated[
-        bool, typer.Option("--previous", "-p", help="Only those of the process before the one that runs.")
-    ] = False,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with new lines, until Ctrl-C.")] = False,
-    state: StateOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Show the last log lines of a child, also of the processes that it had before.
-
-    The system keeps 500 lines of each child in memory, and at most 256 KiB of text.
-    """
-    if follow and previous:
-        raise UsageError("--previous: expected no --follow with it, as a process that has ended logs no more")
-    with client_of(state) as client:
-        log = log_of(client, child, lines, previous=previous)
-        text = LogText(log.path, [] if as_json else records_of_child(client, log.path))
-        _say_log(log.path, log.lines, text, as_json)
-        if not log.lines:
-            whose = f"{log.path}, of the process before" if previous else log.path
-            say(f"no log lines of {whose}{f': {log.note}' if log.note else ''}", err=True)
-        if not follow:
-            if not as_json:
-                say_lines("\n".join(text.end()))
-            return
-        with contextlib.suppress(NotRunning):
-            for new in new_lines(client, log.path, log.lines[-1].seq if log.lines else 0):
-                _say_log(log.path, new, text, as_json)
-    say("the system has ended", err=True)
-
-
-def _say_log(path: str, lines: list[LogLine], text: LogText, as_json: bool) -> None:
-    if as_json:
-        for line in lines:
-            say_json({"path": path, **msgspec.structs.asdict(line)})
-    else:
-        for one in text.of(lines):
-            say(one)
 
 
 @app.command(epilog="Example: rr-actors stack cameras --timeout 10")
@@ -284,89 +233,6 @@ def why(
             client, id
         ):
             say(line)
-
-
-@app.command(epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
-def graph(
-    what: Annotated[
-        Literal["check", "show", "run", "change"] | None,
-        typer.Argument(help="Without it the system is drawn. With it, FILE.json is a graph of actions."),
-    ] = None,
-    file: Annotated[Path | None, typer.Argument(metavar="[FILE.json]")] = None,
-    id: Annotated[str, typer.Argument(metavar="[ID]", help="Of `change`: the resource of a graph that runs.")] = "",
-    format: Annotated[
-        Literal["mermaid", "dot", "svg", "png"],
-        typer.Option("--format", help="dot is for Graphviz; png needs the program rsvg-convert."),
-    ] = "mermaid",
-    of: Annotated[Literal["tree", "dependencies", "both"], typer.Option("--of", help="What to draw.")] = "both",
-    limit: Limit = SHOWN,
-    inputs: Annotated[str, typer.Option(metavar="JSON", help="Of `run`: what the first actions are given.")] = "{}",
-    start: Annotated[str, typer.Option("--from", metavar="ACTION", help="Of `change`: what runs then.")] = "",
-    timeout_s: Timeout = 3600.0,
-    state: StateOption = None,
-) -> None:
-    """Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz.
-
-    With `check`, `show` or `run` and FILE.json: check a graph of actions, draw it, or have the child `actions` run it.
-    With `change`, FILE.json and ID: have a graph that runs go on as the one in the file.
-    """
-    if format == "png" and sys.stdout.isatty():
-        raise UsageError("--format png: expected a file, got a terminal: rr-actors graph --format png > graph.png")
-    if what is not None:
-        if file is None:
-            raise UsageError(f"graph {what}: expected a file with a graph of actions, got none")
-        from rr_actors.tools.terminal import action_graphs  # the managers, which the other verbs do without
-
-        if what == "check":
-            action_graphs.check(file)
-        elif what == "show":
-            action_graphs.show(file, format)
-        elif what == "change":
-            action_graphs.change(file, id, state, start)
-        else:
-            action_graphs.run(file, state, inputs, timeout_s)
-        return
-    with client_of(state) as client:
-        rows = client.children().rows
-        page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
-    draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
-    say_picture(draw(rows, page.rows, of), format)
-    if page.total > len(page.rows):
-        say(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
-
-
-@app.command(epilog="Example: rr-actors wait 'cameras/camera \"/dev/video0\"' --for OK --timeout 10")
-def wait(
-    target: Annotated[
-        str,
-        typer.Argument(
-            help="A child's id or path; or a resource's name, or its id, or the beginning or end of that.",
-            autocompletion=completing(list_children_or_resources),
-        ),
-    ],
-    wanted: Annotated[
-        str,
-        typer.Option(
-            "--for",
-            metavar="STATE",
-            help=f"Of a child: {', '.join(CHILD_STATES)}; of a resource: {', '.join(RESOURCE_STATES)}; or {GONE}. "
-            "Default: that the child runs, or the resource is loaded.",
-        ),
-    ] = "",
-    timeout_s: Timeout = 30.0,
-    state: StateOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if in vain."""
-    began = time.monotonic()
-    done, seen = wait_for(lambda: client_of(state), target, wanted, timeout_s)
-    waited_s = round(time.monotonic() - began, 1)
-    if as_json:
-        say_json({"target": target, "state": seen, "waited_s": waited_s, "done": done})
-    else:
-        say(f"{target}: {seen} after {waited_s:g} s", err=not done)
-    if not done:
-        raise typer.Exit(1)
 
 
 # -- driving ---------------------------------------------------------------------------------------------------------
@@ -453,73 +319,6 @@ def revoke(
 ) -> None:
     """Take a resource away from its holders in its owner's name: what depends on it ends first, or replaces it."""
     carry_out(state, commands.Revoke(id, why, grace_s, dry_run), as_json, grace_s + _UNLOAD_S)
-
-
-@app.command(epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'")
-def status(
-    target: Annotated[
-        str,
-        typer.Argument(
-            metavar="CHILD|SERVER/RESOURCE",
-            help="A child's id or path; or a resource's id, its beginning or end, after its server; or its name.",
-            autocompletion=completing(list_children_or_resources),
-        ),
-    ],
-    said: Annotated[str, typer.Argument(metavar="[STATE]", help="OK, UPDATE, WARNING, ERROR or FATAL.")] = "",
-    message: Annotated[str, typer.Argument(help="For people.")] = "",
-    state: StateOption = None,
-    as_json: JsonOption = False,
-    dry_run: DryRun = False,
-) -> None:
-    """Show how a child or a resource is; with STATE, send a resource's status to its holders in its owner's name."""
-    if not said:
-        _show_status(state, target, as_json)
-        return
-    states = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
-    if said.upper() not in states:
-        raise UsageError(f"STATE: expected {', '.join(states)}, got {shown(said)}")
-    before, _, id = target.rpartition("/") if " " not in target else ("", "", target)
-    registrar = before.partition("/")[0]
-    carry_out(state, commands.SendStatus(id, cast("Any", said.upper()), message, registrar, dry_run), as_json)
-
-
-def _show_status(state: Path | None, target: str, as_json: bool) -> None:
-    """Show a child with its latest history, or explain a resource; exit code 1 if a child does not run."""
-    with client_of(state) as client:
-        if (row := child_of(client, target)) is None:
-            try:
-                lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
-            except UnknownQuery as error:
-                hint = did_you_mean(target, list_children(client, target))
-                raise UnknownQuery(f"{error}{hint}", query_id=target) from error
-            say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
-            return
-        served = [one for one in client.registrars().rows if one.name == row.id]
-        records = client.ask(questions.ListHistory(row.path, _LATEST)).records
-    facts = facts_of(row)
-    if as_json:
-        say_json(facts | {"registrars": served, "history": [_facts(event_of(record)) for record in records]})
-    else:
-        say_lines("\n".join(_child_lines(row, facts, served)))
-        say_lines("\n".join(event_line(event_of(record)) for record in records), "    ")
-    if row.state != "running":
-        raise typer.Exit(1)
-
-
-def _child_lines(row: c.ChildRow, facts: dict[str, Any], served: list[c.RegistrarRow]) -> Iterator[str]:
-    yield f"{row.path}: {row.state}{f', {row.error}' if row.error else ''}"
-    if row.pid is not None:
-        up = "" if row.up_s is None else f", up for {ago(row.up_s)}"
-        yield f"    process {row.pid}{up}, {row.restarts} restart{'' if row.restarts == 1 else 's'}"
-    if facts["memory_bytes"] is not None:
-        yield f"    {facts['cpu_percent']:.1f} % of a core, {facts['memory_bytes'] / 2**20:.0f} MiB"
-    for text in filter(None, (row.strategy, row.note)):
-        yield f"    {text}"
-    for one in served:
-        counts = ", ".join(f"{count} {name}" for name, count in one.counts.items() if count)
-        yield f"    registrar {one.name}: {one.status}, serves {', '.join(one.servers) or 'nothing'}"
-        if counts:
-            yield f"        {counts}"
 
 
 @app.command(epilog="Example: rr-actors kill cameras --signal SIGSTOP")

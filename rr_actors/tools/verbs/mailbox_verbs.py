@@ -1,23 +1,41 @@
-"""The commands of `rr-actors` about the mailbox of an actor: what waits in it, and for debugging to hold it up."""
+"""The commands of `rr-actors` about one child or resource: how it is, to wait for that, and the mailbox of an actor."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import typer
 
+from rr_actors.base.errors import UnknownQuery, UsageError, did_you_mean, shown
+from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import PauseActor, ResumeActor, StepActor
-from rr_actors.system.console.console_questions import LookAtMailbox
+from rr_actors.system.console.console_questions import ListHistory, LookAtMailbox
 from rr_actors.system.console.console_view import Command
+from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_json, say_lines, shown_again
-from rr_actors.tools.explanations import mailbox_lines
-from rr_actors.tools.verbs.console_options import complete_child
+from rr_actors.tools.explanations import explain, mailbox_lines
+from rr_actors.tools.process_usage import facts_of
+from rr_actors.tools.terminal.event_lines import event_line, event_of, facts_in
+from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
+from rr_actors.tools.verbs.console_options import (
+    DryRun,
+    Timeout,
+    carry_out,
+    client_of,
+    complete_child,
+    completing,
+    list_children,
+    list_children_or_resources,
+)
 
 app = typer.Typer()
 _ANSWER_S = 30.0
+_LATEST = 10  # records of a child that its status shows
 
 ActorArgument = Annotated[
     str,
@@ -84,3 +102,104 @@ def _carry_out(state: Path | None, command: Command[c.Done], as_json: bool, time
         say_json({"done": done.text, **done.facts})
     else:
         say(done.text)
+
+
+@app.command(epilog="Example: rr-actors wait 'cameras/camera \"/dev/video0\"' --for OK --timeout 10")
+def wait(
+    target: Annotated[
+        str,
+        typer.Argument(
+            help="A child's id or path; or a resource's name, or its id, or the beginning or end of that.",
+            autocompletion=completing(list_children_or_resources),
+        ),
+    ],
+    wanted: Annotated[
+        str,
+        typer.Option(
+            "--for",
+            metavar="STATE",
+            help=f"Of a child: {', '.join(CHILD_STATES)}; of a resource: {', '.join(RESOURCE_STATES)}; or {GONE}. "
+            "Default: that the child runs, or the resource is loaded.",
+        ),
+    ] = "",
+    timeout_s: Timeout = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if in vain."""
+    began = time.monotonic()
+    done, seen = wait_for(lambda: client_of(state), target, wanted, timeout_s)
+    waited_s = round(time.monotonic() - began, 1)
+    if as_json:
+        say_json({"target": target, "state": seen, "waited_s": waited_s, "done": done})
+    else:
+        say(f"{target}: {seen} after {waited_s:g} s", err=not done)
+    if not done:
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'")
+def status(
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar="CHILD|SERVER/RESOURCE",
+            help="A child's id or path; or a resource's id, its beginning or end, after its server; or its name.",
+            autocompletion=completing(list_children_or_resources),
+        ),
+    ],
+    said: Annotated[str, typer.Argument(metavar="[STATE]", help="OK, UPDATE, WARNING, ERROR or FATAL.")] = "",
+    message: Annotated[str, typer.Argument(help="For people.")] = "",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Show how a child or a resource is; with STATE, send a resource's status to its holders in its owner's name."""
+    if not said:
+        _show_status(state, target, as_json)
+        return
+    states = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
+    if said.upper() not in states:
+        raise UsageError(f"STATE: expected {', '.join(states)}, got {shown(said)}")
+    before, _, id = target.rpartition("/") if " " not in target else ("", "", target)
+    registrar = before.partition("/")[0]
+    carry_out(state, commands.SendStatus(id, cast("Any", said.upper()), message, registrar, dry_run), as_json)
+
+
+def _show_status(state: Path | None, target: str, as_json: bool) -> None:
+    """Show a child with its latest history, or explain a resource; exit code 1 if a child does not run."""
+    with client_of(state) as client:
+        if (row := child_of(client, target)) is None:
+            try:
+                lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
+            except UnknownQuery as error:
+                hint = did_you_mean(target, list_children(client, target))
+                raise UnknownQuery(f"{error}{hint}", query_id=target) from error
+            say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
+            return
+        served = [one for one in client.registrars().rows if one.name == row.id]
+        records = client.ask(ListHistory(row.path, _LATEST)).records
+    facts = facts_of(row)
+    if as_json:
+        say_json(facts | {"registrars": served, "history": [facts_in(event_of(record)) for record in records]})
+    else:
+        say_lines("\n".join(_child_lines(row, facts, served)))
+        say_lines("\n".join(event_line(event_of(record)) for record in records), "    ")
+    if row.state != "running":
+        raise typer.Exit(1)
+
+
+def _child_lines(row: c.ChildRow, facts: dict[str, Any], served: list[c.RegistrarRow]) -> Iterator[str]:
+    yield f"{row.path}: {row.state}{f', {row.error}' if row.error else ''}"
+    if row.pid is not None:
+        up = "" if row.up_s is None else f", up for {ago(row.up_s)}"
+        yield f"    process {row.pid}{up}, {row.restarts} restart{'' if row.restarts == 1 else 's'}"
+    if facts["memory_bytes"] is not None:
+        yield f"    {facts['cpu_percent']:.1f} % of a core, {facts['memory_bytes'] / 2**20:.0f} MiB"
+    for text in filter(None, (row.strategy, row.note)):
+        yield f"    {text}"
+    for one in served:
+        counts = ", ".join(f"{count} {name}" for name, count in one.counts.items() if count)
+        yield f"    registrar {one.name}: {one.status}, serves {', '.join(one.servers) or 'nothing'}"
+        if counts:
+            yield f"        {counts}"

@@ -1,25 +1,39 @@
-"""The commands of `rr-actors` that record a running system, and draw recordings."""
+"""The commands of `rr-actors` that record a running system, draw it or a recording, and show its logs and streams."""
 
 from __future__ import annotations
 
+import io
+import itertools
 import re
+import sys
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, cast
 
 import msgspec
 import typer
 
-from rr_actors.base.errors import NotFound
+from rr_actors.base.errors import NotFound, NotRunning, UsageError, did_you_mean, few, shown, text_of
+from rr_actors.base.names import short_id
+from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.registrar.model.recorded import Entry
+from rr_actors.streams.stream import Stream, StreamFrame, StreamRow
+from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_questions import Find
 from rr_actors.system.recording.recordings import Recording, RecordingFile, add, read_recording
 from rr_actors.system.recording.timelines import read_timeline
 from rr_actors.system.recording.traces import Trace
-from rr_actors.tools.cli_commands import JsonOption, StateOption, json_text, say, say_lines
+from rr_actors.tools import graphs
+from rr_actors.tools.cli_commands import JsonOption, StateOption, json_text, say, say_json, say_lines, say_picture
+from rr_actors.tools.explanations import age_text, bytes_text, rate_text, readers_text
+from rr_actors.tools.tables.stream_table import stream_facts
+from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
+from rr_actors.tools.terminal.stream_frames import frames_of, png
+from rr_actors.tools.verbs.console_options import SHOWN, ChildArgument, Limit, Timeout, client_of
 from rr_actors.tools.web.timeline_file import html
 
 app = typer.Typer()
@@ -130,3 +144,260 @@ def _ending(client: ConsoleClient, seconds: float | None) -> Generator[None]:
 
 def _line(entry: Entry) -> str:
     return msgspec.json.encode(entry, enc_hook=str).decode()
+
+
+@app.command(epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
+def graph(
+    what: Annotated[
+        Literal["check", "show", "run", "change"] | None,
+        typer.Argument(help="Without it the system is drawn. With it, FILE.json is a graph of actions."),
+    ] = None,
+    file: Annotated[Path | None, typer.Argument(metavar="[FILE.json]")] = None,
+    id: Annotated[str, typer.Argument(metavar="[ID]", help="Of `change`: the resource of a graph that runs.")] = "",
+    format: Annotated[
+        Literal["mermaid", "dot", "svg", "png"],
+        typer.Option("--format", help="dot is for Graphviz; png needs the program rsvg-convert."),
+    ] = "mermaid",
+    of: Annotated[Literal["tree", "dependencies", "both"], typer.Option("--of", help="What to draw.")] = "both",
+    limit: Limit = SHOWN,
+    inputs: Annotated[str, typer.Option(metavar="JSON", help="Of `run`: what the first actions are given.")] = "{}",
+    start: Annotated[str, typer.Option("--from", metavar="ACTION", help="Of `change`: what runs then.")] = "",
+    timeout_s: Timeout = 3600.0,
+    state: StateOption = None,
+) -> None:
+    """Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz.
+
+    With `check`, `show` or `run` and FILE.json: check a graph of actions, draw it, or have the child `actions` run it.
+    With `change`, FILE.json and ID: have a graph that runs go on as the one in the file.
+    """
+    if format == "png" and sys.stdout.isatty():
+        raise UsageError("--format png: expected a file, got a terminal: rr-actors graph --format png > graph.png")
+    if what is not None:
+        if file is None:
+            raise UsageError(f"graph {what}: expected a file with a graph of actions, got none")
+        from rr_actors.tools.terminal import action_graphs  # the managers, which the other verbs do without
+
+        if what == "check":
+            action_graphs.check(file)
+        elif what == "show":
+            action_graphs.show(file, format)
+        elif what == "change":
+            action_graphs.change(file, id, state, start)
+        else:
+            action_graphs.run(file, state, inputs, timeout_s)
+        return
+    with client_of(state) as client:
+        rows = client.children().rows
+        page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
+    draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
+    say_picture(draw(rows, page.rows, of), format)
+    if page.total > len(page.rows):
+        say(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
+
+
+@app.command(epilog="Example: rr-actors logs cameras --previous --lines 20")
+def logs(
+    child: ChildArgument,
+    lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="The newest so many.")] = c.PAGE_LIMIT,
+    previous: Annotated[
+        bool, typer.Option("--previous", "-p", help="Only those of the process before the one that runs.")
+    ] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with new lines, until Ctrl-C.")] = False,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the last log lines of a child, also of the processes that it had before.
+
+    The system keeps 500 lines of each child in memory, and at most 256 KiB of text.
+    """
+    if follow and previous:
+        raise UsageError("--previous: expected no --follow with it, as a process that has ended logs no more")
+    with client_of(state) as client:
+        log = log_of(client, child, lines, previous=previous)
+        text = LogText(log.path, [] if as_json else records_of_child(client, log.path))
+        _say_log(log.path, log.lines, text, as_json)
+        if not log.lines:
+            whose = f"{log.path}, of the process before" if previous else log.path
+            say(f"no log lines of {whose}{f': {log.note}' if log.note else ''}", err=True)
+        if not follow:
+            if not as_json:
+                say_lines("\n".join(text.end()))
+            return
+        with suppress(NotRunning):
+            for new in new_lines(client, log.path, log.lines[-1].seq if log.lines else 0):
+                _say_log(log.path, new, text, as_json)
+    say("the system has ended", err=True)
+
+
+def _say_log(path: str, lines: list[LogLine], text: LogText, as_json: bool) -> None:
+    if as_json:
+        for line in lines:
+            say_json({"path": path, **msgspec.structs.asdict(line)})
+    else:
+        for one in text.of(lines):
+            say(one)
+
+
+# -- a stream ----------------------------------------------------------------------------------------------------------
+
+_LOOK_S = 1.0  # between two looks at a stream's rate, and at whether its resource is still there
+
+
+@app.command(epilog="Example: rr-actors stream 'cameras/camera \"front\"' images --save front.png")
+def stream(
+    id: Annotated[str, typer.Argument(help="A resource's name, or its id, or the beginning or end of that.")],
+    name: Annotated[str, typer.Argument(help="The stream's name, if the resource has several.")] = "",
+    rate: Annotated[bool, typer.Option("--rate", help="Show frames and bytes a second. This reads no frame.")] = False,
+    echo: Annotated[bool, typer.Option("--echo", help="Read the stream, and show each frame as a line.")] = False,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", metavar="FILE", help="Read one frame into a new file: .png, .npy (numpy's), or .bin."),
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="End after so many lines. Default: at Ctrl-C.")] = None,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=86_400.0, help="The longest wait for a frame.")
+    ] = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show a stream's rate; or read it as one reader more, and show its frames or save one.
+
+    Without an option: --rate. To read imports the classes of the values.
+    """
+    if rate + echo + (save is not None) > 1:
+        raise UsageError("stream: expected one of --rate, --echo and --save FILE, got several")
+    write = None if save is None else _writer(save)
+    with ConsoleClient(find_console(state)) as client:
+        row = _found(client, id, name)
+        if write is not None and save is not None:
+            frame = next(_frames(client, row, timeout_s), None)
+            if frame is None:
+                raise NotFound(f"stream {row.info.name!r}: its resource was unloaded", id=row.info.resource_id)
+            _save(save, write, frame)
+            say(f"saved frame {frame.number} in {save}")
+        elif echo:
+            for frame in itertools.islice(_frames(client, row, timeout_s), count):
+                _say_frame(frame, as_json)
+        else:
+            for one in itertools.islice(_looks(client, row), count):
+                _say_rate(one, as_json)
+
+
+def _found(client: ConsoleClient, id: str, name: str) -> StreamRow:
+    """Return the stream of the resource of this id or name.
+
+    Raises:
+        NotFound: there is none.
+        UsageError: there are several.
+    """
+    resources = client.ask(Find(id)).resources
+    if not resources:
+        raise UsageError(f"{shown(id)}: no resource has this id; rr-actors streams lists the streams that there are")
+    if len(resources) > 1:
+        several = few(f"{row.name} ({short_id(row.id)})" for row in resources)
+        raise UsageError(f"{shown(id)}: several resources have this in their ids: {several}; give more of the id")
+    (resource,) = resources
+    rows = {row.info.name: row for row in client.streams(match=resource.id).rows}
+    names = few(map(repr, rows)) or "none"
+    if name and name not in rows:
+        raise UsageError(f"{resource.name} has no stream {shown(name)}; it has: {names}{did_you_mean(name, rows)}")
+    if not rows:
+        raise UsageError(f"{resource.name} has no stream that is open")
+    if not name and len(rows) > 1:
+        raise UsageError(f"{resource.name} has several streams: give the name of one after its id, of {names}")
+    return rows[name or next(iter(rows))]
+
+
+# -- its rate --------------------------------------------------------------------------------------------------------
+
+
+def _looks(client: ConsoleClient, row: StreamRow) -> Iterator[StreamRow | None]:
+    """Yield the stream's row each second; None while it is not open. It ends when the resource is gone."""
+    while client.ask(Find(row.info.resource_id)).resources:
+        found = [one for one in client.streams(match=row.info.resource_id).rows if one.info.name == row.info.name]
+        yield found[0] if found else None
+        time.sleep(_LOOK_S)
+    say(f"stream {row.info.name!r}: its resource was unloaded", err=True)
+
+
+def _say_rate(row: StreamRow | None, as_json: bool) -> None:
+    if as_json:
+        say_json(None if row is None else stream_facts(row))
+    elif row is None:
+        say("the stream is not open: its manager is being respawned, or a callback of its resource runs")
+    else:
+        size = f", {bytes_text(row)}" if row.readers else ""
+        by = f", read by {readers_text(row)}" if row.readers else ", nobody reads it"
+        say(f"{rate_text(row)}{size}, newest {age_text(row)}{by}")
+
+
+# -- its frames ------------------------------------------------------------------------------------------------------
+
+
+def _frames(client: ConsoleClient, row: StreamRow, timeout_s: float) -> Iterator[StreamFrame]:
+    """Yield the newest frames, until the resource is gone.
+
+    Raises:
+        Unavailable: no frame came in time.
+        RrError: a frame cannot be read here.
+    """
+    looked_at = time.monotonic()
+
+    def is_over() -> bool:
+        nonlocal looked_at
+        if (now := time.monotonic()) - looked_at < _LOOK_S:
+            return False
+        looked_at = now
+        return not client.ask(Find(row.info.resource_id)).resources
+
+    yield from frames_of(Stream(row.info.resource_id, row.info.name), is_over, timeout_s)
+    say(f"stream {row.info.name!r}: its resource was unloaded", err=True)
+
+
+def _say_frame(frame: StreamFrame, as_json: bool) -> None:
+    if as_json:
+        facts = {"number": frame.number, "published_at": frame.published_at, "missed": frame.missed}
+        say_json({**facts, "value": _value_text(frame.value)})
+    else:
+        missed = f", missed {frame.missed}" if frame.missed else ""
+        say(f"{frame.number}  {frame.age_s * 1000:.1f} ms old{missed}  {_value_text(frame.value)}")
+
+
+def _value_text(value: Any) -> str:
+    """Return a text for a value: of an array, its shape and type."""
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if isinstance(shape, tuple) and dtype is not None:
+        return f"array of shape {cast('object', shape)} and type {dtype}"
+    return shown(value)
+
+
+def _save(path: Path, write: Callable[[Any], bytes], frame: StreamFrame) -> None:
+    try:
+        data = write(frame.value)
+    except (TypeError, ValueError) as error:
+        what = f"frame {frame.number} of stream {frame.stream.name!r}, {_value_text(frame.value)}"
+        raise UsageError(f"--save {path}: {what}, cannot be saved: {text_of(error)}") from error
+    with path.open("xb") as file:
+        file.write(data)
+
+
+def _writer(path: Path) -> Callable[[Any], bytes]:
+    """Return the function that makes the bytes of such a file of a value; raise UsageError if there is none."""
+    writers = {".png": png, ".npy": _npy, ".bin": _raw}
+    if (write := writers.get(path.suffix)) is None:
+        raise UsageError(f"--save: expected a file that ends with .png, .npy or .bin, got {shown(str(path))}")
+    if path.exists():
+        raise UsageError(f"--save: expected a new file, got {path}, which is there already")
+    return write
+
+
+def _raw(value: Any) -> bytes:
+    return memoryview(value).tobytes()
+
+
+def _npy(value: Any) -> bytes:
+    import numpy  # most programs do without; it is not among the package's requirements
+
+    file = io.BytesIO()
+    numpy.save(file, value, allow_pickle=False)
+    return file.getvalue()

@@ -11,7 +11,7 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, cast, get_type_hints
+from typing import Annotated, Any, Protocol, cast, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -20,7 +20,14 @@ from rr_actors.base import __version__
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import UsageError
 from rr_actors.runtime.garbage import left_alone
+from rr_actors.tools.tables.sheet import Sheet
 from rr_actors.tools.tables.sheets import SHEETS
+
+
+class Declaring(Protocol):
+    """A module that declares verbs, or what declares one."""
+
+    app: typer.Typer
 
 
 def _console() -> ModuleType:
@@ -33,6 +40,17 @@ def _lists() -> ModuleType:
     from rr_actors.tools.verbs import list_verbs
 
     return list_verbs
+
+
+def _listed(sheet: Sheet) -> Callable[[], Declaring]:
+    """Return a function that imports and returns the verb of a sheet."""
+
+    def listed() -> Declaring:
+        from rr_actors.tools.verbs import list_verbs
+
+        return list_verbs.ListVerb(sheet)
+
+    return listed
 
 
 def _planner() -> ModuleType:
@@ -83,18 +101,16 @@ def _project() -> ModuleType:
     return project_verbs
 
 
-VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
+VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
     "Look at a running system": {
+        **{_listed(sheet): {sheet.verb: sheet.says.partition("\n")[0].rstrip(".")} for sheet in SHEETS},
         _lists: {
-            **{sheet.verb: sheet.says.partition("\n")[0].rstrip(".") for sheet in SHEETS},
             "usage": "Show what each resource uses now, CPU and memory for instance, of servers that can say it",
             "dead-letters": "Show how many messages could not be delivered, and the newest of them",
-            "stream": "Show a stream's rate; or read it as one reader more, and show its frames or save one",
         },
         _console: {
             "events": "Show the latest events of the tree; with --follow show new events, also those of resources",
             "history": "Show the starts and exits of a child and all below it, or of all children, with reasons",
-            "logs": "Show the last log lines of a child, also of the processes that it had before",
             "stack": "Show where each thread of a child's process is now, also if the child is stuck",
             "top": "Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys",
             "web": (
@@ -104,19 +120,23 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
             "why": (
                 "Say who holds a resource, for whom, since when, and what it waits for; or whom an actor waits for"
             ),
+        },
+        _recording: {
+            "logs": "Show the last log lines of a child, also of the processes that it had before",
             "graph": (
                 "Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz"
             ),
-            "wait": (
-                "Wait until a child or a resource is in a state; before the system runs, for that, too; "
-                "exit code 1 if in vain"
-            ),
+            "stream": "Show a stream's rate; or read it as one reader more, and show its frames or save one",
         },
         _mailboxes: {
             "mailbox": (
                 "Show how many messages wait for an actor, since when, of what types, and what it handles, "
                 "from whom, since when"
-            )
+            ),
+            "wait": (
+                "Wait until a child or a resource is in a state; before the system runs, for that, too; "
+                "exit code 1 if in vain"
+            ),
         },
         _planner: {
             "keep": "Show what a Keeper keeps, how many replicas are ready, and why others are not",
@@ -138,10 +158,12 @@ VERBS: dict[str, dict[Callable[[], ModuleType], dict[str, str]]] = {
                 "Take a resource away from its holders in its owner's name: what depends on it ends "
                 "first, or replaces it"
             ),
+        },
+        _mailboxes: {
             "status": (
                 "Show how a child or a resource is; with STATE, send a resource's status to its holders "
                 "in its owner's name"
-            ),
+            )
         },
         _planner: {
             "apply": (
@@ -272,7 +294,7 @@ def whole(name: str) -> Verb:
     with needing("the command line", "cli"), left_alone():
         declared = module().app
     for info in declared.registered_commands:
-        if (info.name or typer.main.get_command_name(info.callback.__name__)) == name:
+        if (info.name or typer.main.get_command_name(cast("Any", info.callback).__name__)) == name:
             info.cls = Verb
             found = typer.main.get_command_from_info(info, pretty_exceptions_short=False, rich_markup_mode=None)
             return cast("Verb", found)
