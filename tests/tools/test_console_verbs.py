@@ -931,7 +931,7 @@ def test_each_verb_is_in_the_list_of_the_verbs_with_the_first_sentence_of_its_he
         for module, verbs in modules.items():
             for name, says in verbs.items():
                 assert (whole(name).help or "").partition("\n\n")[0].partition(". ")[0].rstrip(".") == says
-            declared = module().app.registered_commands
+            declared: list[Any] = module().app.registered_commands
             assert {info.name or info.callback.__name__.replace("_", "-") for info in declared} <= {*NAMES}
 
 
