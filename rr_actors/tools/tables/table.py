@@ -13,7 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar, cast
 from rr_actors.base.names import short_id
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_view import Verb
-from rr_actors.tools.tables.sheet import Sheet
+from rr_actors.tools.tables.sheets import Sheet
 
 _A = TypeVar("_A")
 _Row = TypeVar("_Row")

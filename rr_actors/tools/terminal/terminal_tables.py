@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from rr_actors.tools.tables.sheet import Sheet
+from rr_actors.tools.tables.sheets import Sheet
 from rr_actors.tools.tables.table import Asks, Column, Look, Table
 from rr_actors.tools.terminal.terminal_rows import LOOK_S, Hasty, Listed, Window, joined
 

@@ -29,7 +29,7 @@ from rr_actors.tools.cli_commands import (
     say_table,
     shown_again,
 )
-from rr_actors.tools.tables.sheet import Sheet
+from rr_actors.tools.tables.sheets import Sheet
 from rr_actors.tools.tables.table import Column, Look, Table, tables_of
 from rr_actors.tools.verbs.console_options import SHOWN, Limit, Output, RowLimit, client_of, completing, list_registrars
 

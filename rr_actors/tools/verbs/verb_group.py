@@ -20,8 +20,7 @@ from rr_actors.base import __version__
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import UsageError
 from rr_actors.runtime.garbage import left_alone
-from rr_actors.tools.tables.sheet import Sheet
-from rr_actors.tools.tables.sheets import SHEETS
+from rr_actors.tools.tables.sheets import SHEETS, Sheet
 
 
 class Declaring(Protocol):

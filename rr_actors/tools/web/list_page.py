@@ -14,7 +14,7 @@ from nicegui import background_tasks, ui
 
 from rr_actors.base.errors import RrError
 from rr_actors.base.notebook import escape
-from rr_actors.tools.tables.sheet import Sheet
+from rr_actors.tools.tables.sheets import Sheet
 from rr_actors.tools.tables.table import Look, Rows, Table, tables_of
 from rr_actors.tools.terminal.terminal_rows import LOOK_S, Hasty
 from rr_actors.tools.web.page_parts import Page
