@@ -25,7 +25,8 @@ class Fork(rr.Actor):
         if not others:
             return f"philosopher {who} eats"
         all_have_one()
-        return others[0].ask((who, others[1:], all_have_one))
+        answer: str = others[0].ask((who, others[1:], all_have_one))
+        return answer
 
 
 def dine(forks: list[rr.ActorRef[Any]], orders: list[list[int]], all_have_one: Callable[[], object]) -> None:

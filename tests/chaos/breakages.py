@@ -24,8 +24,7 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.managers import Choices, Keeper
 from rr_actors.managers.actions.graph_engine import GraphEngine
 from rr_actors.managers.actions.graph_runs import OVER, Ended, GraphRun
-from rr_actors.managers.choices import choice_manager
-from rr_actors.managers.choices.trials import Trials
+from rr_actors.managers.choices import choice_manager, trials
 from rr_actors.managers.keeper import comparing
 from rr_actors.registrar.core import holding, notices, reconciliation, recovery, releasing, status_delivery, unloading
 from rr_actors.registrar.model.catalog import Decision, add, discard
@@ -316,7 +315,7 @@ def _failed_alternatives_stay() -> None:
 
 
 def _trials_stay() -> None:
-    override(Trials, "release", lambda release: lambda self, query: None)
+    trials.release_soon = lambda query: None
 
 
 def _no_reasons() -> None:
@@ -434,7 +433,7 @@ BREAKAGES = {
         "choices", "Choices._replace does nothing", _failed_alternatives_stay, ("no working alternative",)
     ),
     "trials are not released": Breakage(
-        "choices", "Trials.release does nothing", _trials_stay, ("is held by nobody", "trials of", "is left")
+        "choices", "Trials releases nothing", _trials_stay, ("is held by nobody", "trials of", "is left")
     ),
     "a choice that is lost does not say why": Breakage(
         "choices", "nothing_left leaves out the first reason", _no_reasons, ("does not say why",)

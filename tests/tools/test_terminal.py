@@ -573,7 +573,7 @@ def test_a_window_goes_on_from_one_list_to_the_next(start: Start, state_dir: Pat
     start()
     crowd = Crowd(state_dir)
     try:
-        listed = SheetRows(SHEETS[0], tables_of(SHEETS[0])).list(crowd, Window(offset=498, limit=10))
+        listed = SheetRows(SHEETS[0], tables_of(SHEETS[0].module())).list(crowd, Window(offset=498, limit=10))
     finally:
         crowd.close()
 

@@ -211,7 +211,7 @@ def messages_with(trap: bytes) -> dict[str, tuple[str, Any]]:
         "load": ("registrar", Load("0" * 32, "shop/thing", trap, "app", "", 1, 1)),
         "direct load": (DIRECT, Load("1" * 32, "shop/thing", trap, "app", "", 1, 1)),
         "describe": ("registrar", Describe("thing")),
-        "call": (remote_calls.KIND, remote_calls.CallMethod(1, "queries", trap)),
+        "call": (remote_calls.KIND, remote_calls.CallMethod(1, "children", trap)),
         "stored server": (remote_calls.KIND, remote_calls.CallMethod(2, "_register_stored", trap)),
         "returned": (remote_calls.KIND, remote_calls.Returned(1, trap)),
         "ask": (protocol.KIND, protocol.Ask(1, "root/shop", trap, ())),

@@ -19,7 +19,7 @@ class Sheet:
         verb, says, example: its verb, with the verb's help and an example.
         match: the help of the verb's argument MATCH.
         key: the key of `top` that shows it.
-        module: imports and returns the module of its tables, which tables_of() asks for them.
+        module: imports and returns the module of its tables, which tables_of() takes.
         options: the options that the verb has beside those of all lists.
         in_verb: how many of the tables the verb shows.
         title: its title in `top` while no column sorts it; "": its name.

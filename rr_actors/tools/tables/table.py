@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any, Generic, Protocol, TypeVar, cast
 
 from rr_actors.base.names import short_id
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_view import Verb
-from rr_actors.tools.tables.sheets import Sheet
 
 _A = TypeVar("_A")
 _Row = TypeVar("_Row")
@@ -196,6 +196,6 @@ class Table(Generic[_Row]):
                 return Rows(part.total, rows, list(notes))
 
 
-def tables_of(sheet: Sheet) -> tuple[Table[Any], ...]:
-    """Return the tables of a sheet, for one viewer. One of them has columns beside its lines in `top`."""
-    return cast("tuple[Table[Any], ...]", sheet.module().tables())
+def tables_of(module: ModuleType) -> tuple[Table[Any], ...]:
+    """Return the tables of a sheet's module, for one viewer. One of them has columns beside its lines in `top`."""
+    return cast("tuple[Table[Any], ...]", module.tables())

@@ -157,7 +157,7 @@ class Terminal(App[None]):
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
         self._happened = EventLines()
         # Kept, not looked up on the screen: an answer may arrive when the user leaves and the screen is empty.
-        self._sheets = {sheet.key: SheetRows(sheet, tables_of(sheet)) for sheet in SHEETS}  # sorted as last
+        self._sheets = {sheet.key: SheetRows(sheet, tables_of(sheet.module())) for sheet in SHEETS}  # sorted as last
         self.left = Pane("tree", next(iter(self._sheets.values())), self._look)
         self.right = Pane("chosen", Nothing(), self._look)
         self.events = Pane("events", Happenings(self._happened), self._look)

@@ -61,7 +61,7 @@ class ListVerb:
 
 
 def _verb(sheet: Sheet) -> Callable[..., None]:
-    tables = tables_of(sheet)[: sheet.in_verb]
+    tables = tables_of(sheet.module())[: sheet.in_verb]
 
     def show(
         match: str = "",

@@ -30,7 +30,7 @@ class ListPage(Page):
     goes_back = False
 
     def __init__(self, watch: Watch, sheet: Sheet) -> None:
-        self._tables, self._note = tables_of(sheet), sheet.note
+        self._tables, self._note = tables_of(sheet.module()), sheet.note
         self._sorts = {table.name: table.page_sort for table in self._tables}
         self._is_asking = False
         super().__init__(watch, f"/{sheet.name}")
