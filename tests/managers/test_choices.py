@@ -369,12 +369,20 @@ def test_the_best_one_that_hangs_costs_a_new_choice_some_seconds_and_not_its_who
 def test_nothing_is_tried_beside_one_that_is_exclusive_in_a_new_choice(start: Start) -> None:
     world = World(start, [sensor("camera", break_first=True), sensor("lidar")])
 
+    beside, serve = threading.Event(), world.served["lidar"].do_load
+    assert serve is not None
+
+    def note(request: Any) -> Any:
+        response = serve(request)
+        beside.set()
+        return response
+
     def give_up_late(request: Any) -> None:
-        time.sleep(6)  # beside another one, the next is tried after five seconds
+        beside.wait(6)  # beside another one, the next is tried after five seconds
         world.steps("the camera has failed")
         raise OSError("no camera")
 
-    world.served["camera"].do_load = give_up_late
+    world.served["lidar"].do_load, world.served["camera"].do_load = note, give_up_late
     assert world.choose().response.server == "sensors/lidar"
     assert list(world.steps) == ["the camera has failed", "load lidar"]
 

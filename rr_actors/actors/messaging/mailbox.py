@@ -221,14 +221,17 @@ class Mailbox:
             if self._at_rest:
                 self._due = False
                 return True
+        self._rouse(schedule)  # for messages that have come meanwhile
+        return True
+
+    def _rouse(self, schedule: Callable[[bool], None]) -> None:
+        """Schedule the actor for messages that wait. If that fails, the next message schedules it for them."""
         try:
-            schedule(True)  # for messages that have come meanwhile
+            schedule(True)
         except BaseException:
             with self._lock:
-                self._due = False
-                self._at_rest = True  # so that the next message schedules the actor for them
+                self._at_rest, self._due = True, False
             raise
-        return True
 
     def next(self) -> PykkaEnvelope[Any] | None:
         """Take the next message; None if the mailbox is empty."""

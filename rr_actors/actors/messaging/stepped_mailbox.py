@@ -110,12 +110,7 @@ class SteppedMailbox(Mailbox):
             if not self._at_rest or schedule is None or self._next_lane() is None:
                 return
             self._at_rest, self._due = False, True
-        try:
-            schedule(True)
-        except BaseException:
-            with self._lock:
-                self._at_rest, self._due = True, False
-            raise
+        self._rouse(schedule)
 
 
 def _overtakes(envelope: PykkaEnvelope[Any]) -> bool:

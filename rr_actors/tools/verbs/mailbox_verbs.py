@@ -12,10 +12,8 @@ import typer
 from rr_actors.base.errors import UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import PauseActor, ResumeActor, StepActor
 from rr_actors.system.console.console_questions import ListHistory, LookAtMailbox
-from rr_actors.system.console.console_view import Command
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_json, say_lines, shown_again
 from rr_actors.tools.explanations import explain, mailbox_lines
@@ -59,7 +57,7 @@ def mailbox(
 
 
 def _show(state: Path | None, actor: str, as_json: bool) -> None:
-    with ConsoleClient(find_console(state), timeout_s=_ANSWER_S) as client:
+    with client_of(state, _ANSWER_S) as client:
         found = client.ask(LookAtMailbox(actor)).mailbox
     if as_json:
         say_json({name: getattr(found, name) for name in found.__struct_fields__})
@@ -73,7 +71,7 @@ def pause(actor: ActorArgument, state: StateOption = None, as_json: JsonOption =
 
     What it handles already, it finishes. Its supervisor can stop it. When it is restarted, it is not paused.
     """
-    _carry_out(state, PauseActor(actor), as_json)
+    carry_out(state, PauseActor(actor), as_json)
 
 
 @app.command(epilog="Example: rr-actors step cameras")
@@ -86,22 +84,13 @@ def step(
     as_json: JsonOption = False,
 ) -> None:
     """Have a paused actor handle one message, and say which."""
-    _carry_out(state, StepActor(actor, timeout_s), as_json, timeout_s)
+    carry_out(state, StepActor(actor, timeout_s), as_json, timeout_s)
 
 
 @app.command(epilog="Example: rr-actors resume cameras")
 def resume(actor: ActorArgument, state: StateOption = None, as_json: JsonOption = False) -> None:
     """Have a paused actor handle its messages again."""
-    _carry_out(state, ResumeActor(actor), as_json)
-
-
-def _carry_out(state: Path | None, command: Command[c.Done], as_json: bool, timeout_s: float = 0.0) -> None:
-    with ConsoleClient(find_console(state), timeout_s=timeout_s + _ANSWER_S) as client:
-        done = client.ask(command)
-    if as_json:
-        say_json({"done": done.text, **done.facts})
-    else:
-        say(done.text)
+    carry_out(state, ResumeActor(actor), as_json)
 
 
 @app.command(epilog="Example: rr-actors wait 'cameras/camera \"/dev/video0\"' --for OK --timeout 10")
