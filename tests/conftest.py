@@ -29,6 +29,7 @@ from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, se
 
 _MARK = "RR_ACTORS_TESTS"
 _LEAK_LIMIT_S = 5.0
+_MOST_RUN_AGAIN = 3
 
 # Every process that a test starts inherits this, however it was started and whoever has adopted it since.
 os.environ[_MARK] = uuid.uuid4().hex
@@ -62,6 +63,30 @@ def pytest_collection_modifyitems(items: list[pytest.Item], config: pytest.Confi
     config.hook.pytest_deselected(items=others)
     left_out = set(others)
     items[:] = [item for item in items if item not in left_out]
+
+
+def _run_again(config: pytest.Config) -> list[Any]:
+    """The reports of the tests that failed and were run once more."""
+    terminal: Any = config.pluginmanager.get_plugin("terminalreporter")
+    return [] if terminal is None else terminal.stats.get("rerun", [])
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail where more tests than a few needed their second run: the change has a race, or the machine is too busy."""
+    if len(_run_again(session.config)) > _MOST_RUN_AGAIN:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Say what each first run failed with, so that nobody needs to see it again to mend it."""
+    reports = _run_again(config)
+    if not reports:
+        return
+    terminalreporter.section("failed at the first run, and were run again")
+    for report in reports:
+        terminalreporter.write_line(f"{report.nodeid} ({report.when})\n{report.longreprtext}\n")
+    if len(reports) > _MOST_RUN_AGAIN:
+        terminalreporter.write_line(f"{len(reports)} tests were run again, at most {_MOST_RUN_AGAIN} may be: failed")
 
 
 def _part_of(item: pytest.Item, parts: int) -> int:

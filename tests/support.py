@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -75,6 +75,20 @@ def lives(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def descriptors(target: str = "") -> set[tuple[str, str, int]]:
+    """The number, target and inode of each open descriptor of this process whose target has this in its name.
+
+    A test that leaves no descriptor asserts that `descriptors() - before` is empty. It compares no counts: what a
+    thread of an earlier test still holds may be closed meanwhile.
+    """
+    found: set[tuple[str, str, int]] = set()
+    for number in os.listdir("/proc/self/fd"):
+        path = f"/proc/self/fd/{number}"
+        with suppress(OSError):  # the one that reads the directory is closed by now
+            found.add((number, os.readlink(path), os.stat(path).st_ino))
+    return {each for each in found if target in each[1]}
 
 
 def wait_gone(*pids: int) -> float:

@@ -28,7 +28,7 @@ from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalProgr
 from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
 from rr_actors.runtime.processes.control_groups import ControlGroup, ControlGroups
-from support import NoDescriptors, hang
+from support import NoDescriptors, descriptors, hang
 from support_programs import group_of_program
 from support_slow import few_now
 
@@ -158,10 +158,10 @@ def test_a_start_without_free_descriptors_leaves_no_descriptor_and_no_shim(
     programs: ExternalPrograms, free: int
 ) -> None:
     gc.collect()  # what earlier tests have left closes its descriptors now
-    before = sorted(os.listdir("/proc/self/fd"))
+    before = descriptors()
     with NoDescriptors(free), pytest.raises(OSError, match="Too many open files"):
         programs.start(KEY, python(SLEEP))
-    assert sorted(os.listdir("/proc/self/fd")) == before
+    assert not descriptors() - before
     assert not psutil.Process().children()
 
 

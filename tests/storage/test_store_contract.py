@@ -33,6 +33,7 @@ from rr_actors.registrar.model.store import MemoryStore, Store
 from rr_actors.storage.damage import errors_named
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sql_tables import OLDEST_VERSION, SCHEMA_VERSION
+from support import descriptors
 from support_stores import COMMITS, in_order, part, query, states
 
 ROOT = Path(__file__).parents[2]
@@ -267,12 +268,12 @@ def test_a_catalog_that_holds_nothing_is_a_lock_two_descriptors_and_no_wait_for_
 ) -> None:
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", synced.append)
-    descriptors = len(os.listdir("/proc/self/fd"))
+    before = descriptors()
     path = tmp_path / "reg" / "catalog.sqlite3"
     store = open_store(path)
     try:
         assert [file.name for file in path.parent.iterdir()] == ["catalog.lock"]
-        assert len(os.listdir("/proc/self/fd")) == descriptors + 2  # the lock, and the directory
+        assert len(descriptors() - before) == 2  # the lock, and the directory
         assert synced == []
         assert read_rows(path) == []
         store.commit([Put(query("a"))])
@@ -292,7 +293,7 @@ def test_a_catalog_that_holds_nothing_is_a_lock_two_descriptors_and_no_wait_for_
 
 
 def test_closing_leaves_one_file_and_an_empty_lock_and_erasing_not_even_the_directory(either: FileDisk) -> None:
-    descriptors = len(os.listdir("/proc/self/fd"))
+    before = descriptors()
     store = either.open()
     store.commit([Put(query("a"))])
     store.close()
@@ -300,7 +301,7 @@ def test_closing_leaves_one_file_and_an_empty_lock_and_erasing_not_even_the_dire
     assert either.path.with_name("catalog.lock").read_bytes() == b""
     either.open().close(erase=True)
     assert not either.path.parent.exists()
-    assert len(os.listdir("/proc/self/fd")) == descriptors
+    assert not descriptors() - before
 
 
 def test_erasing_leaves_what_is_not_the_catalogs(either: FileDisk) -> None:
@@ -511,7 +512,7 @@ def test_a_commit_that_fails_leaves_the_last_committed_state_and_the_next_one_su
 
 
 def test_closing_after_a_failure_leaves_one_file_and_no_descriptor(either: FileDisk) -> None:
-    descriptors = len(os.listdir("/proc/self/fd"))
+    before = descriptors()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     store = either.open()
     store.commit([Put(query("a"))])
@@ -524,7 +525,7 @@ def test_closing_after_a_failure_leaves_one_file_and_no_descriptor(either: FileD
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     store.close()
     assert sorted(file.name for file in either.path.parent.iterdir()) == ["catalog.lock", "catalog.sqlite3"]
-    assert len(os.listdir("/proc/self/fd")) == descriptors
+    assert not descriptors() - before
     assert read_rows(either.path) == [query("a")]
 
 

@@ -22,7 +22,18 @@ from rr_actors.runtime.processes.process import Spawner
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.specs import Backoff
 from rr_actors.supervision.heartbeat import Heartbeat, ProcessHealth
-from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_gone, wait_respawned
+from support import (
+    NoDescriptors,
+    Workshop,
+    child,
+    descriptors,
+    eventually,
+    kill,
+    lives,
+    pid_of,
+    wait_gone,
+    wait_respawned,
+)
 from support_children import hear
 
 Start = Callable[..., rr.System]
@@ -189,14 +200,14 @@ def test_a_start_that_fails_at_any_descriptor_leaves_no_process_and_no_descripto
     failures: list[str] = []
     try:
         _started(spawner)
-        before = set(os.listdir("/proc/self/fd"))
+        before = descriptors()
         for spare in range(14):
             with NoDescriptors(spare):
                 try:
                     _started(spawner)
                 except StartFailed as error:
                     failures.append(str(error))
-            assert set(os.listdir("/proc/self/fd")) == before
+            assert not descriptors() - before
         assert 5 < len(failures) < 14
         assert all("EMFILE" in failure for failure in failures)
         _started(spawner)

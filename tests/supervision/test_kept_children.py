@@ -47,9 +47,11 @@ def running(system: rr.System, id: str, *, not_: int | None = None) -> int:
     """The process of a child of the pool that runs, in another process than before."""
 
     def pid() -> int:
-        if state_of(system, id) != "running":
+        try:
+            child = system.supervisor("pool").which_child(id)
+        except (rr.ActorUnavailable, NotFound):  # the pool is being started again
             return 0
-        now = system.supervisor("pool").which_child(id).pid
+        now = child.pid if child.state == "running" else None
         return 0 if now is None or now == not_ else now
 
     return eventually(pid, 2 * LIMIT_S, f"{id} runs in another process than {not_}")

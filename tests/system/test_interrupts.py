@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import itertools
-import os
 import sys
 import threading
 from collections.abc import Callable
@@ -16,7 +15,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.runtime.thread_pool import EventBell
-from support import Calls, Workshop, eventually, serve
+from support import Calls, Workshop, descriptors, eventually, serve
 from support_inside import actor_of
 from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
 from support_managers import Order, Shop
@@ -198,11 +197,11 @@ def test_a_bell_whose_making_is_interrupted_leaves_no_descriptor_open() -> None:
     points = interrupted(make, sys.maxsize).points
     bells.clear()
     gc.collect()  # of what other tests have left
-    before = len(os.listdir("/proc/self/fd"))
+    before = descriptors()
     raised = [interrupted(make, point).was_raised for point in range(1, points + 1)]
     bells.clear()
     gc.collect()  # errors refer to frames
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert not descriptors() - before
     assert sum(raised) >= 4
 
 

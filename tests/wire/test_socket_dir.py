@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import socket
 import threading
@@ -14,7 +13,7 @@ import pytest
 
 from rr_actors.base.folder import Folder
 from rr_actors.wire.unix_sockets import SocketDir
-from support import Gate
+from support import Gate, descriptors
 from support_asks import Background
 
 
@@ -27,12 +26,12 @@ def run(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def sockets(run: Path) -> Iterator[SocketDir]:
-    before = len(os.listdir("/proc/self/fd"))
+    before = descriptors()
     made = SocketDir(run)
     yield made
     made.unlink("a.sock")
     made.close()
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert not descriptors() - before
 
 
 def connect(sockets: SocketDir) -> None:
