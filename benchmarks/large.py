@@ -1,4 +1,4 @@
-"""Large values to an Actor in another process and back, beside memcpy and multiprocessing.Pipe."""
+"""Values of 8 KB to 50 MB to an Actor in another process and back, beside memcpy and multiprocessing.Pipe."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ class Watcher(rr.Actor):
 
 
 def large(times: int) -> list[Row]:
-    """Buffers of 1, 10 and 50 MB, and 10 MB of bytes."""
+    """Bytes of 8 to 500 KB; buffers of 1, 10 and 50 MB, and 10 MB of bytes."""
     rows: list[Row] = []
     with _pipe() as pipe, _watcher() as ask:
+        rows += [_middle(kilobytes, pipe, ask, 10 * times) for kilobytes in (8, 32, 60, 100, 200, 500)]
         for name, size, make in (
             ("1 MB", _MB, _picture),
             ("10 MB", 10 * _MB, _picture),
@@ -48,6 +49,15 @@ def large(times: int) -> list[Row]:
             value = make(size)
             rows += _rows(name, value, bytearray(size), bytearray(size), pipe, ask, times)
     return rows
+
+
+def _middle(kilobytes: int, pipe: Callable[[Any], Any], ask: Callable[[Any], Any], times: int) -> Row:
+    """What most messages are: documents, scans, small pictures. The byte 0x93 looks like a name in a pickle."""
+    value = b"\x93" * (kilobytes * 1000)
+    measured = interleaved({"pipe": lambda: pipe((value, True)), "echo": lambda: ask((value, True))}, times=times)
+    took = measured["echo"].median
+    name = f"echo by an Actor, {kilobytes} KB of bytes"
+    return Row(name, took * 1e3, "ms", measured["echo"].p99 * 1e3, took / measured["pipe"].median, "Pipe")
 
 
 def _picture(size: int) -> Picture:

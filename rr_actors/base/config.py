@@ -102,7 +102,7 @@ class SystemConfig:
 
     Attributes:
         frame_limit_bytes: the size of the largest message on the connection between two processes. The sender refuses
-            a larger one. Values of 64 KiB and more that actors send go through shared memory instead, and have no such
+            a larger one. Values of 192 KiB and more that actors send go through shared memory instead, and have no such
             limit. Default: 16,777,216. Raise it where there is no shared memory.
         segments_limit_bytes: the shared memory that one process may use for the large values that it sends. Default:
             None, a quarter of the machine's memory. Lower it if others need the memory; 0: use none.

@@ -53,14 +53,20 @@ _CloudPickler: Any = cloudpickle.Pickler
 
 _MAIN = b"__main__"
 _CONNECTION = b"multiprocessing.connection"
-_LOCKS = b"asyncio.locks"
-_QUEUES = b"asyncio.queues"
-"""A pickle that contains one of these four is made again by cloudpickle, which is slower and handles more objects.
+_ASYNCIO = (b"asyncio.locks", b"asyncio.queues")
+"""A pickle that names one of these four modules is made again by cloudpickle, which is slower and handles more objects.
 Three are the modules of objects that plain pickle accepts, although they cannot leave their process."""
 
+_NAMES = pickle.STACK_GLOBAL
+"""The byte by which a pickle of this protocol takes a class or a function. One without it names no module."""
 
-LARGE_BYTES = 64 * 1024
-"""How long a buffer, or a whole pickle, is at least that goes through shared memory."""
+_LOOKS = 16
+_LEAVES = frozenset({bytes, str, bytearray, int, float, bool, type(None)})
+
+
+LARGE_BYTES = 192 * 1024
+"""How long a buffer, or a whole pickle, of a message is at least that goes through shared memory. A shorter one is
+faster in the message itself (`make bench`, asks of 100 and 200 KB)."""
 
 
 Bytes = bytes | bytearray | memoryview
@@ -97,7 +103,7 @@ def dumps(value: object, what: str = "value") -> bytes:
         blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
         if isinstance(value, BaseException) and len(blob) > exception_parts.PART_LIMIT_BYTES:
             return _dumps_by_value(value)
-        if _is_plain(blob):
+        if _is_plain(blob, value):
             return blob
     except Exception:
         pass  # cloudpickle handles more objects, and otherwise raises the error to report
@@ -107,33 +113,33 @@ def dumps(value: object, what: str = "value") -> bytes:
 _were_large = False
 
 
-def dumps_large(value: object, what: str) -> bytes | Large:
-    """Return what `dumps` returns, but a Large for a value of at least LARGE_BYTES. Raises the errors of dumps()."""
+def dumps_large(value: object, what: str, large_bytes: int = LARGE_BYTES) -> bytes | Large:
+    """Return what `dumps` returns, but a Large for a value of at least `large_bytes`. Raises the errors of dumps()."""
     if not _were_large:  # this way is the fastest, but copies long bytes and text
         try:
             blob = pickle.dumps(value, _PROTOCOL, buffer_callback=_stays)
-            if len(blob) < LARGE_BYTES and _is_plain(blob) and not isinstance(value, BaseException):
+            if len(blob) < large_bytes and _is_plain(blob, value) and not isinstance(value, BaseException):
                 return blob
         except Exception:
             pass  # as above, or _LongBuffer
-    return dumps(value, what) if isinstance(value, BaseException) else _dumps_parts(value, what)
+    return dumps(value, what) if isinstance(value, BaseException) else _dumps_parts(value, what, large_bytes)
 
 
-def _dumps_parts(value: object, what: str) -> bytes | Large:
+def _dumps_parts(value: object, what: str, large_bytes: int) -> bytes | Large:
     global _were_large
     buffers: list[memoryview] = []
-    keep = _keeper(buffers)
+    keep = _keeper(buffers, large_bytes)
     try:
         parts: list[Bytes] = []
         pickle.Pickler(_Parts(parts.append), _PROTOCOL, buffer_callback=keep).dump(value)
-        is_large = _were_large = sum(map(len, parts)) >= LARGE_BYTES
-        if all(_is_plain(part) for part in parts if len(part) < LARGE_BYTES or part[:1] in (_PROTO, _FRAME)):
+        is_large = _were_large = sum(map(len, parts)) >= large_bytes
+        if all(_is_plain(part, value) for part in parts if len(part) < _OWN_PART_BYTES or part[:1] in (_PROTO, _FRAME)):
             return Large(value, what, parts, buffers) if is_large or buffers else b"".join(parts)
     except Exception:
         pass  # as above
     buffers.clear()
     blob = _dumps_more(value, what, keep)
-    return Large(value, what, (blob,), buffers) if buffers or len(blob) >= LARGE_BYTES else blob
+    return Large(value, what, (blob,), buffers) if buffers or len(blob) >= large_bytes else blob
 
 
 class _Parts:
@@ -143,6 +149,7 @@ class _Parts:
         self.write = write
 
 
+_OWN_PART_BYTES = 64 * 1024  # a pickler writes so long bytes and text as parts of their own
 _PROTO, _FRAME = b"\x80", b"\x95"  # a part of a pickle that contains names begins with one of these, or is short
 
 
@@ -159,21 +166,24 @@ def dumps_around(value: object, what: str) -> Large:
 
 def _stays(buffer: pickle.PickleBuffer) -> bool:
     """Return that a short buffer becomes a part of the pickle; raise _LongBuffer for another."""
-    with memoryview(buffer) as memory:
-        if memory.nbytes < LARGE_BYTES or not memory.contiguous:
-            return True
+    if _is_short(buffer, _OWN_PART_BYTES):
+        return True
     raise _LongBuffer
 
 
-def _keeper(buffers: list[memoryview]) -> Callable[[pickle.PickleBuffer], bool]:
+def _keeper(buffers: list[memoryview], large_bytes: int) -> Callable[[pickle.PickleBuffer], bool]:
     def keep(buffer: pickle.PickleBuffer) -> bool:
-        try:
-            return _stays(buffer)
-        except _LongBuffer:
-            buffers.append(buffer.raw())
-            return False
+        if _is_short(buffer, large_bytes):
+            return True
+        buffers.append(buffer.raw())
+        return False
 
     return keep
+
+
+def _is_short(buffer: pickle.PickleBuffer, large_bytes: int) -> bool:
+    with memoryview(buffer) as memory:
+        return memory.nbytes < large_bytes or not memory.contiguous
 
 
 def raw(value: Any) -> memoryview:
@@ -181,15 +191,31 @@ def raw(value: Any) -> memoryview:
     return pickle.PickleBuffer(value).raw()
 
 
-def _is_plain(blob: Bytes) -> bool:
-    """Return whether nothing in a pickle, or a part of it, goes by value."""
+def _is_plain(blob: Bytes, value: object) -> bool:
+    """Return whether nothing in the pickle of a value, or a part of it, goes by value.
+
+    The search goes through all bytes, four times. Most long values need none: they name nothing.
+    """
+    if _NAMES not in blob or _names_nothing(value):
+        return True
     return not (
         _MAIN in blob
         or _CONNECTION in blob
-        or _LOCKS in blob
-        or _QUEUES in blob
+        or (b"asyncio." in blob and any(name in blob for name in _ASYNCIO))
         or cloudpickle.list_registry_pickle_by_value()
     )
+
+
+def _names_nothing(value: object) -> bool:
+    """Return whether the value is made of bytes, text and numbers, as far as a look at its first level tells."""
+    kind = type(value)
+    if kind is tuple or kind is list:
+        items = cast("Sequence[object]", value)
+        return len(items) <= _LOOKS and all(type(item) in _LEAVES for item in items)
+    if kind is dict:
+        entries = cast("dict[object, object]", value)
+        return len(entries) <= _LOOKS and all(type(k) in _LEAVES and type(v) in _LEAVES for k, v in entries.items())
+    return kind in _LEAVES
 
 
 def _dumps_more(value: object, what: str, keep: Callable[[pickle.PickleBuffer], bool] | None = None) -> bytes:

@@ -30,6 +30,7 @@ from rr_actors.streams.loan import Loan
 from rr_actors.streams.stream import Stream, StreamInfo, StreamNews, StreamRow
 from rr_actors.streams.stream_sockets import (
     IN_BAND_BYTES,
+    LARGE_FRAME_BYTES,
     OPENED,
     Packet,
     ReaderSocket,
@@ -225,7 +226,7 @@ class Publisher:
         limit_s = time_limit(timeout_s)
         check_process(self._pid, self._what)
         readers = [] if self._closed else self._readers()
-        packed = pickling.dumps_large(value, f"a frame of stream {self.name!r}") if readers else b""
+        packed = pickling.dumps_large(value, f"a frame of stream {self.name!r}", LARGE_FRAME_BYTES) if readers else b""
         return self._publish(readers, packed, None, limit_s)
 
     def loan(self, shape: int | Sequence[int], dtype: object, *, timeout_s: float | None = None) -> Loan:

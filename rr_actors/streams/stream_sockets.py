@@ -25,6 +25,9 @@ from rr_actors.wire.segments import Parcel
 IN_BAND_BYTES = 128 * 1024
 """The longest frame that goes over the socket if there is no shared memory for it."""
 
+LARGE_FRAME_BYTES = 64 * 1024
+"""How long a frame is at least that goes through shared memory: there it is once, for all readers."""
+
 PACKET_BYTES = IN_BAND_BYTES + 4096
 MOST_DEPTH = 1000
 

@@ -25,6 +25,9 @@ _encode = msgspec.msgpack.Encoder().encode
 
 GOODBYE = _pack_length(0)
 
+_SHORT_BYTES = 4096
+"""A shorter body is copied for the decoder, which takes less time than a view of it."""
+
 # The errors of the encoder: for a type, an int over 64 bits, half a character, too deep a nesting. An exception that a
 # signal handler raises meanwhile is none of these.
 _NOT_ENCODED = (TypeError, OverflowError, UnicodeEncodeError, RecursionError)
@@ -52,12 +55,13 @@ class FrameReader(Generic[T]):
         ended: the peer has said goodbye.
     """
 
-    __slots__ = ("_buffer", "_decode", "_limit", "_wanted", "ended", "error")
+    __slots__ = ("_decode", "_limit", "_pieces", "_size", "_wanted", "ended", "error")
 
     def __init__(self, decoder: msgspec.msgpack.Decoder[T], limit: int) -> None:
         self._decode = decoder.decode
         self._limit = limit
-        self._buffer = bytearray()  # an incomplete frame
+        self._pieces: list[bytes] = []  # of an incomplete frame, as they arrived
+        self._size = 0  # how many bytes these are
         self._wanted = 0  # the length of that frame, as far as it is known
         self.error: Unavailable | None = None
         self.ended = False
@@ -65,25 +69,29 @@ class FrameReader(Generic[T]):
     @property
     def is_waiting(self) -> bool:
         """Whether a frame has begun and is not complete."""
-        return bool(self._buffer)
+        return bool(self._pieces)
 
     def feed(self, data: bytes) -> list[T]:
         """Return the messages that `data` completes; none after an `error`, or when the stream has `ended`."""
         if self.error is not None or self.ended:
             return []
         length = len(data) - 4
-        if 0 < length <= self._limit and not self._buffer and _unpack_length(data)[0] == length:  # the common case
+        if 0 < length <= self._limit and not self._pieces and _unpack_length(data)[0] == length:  # the common case
             try:
-                return [self._decode(data[4:])]
+                return [self._decode(data[4:] if length < _SHORT_BYTES else memoryview(data)[4:])]
             except Exception as error:  # msgspec's own, UnicodeDecodeError, RecursionError, MemoryError
                 self._not_a_message(length, error)
                 return []
-        if self._buffer:
-            self._buffer += data
-            if len(self._buffer) < self._wanted:
+        if self._pieces:
+            if len(self._pieces[-1]) < _SHORT_BYTES:  # a piece takes memory of its own, however short it is
+                self._pieces[-1] += data
+            else:
+                self._pieces.append(data)
+            self._size += len(data)
+            if self._size < self._wanted:
                 return []
-            data = bytes(self._buffer)
-            self._buffer.clear()
+            data = b"".join(self._pieces)
+            self._pieces.clear()
         messages: list[T] = []
         decode = self._decode
         limit = self._limit
@@ -100,14 +108,15 @@ class FrameReader(Generic[T]):
                 wanted += length
                 break
             try:
-                messages.append(decode(data[start:end]))
+                messages.append(decode(data[start:end] if length < _SHORT_BYTES else memoryview(data)[start:end]))
             except Exception as error:  # as above
                 self._not_a_message(length, error)
                 return messages
             start = end + 4
         if start - 4 < size:
             self._wanted = wanted
-            self._buffer += data[start - 4 :]
+            self._size = size - start + 4
+            self._pieces.append(data[start - 4 :])
         return messages
 
     def _not_a_message(self, length: int, error: Exception) -> None:

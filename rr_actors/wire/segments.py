@@ -33,7 +33,7 @@ from typing import Any, cast
 import msgspec
 
 from rr_actors.base.errors import MailboxFull, Unavailable, few, text_of
-from rr_actors.base.pickling import Bytes, Large
+from rr_actors.base.pickling import LARGE_BYTES, Bytes, Large
 from rr_actors.base.scarcity import memory_bytes, wanted_by
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES
 from rr_actors.wire.segment_slots import PAGE_BYTES, USED, Head, Slot, Slots
@@ -116,6 +116,9 @@ class Segments:
     Args:
         limit_bytes: the memory that they may take; 0: there are none. Default: a quarter of what this process may have.
         frame_limit_bytes: the length of the longest message.
+
+    Attributes:
+        large_bytes: the length from which on a value goes through a segment.
     """
 
     def __init__(self, limit_bytes: int | None = None, frame_limit_bytes: int = FRAME_LIMIT_BYTES) -> None:
@@ -123,6 +126,7 @@ class Segments:
             limit_bytes = memory_bytes() // 4
         self.limit_bytes = limit_bytes
         self.frame_limit_bytes = frame_limit_bytes
+        self.large_bytes = min(LARGE_BYTES, frame_limit_bytes // 2)
         self._lock = threading.RLock()
         self._inside = False
         self.loop: asyncio.AbstractEventLoop | None = None  # which gives idle pages back
@@ -292,6 +296,7 @@ class Parcels:
     """One end of a connection: puts large values into a segment of its own, and reads them from the other end's."""
 
     def __init__(self, segments: Segments, pid: int) -> None:
+        self.large_bytes = segments.large_bytes
         self._segments = segments
         self._pid = pid
         self._owned: _Owned | None = None

@@ -96,7 +96,7 @@ def keeper(start: Start) -> Any:
 
 
 @pytest.mark.parametrize("block", [True, False])
-@pytest.mark.parametrize("size", [65_535, 65_536, 65_537, 20 * MB])
+@pytest.mark.parametrize("size", [196_607, 196_608, 196_609, 20 * MB])
 def test_large_values_arrive_as_they_were(keeper: Any, size: int, block: bool) -> None:
     data = os.urandom(size)
 
@@ -107,6 +107,14 @@ def test_large_values_arrive_as_they_were(keeper: Any, size: int, block: bool) -
         assert ask(("echo", value)) == value
     for buffer in (bytearray(data), array.array("B", data), memoryview(data)):
         assert bytes(ask(("echo", Picture(buffer))).data) == data
+
+
+@pytest.mark.parametrize("frame_limit_bytes", [60_000, 150_000])
+def test_a_value_that_is_too_long_for_a_frame_goes_through_a_segment(start: Start, frame_limit_bytes: int) -> None:
+    config = rr.SystemConfig(frame_limit_bytes=frame_limit_bytes)
+    keeper = start(rr.ChildSpec(Keeper, id="keeper", placement="process"), config=config).ref("keeper")
+    for size in (30_000, 59_990, 70_000, 149_990, 190_000):
+        assert keeper.ask(("echo", b"x" * size)) == b"x" * size
 
 
 def test_what_was_told_is_the_receivers_own(keeper: Any) -> None:

@@ -637,6 +637,47 @@ def test_a_global_variable_of_main_that_cannot_travel_is_named() -> None:
     assert (done.stdout, done.stderr) == ("load callback: global variable 'lock'\n", "")
 
 
+_LONG = b"\x93" * 70_000
+"""Looks like names to whoever reads only the bytes."""
+
+
+@pytest.mark.parametrize(
+    "holder",
+    [
+        lambda item: [item],
+        lambda item: (_LONG, item),
+        lambda item: {"a": _LONG, "b": item},
+        lambda item: {item: _LONG},
+        lambda item: [[_LONG, item]],
+        lambda item: {"a": {"b": (item,)}},
+        lambda item: [*range(100), item],
+        lambda item: {**dict.fromkeys(range(100), _LONG), "b": item},
+        lambda item: {_LONG, item},
+        lambda item: Envelope(_LONG, item),
+    ],
+)
+@pytest.mark.parametrize("pack", [lambda value: dumps(value), lambda value: dumps_large(value, "value")])
+def test_what_cannot_leave_its_process_is_found_wherever_it_is_among_long_bytes(
+    holder: Callable[[Any], Any], pack: Callable[[Any], Any]
+) -> None:
+    with pytest.raises(NotSerializable, match=r"asyncio\.locks\.Lock"):
+        pack(holder(asyncio.Lock()))
+
+
+@dataclasses.dataclass(frozen=True)
+class Envelope:
+    data: bytes
+    item: Any
+
+
+@pytest.mark.parametrize(
+    "value", [_LONG, bytearray(_LONG), "x" * 70_000, [_LONG, "__main__", 1.5, None], (_LONG,), {"__main__": _LONG}]
+)
+def test_long_bytes_and_text_travel_as_they_are(value: Any) -> None:
+    assert loads(dumps(value)) == value
+    assert dumps(value) == pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+
+
 def test_a_value_is_large_whatever_another_thread_pickles_meanwhile() -> None:
     value = b"x" * LARGE_BYTES
     steps: list[int] = []

@@ -55,6 +55,29 @@ def test_messages_come_out_as_they_went_in_however_the_stream_is_cut(sizes: list
     assert one.error is None
 
 
+@pytest.mark.parametrize("piece", [7, 4096, 65_536, 10**6])
+def test_long_messages_come_out_whatever_their_pieces_are(piece: int) -> None:
+    sent = [load(number, random.Random(number).randbytes(size)) for number, size in enumerate((5000, 300_000, 1, 9000))]
+    stream = b"".join(framed(message, 10**6) for message in sent)
+    one = reader(10**6)
+    received = [message for at in range(0, len(stream), piece) for message in one.feed(stream[at : at + piece])]
+    assert received == sent
+    assert not one.is_waiting
+
+
+def test_a_long_message_in_single_bytes_takes_no_memory_for_each_of_them() -> None:
+    stream = framed(load(1, bytes(60_000)), 10**6)
+    one = reader(10**6)
+    tracemalloc.start()
+    try:
+        for byte in stream[:-1]:
+            one.feed(bytes([byte]))
+        assert tracemalloc.get_traced_memory()[1] < 5 * len(stream)
+    finally:
+        tracemalloc.stop()
+    assert one.feed(stream[-1:]) == [load(1, bytes(60_000))]
+
+
 def test_a_stream_that_comes_byte_by_byte_is_read() -> None:
     sent = [load(1), Describe("cameras/camera"), load(2, bytes(500))]
     one = reader()

@@ -182,8 +182,8 @@ def test_free_pages_are_given_back_to_the_machine() -> None:
 
 def test_when_the_segments_are_full_a_value_goes_in_band_or_the_error_says_who_holds_what() -> None:
     ends = Ends(limit=2**20, frame_limit=2**18)
-    held = [ends.send(box(3 * LARGE)) for _ in range(5)]
-    assert type(ends.pack(box(3 * LARGE))) is bytes
+    held = [ends.send(box(LARGE)) for _ in range(5)]
+    assert type(ends.pack(box(LARGE))) is bytes
     with pytest.raises(MailboxFull, match="segments_limit_bytes") as caught:
         ends.pack(box(2**19))
     assert str(os.getpid()) in str(caught.value)
@@ -265,7 +265,7 @@ def test_a_process_whose_id_is_not_known_gets_values_in_band() -> None:
 
 def test_the_error_of_full_segments_names_the_process_that_keeps_values() -> None:
     ends = Ends(limit=2**20, frame_limit=2**18)
-    held = ends.send(box(10 * LARGE))
+    held = ends.send(box(640 * 1024))
     other = ends.segments.parcels(os.getppid())
     with pytest.raises(MailboxFull, match=f"bytes in use: 6[0-9]{{5}} by process {os.getpid()}$"):
         other.pack(pickling.dumps_large(box(2**19), "value"))

@@ -81,6 +81,7 @@ class ActorHub:
         self.ask_timeout_s = ask_timeout_s
         self._dispatcher = dispatcher
         self._transport = transport
+        self._large_bytes = transport.segments.large_bytes
         self._directory = directory
         self._hosted: dict[str, pykka.ActorRef[Any]] = {}
         self._parts: dict[str, pykka.ActorRef[Any]] = {}
@@ -141,7 +142,7 @@ class ActorHub:
         self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain, stamp: Stamp | None
     ) -> Callable[[], None]:
         """Send the message; `reply` is set later. Return what to call when nobody waits for the reply any more."""
-        body = pickling.dumps_large(message, f"message to {where.target.name}")
+        body = pickling.dumps_large(message, f"message to {where.target.name}", self._large_bytes)
         return self._call(
             where, reply, lambda number, line: Ask(number, where.target.urn, line.parcels.pack(body), chain, stamp)
         )
@@ -178,7 +179,7 @@ class ActorHub:
             TimeoutError: no reply came in time.
             NotSerializable: the message cannot be pickled, or is too long.
         """
-        body = pickling.dumps_large(message, f"message to {where.target.name}")
+        body = pickling.dumps_large(message, f"message to {where.target.name}", self._large_bytes)
         call = PendingCall(line.next_number(), reply, where)
         try:
             if isinstance(body, bytes):
@@ -199,7 +200,7 @@ class ActorHub:
 
     def tell(self, where: Whereabouts, message: Any, stamp: Stamp | None) -> None:
         """Send the message. If the actor ends before it arrives, the message is lost, and logged."""
-        body = pickling.dumps_large(message, f"message to {where.target.name}")
+        body = pickling.dumps_large(message, f"message to {where.target.name}", self._large_bytes)
         line = self._line(self._locate(where))
         line.put(Tell(where.target.urn, line.parcels.pack(body), stamp))
 

@@ -102,7 +102,7 @@ class Visitor:
     def answer(self, call: int, value: Any, name: str) -> None:
         """Send the value that a handler returned. From any thread, which pickles it."""
         try:
-            body = pickling.dumps_large(value, f"reply of {name}")
+            body = pickling.dumps_large(value, f"reply of {name}", self._parcels.large_bytes)
             if not isinstance(body, bytes):
                 body = self._parcels.pack(body)
         except BaseException as error:
