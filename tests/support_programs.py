@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
+from typing import Any
 
+from rr_actors.managers import Programs
 from rr_actors.managers.process_marks import VARIABLE, find_processes
 from rr_actors.runtime.processes.control_groups import group_of
 
@@ -21,3 +24,21 @@ def group_of_program(pid: int) -> Path | None:
     """The control group that a program has been given; None if it has none."""
     group = group_of(pid)
     return group if group is not None and group.name.startswith("rr-") else None
+
+
+class CrampedPrograms(Programs):
+    """A program manager whose disk has no room for another program while the file `full` exists."""
+
+    def __init__(self, full: str) -> None:
+        super().__init__()
+        self.full = Path(full)
+
+    def on_start(self) -> None:
+        real = os.mkdir
+
+        def mkdir(path: Any, *args: Any, **options: Any) -> None:
+            if self.full.exists() and Path(path).parent.name == "programs":
+                raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), str(path))
+            real(path, *args, **options)
+
+        os.mkdir = mkdir

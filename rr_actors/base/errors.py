@@ -311,11 +311,13 @@ class LoadFailed(LoadError):
 
     `.trace`: one Frame per registrar on the way, innermost first; `.server`.
     `.traceback`: the lines of the innermost callback as Python prints them, where it ran; a note shows them, too.
+    `.wanted`: what the machine had no more of, "ENOSPC: ..."; "" if the load failed for another reason.
     """
 
     server: str
     trace: tuple[Frame, ...] = ()
     traceback: str = ""
+    wanted: str = ""
 
 
 class CircularDependency(LoadFailed):

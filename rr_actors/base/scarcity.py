@@ -24,6 +24,9 @@ _WANTED = {
 }
 
 
+_DRIVERS_RAISE = (errno.EAGAIN, errno.ENOMEM, errno.ENOBUFS)
+"""What a driver raises of its device, too: another process has locked it, its request is too large, its bus is off."""
+
 NO_THREAD = _WANTED[errno.EAGAIN]
 """The text for an error when no more threads can be started."""
 
@@ -31,6 +34,12 @@ NO_THREAD = _WANTED[errno.EAGAIN]
 def wanted_by(error: BaseException) -> str:
     """Name what was wanting, "EMFILE: ..."; "" if the error has another reason."""
     return next((wanted for cause in _causes(error) if (wanted := _wanted(cause))), "")
+
+
+def wanted_by_callback(error: BaseException) -> str:
+    """Name what was wanting as wanted_by() does, for the error of a user's callback, which may be about a device."""
+    causes = (cause for cause in _causes(error) if not (isinstance(cause, OSError) and cause.errno in _DRIVERS_RAISE))
+    return next((wanted for cause in causes if (wanted := _wanted(cause))), "")
 
 
 def _wanted(error: BaseException) -> str:

@@ -35,6 +35,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import ConfigError, LoadError, LoadFailed, LoadTimeout, RrError, UnknownQuery
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
 from rr_actors.managers.planning.hedging import HEDGE_S
@@ -175,7 +176,8 @@ class Components(Manager):
         if found is not None:
             return found
         if candidates:
-            raise NoComponent("\n".join([f"no component of type {request.type!r} could be loaded:", *search.tried]))
+            text = f"no component of type {request.type!r} could be loaded:"
+            raise NoComponent("\n".join([text, *search.tried]), wanted=search.wanted)
         known = ", ".join(sorted({component.type for component in self._registry})) or "none"
         raise NoComponent(f"no component of type {request.type!r} in {self._path}: expected one of {known}")
 
@@ -247,15 +249,18 @@ class Components(Manager):
             release_soon(query)
             return one.name
 
+        def one_pass() -> str | None:
+            in_turn = sorted(fitting(), key=lambda one: not self._retries.is_ready((search.id, one.name)))
+            if failed in in_turn and status.reason == "revoked":
+                in_turn.remove(failed)  # it would wait for the end of this one
+            return self._first(search, in_turn, begin, take, check=search.check_wanted)
+
         try:
             with search.telling(HEDGE_S, f"{name} has failed, and another one is being started"):
                 if part.state is not State.FATAL:  # a holder has called it lost: its program is being ended
                     with contextlib.suppress(UnknownQuery, LoadTimeout):  # it is gone, or its grace is long
                         part.wait_status(State.FATAL, timeout_s=LOAD_MARGIN_S)
-                in_turn = sorted(fitting(), key=lambda one: not self._retries.is_ready((search.id, one.name)))
-                if failed in in_turn and status.reason == "revoked":
-                    in_turn.remove(failed)  # it would wait for the end of this one
-                found = self._first(search, in_turn, begin, take, check=search.check_wanted)
+                found = search.until_had(one_pass)
         except UnknownQuery:
             status.handled()  # it is being unloaded
             return
@@ -297,7 +302,7 @@ class Components(Manager):
             return taken
 
         def failed(one: ComponentDescription, error: Exception) -> None:
-            if is_over() or not isinstance(error, LoadError):
+            if is_over() or not (isinstance(error, LoadError) or wanted_by(error)):
                 raise error
             if is_own_fault(error):
                 self._lower(one, new_id())

@@ -28,6 +28,7 @@ import psutil
 
 from rr_actors.base.errors import RrError, shown
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.process_marks import VARIABLE, kill_allocation
 from rr_actors.managers.program_directory import OUTPUT, Home, remove_retired, shim_of
@@ -47,9 +48,13 @@ _SHIM_LIMIT_S = 5.0  # for a shim's step that usually takes milliseconds
 
 
 class ProgramFailed(RrError):
-    """A program did not start, did not become ready, or is gone. `.exit` says how it ended, if it did."""
+    """A program did not start, did not become ready, or is gone. `.exit` says how it ended, if it did.
+
+    `.wanted`: what the machine had no more of for it, "ENOSPC: ..."; "" if it failed for another reason.
+    """
 
     exit: Exit | None = None
+    wanted: str = ""
 
 
 class Running(NamedTuple):
@@ -158,12 +163,16 @@ class ExternalPrograms:
         home = self._home(key)
         spawned: ProcessHandle | None = None
         try:
-            if not home.is_held():
-                self._clear(home)
-                spawned = self._spawn(home, order, f"{key}.{attempt}")
+            with _naming_wants(order.command):
+                if not home.is_held():
+                    self._clear(home)
+                    spawned = self._spawn(home, order, f"{key}.{attempt}")
             return self._wait_ready(home, order, missing, timeout_s, spawned, is_unwanted)
         except BaseException:
-            self.stop(key)
+            if spawned is not None:
+                spawned.send_signal(signal.SIGTERM)
+            with contextlib.suppress(OSError):  # no descriptor is left: the shim ends with its program all the same
+                self.stop(key)
             raise
         finally:
             if spawned is not None:
@@ -361,6 +370,8 @@ class ExternalPrograms:
             if state:
                 self._check_alive(home, command, state)
             elif (spawned is None or spawned.wait(0)) and not (home.is_held() or home.state()):
+                with _naming_wants(command):
+                    home.check_room()
                 raise ProgramFailed(f"cannot start {command!r}: its shim ended ({sys.executable} {_SHIM})")
             if state.get("ready") and asked is None:
                 asked = _ask(missing, _running(state))
@@ -377,6 +388,8 @@ class ExternalPrograms:
             if not self._is_closed and is_unwanted():  # a restart of the manager goes on with it
                 raise ProgramFailed(f"{command!r} was not ready yet, and nobody waits for it any more")
             if limit.is_over():
+                with _naming_wants(command):
+                    home.check_room()  # else its shim cannot say that it is ready
                 output = "\n".join(f"  {line}" for line in home.output(TAIL_LINES)) or "  (none)"
                 if asked is None and not seen:
                     seen = f"no line of its output has {shown(order.ready_line)}"
@@ -388,7 +401,8 @@ class ExternalPrograms:
         if "damaged" in state:
             raise ProgramFailed(f"cannot take {command!r} over: {state['damaged']}")
         if "failed" in state:
-            raise ProgramFailed(f"cannot start {command!r}: {state['failed']}")
+            wanted = wanted_by(OSError(state.get("errno", 0), ""))
+            raise ProgramFailed(f"cannot start {command!r}: {state['failed']}", wanted=wanted)
         if not home.is_over(state):
             return
         end = self._end_of(home)
@@ -438,6 +452,17 @@ class ExternalPrograms:
             if not _has_ended(shim, state["grace_s"] + _SHIM_LIMIT_S):
                 shim.send_signal(signal.SIGKILL)
                 shim.wait(_SHIM_LIMIT_S)
+
+
+@contextlib.contextmanager
+def _naming_wants(command: str) -> Generator[None]:
+    """Raise ProgramFailed for an error that says that the machine has no more of something."""
+    try:
+        yield
+    except (OSError, RuntimeError, MemoryError) as error:
+        if wanted := wanted_by(error):
+            raise ProgramFailed(f"cannot start {command!r}: {wanted}", wanted=wanted) from error
+        raise
 
 
 def _has_ended(shim: ProcessHandle, limit_s: float) -> bool:

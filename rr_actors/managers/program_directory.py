@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import os
 import shutil
+import tempfile
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict, cast
@@ -21,6 +22,7 @@ from rr_actors.runtime.processes.control_groups import ControlGroup
 logger = Log("rr_actors.managers.program_directory")
 
 _LINE_LIMIT = 500  # characters
+_ROOM_BYTES = 4096  # as much as a state takes
 OUTPUT = "output.log"
 _RETIRED = ".retired-"
 
@@ -38,6 +40,7 @@ class _State(TypedDict):
     ready: bool
     program: NotRequired[tuple[int, int]]
     failed: NotRequired[str]
+    errno: NotRequired[int]
     stopped: NotRequired[bool]
     ended: NotRequired[_End]
 
@@ -134,6 +137,15 @@ class Home:
             return not self.is_held()
         with contextlib.closing(shim):
             return shim.wait(0) and not self.is_held()
+
+    def check_room(self) -> None:
+        """Check that a state could be written here.
+
+        Raises:
+            OSError: it could not.
+        """
+        with contextlib.suppress(FileNotFoundError), tempfile.TemporaryFile(dir=self.path) as file:
+            file.write(bytes(_ROOM_BYTES))
 
     def output(self, lines: int) -> tuple[str, ...]:
         """Return the last lines of the program's output, whether it runs or has ended."""

@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec.structs import replace
 
-from rr_actors.base.errors import InvalidRequest, RrError, shown
+from rr_actors.base.errors import CatalogError, InvalidRequest, RrError, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running, with_output
@@ -43,6 +43,8 @@ from rr_actors.registrar.servers.callback_context import current
 from rr_actors.runtime.processes.control_groups import CONTROLLERS
 
 logger = Log("rr_actors.managers.programs")
+
+_TOLD_AGAIN_S = 0.5
 
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
@@ -146,11 +148,13 @@ class Programs(Manager):
         self._cost_from = check_name(cost_from, "cost_from")
         self._idleness = {"idle": idle, "linger_s": linger_s, "paused_s": paused_s}
         self._lock = threading.Lock()
+        self._is_stopped = threading.Event()
         self._programs: ExternalPrograms | None = None
         self._checks: dict[str, ProgramCheck] = {}  # by resource
 
     def on_stop(self) -> None:
         """Stop watching the programs. They run until their holders release them; a last stop ends those that start."""
+        self._is_stopped.set()
         self._external.close(final=self._final)
 
     @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _adapted()
@@ -236,11 +240,25 @@ class Programs(Manager):
         return self.registrar.directory / "programs"
 
     def _program_ended(self, resource_id: str, end: Exit) -> None:
-        """Send the holders of a program that has ended unasked a FATAL status."""
+        """Send the holders of a program that has ended unasked a FATAL status, on a full disk when it has room."""
+        status = Status(State.FATAL, f"the program {end}")
         try:
-            self.registrar.send_status(resource_id, Status(State.FATAL, f"the program {end}"))
+            self.registrar.send_status(resource_id, status)
+        except CatalogError as error:
+            logger.warning("%s: the program %s; its holders hear that later: %s", resource_id, end, error)
+            threading.Thread(target=self._tell_later, args=(resource_id, status), name="ended", daemon=True).start()
         except RrError as error:
             logger.warning("%s: the program %s; its holders could not be told: %s", resource_id, end, error)
+
+    def _tell_later(self, resource_id: str, status: Status) -> None:
+        while not self._is_stopped.wait(_TOLD_AGAIN_S):
+            try:
+                self.registrar.send_status(resource_id, status)
+            except CatalogError:
+                continue
+            except RrError as error:  # it is unloaded, or this process stops, and the next one finds it ended
+                logger.info("%s: %s", resource_id, error)
+            return
 
     def _check(self, request: RunProgram) -> ProgramCheck | None:
         if request.health is None:

@@ -168,10 +168,13 @@ class Robots(Manager):
             release_soon(query)
             return query.response.name
 
-        with search.telling(HEDGE_S, f"{what} has failed, and another one is being started"):
-            name = search.first(
+        def one_pass() -> str | None:
+            return search.first(
                 [failed.request], lambda _: search.beside(load), take, _blame_nobody, check=search.check_wanted
             )
+
+        with search.telling(HEDGE_S, f"{what} has failed, and another one is being started"):
+            name = search.until_had(one_pass)
         if name is None:
             raise LoadFailed("\n".join(search.tried))
         logger.warning("%s: %s takes the place of a part that failed: %s", request.name, name, status.message)

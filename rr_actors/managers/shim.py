@@ -35,6 +35,7 @@ from typing import Any, NamedTuple
 LOG_LIMIT_BYTES = 256 * 1024
 LINE_LIMIT_BYTES = 64 * 1024
 _LONGEST_SLICE_S = 0.25  # of the grace
+_SAVED_AGAIN_S = 0.25
 TAKEN = 75  # exit code of a shim that is not needed: another holds the lock, the directory is gone, or no order came
 
 _PR_SET_PDEATHSIG = 1
@@ -112,6 +113,7 @@ class Shim:
         self._slice_s = min(order["grace_s"] / 16, _LONGEST_SLICE_S)
         self._counted_at = 0.0
         self._ended = False
+        self._is_behind = False  # the state on disk
         self._wakeup = self._catch_signals()
 
     def run(self) -> None:
@@ -120,6 +122,8 @@ class Shim:
             return
         while not self._ended:
             self._wait()
+            if self._is_behind:
+                self._save()
             self._reap()
             if self._asked and self._grace_s is None:
                 self._begin_stop()
@@ -154,7 +158,8 @@ class Shim:
             error = file.read().decode(errors="replace")  # the read ends when exec has closed the other end
         if error:
             os.waitpid(self._pid, 0)
-            self._state["failed"] = error
+            number, _, self._state["failed"] = error.partition(" ")
+            self._state["errno"] = int(number)
         else:
             self._state["program"] = [self._pid, start_ticks(self._pid)]
         self._save()
@@ -169,6 +174,8 @@ class Shim:
         if self._output >= 0:
             poll.register(self._output, select.POLLIN)
         slice_s = None if self._grace_s is None else min(self._grace_s, self._slice_s)
+        if self._is_behind:
+            slice_s = _SAVED_AGAIN_S if slice_s is None else min(slice_s, _SAVED_AGAIN_S)
         for descriptor, _ in poll.poll(None if slice_s is None else int(slice_s * 1000) + 1):
             if descriptor == self._output:
                 self._copy_output()
@@ -281,10 +288,13 @@ class Shim:
             os.killpg(self._pid, number)
 
     def _save(self) -> None:
-        with contextlib.suppress(OSError):  # a full disk must not end the program; a manager that waits in vain does
+        """Write the state; if the disk is full, which must not end the program, do so when it has room again."""
+        self._is_behind = True
+        with contextlib.suppress(OSError):
             with open("state.json.new", "w") as file:
                 json.dump(self._state, file)
             os.replace("state.json.new", "state.json")
+            self._is_behind = False
 
 
 def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> None:
@@ -305,7 +315,8 @@ def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> No
         os.chdir(order["directory"])
         _execute(order["command"], order["arguments"], order["environment"])
     except BaseException as error:  # nothing may unwind into the shim's own loop
-        os.write(failure, f"{type(error).__name__}: {error}".encode())
+        number = getattr(error, "errno", None) or 0
+        os.write(failure, f"{number} {type(error).__name__}: {error}".encode())
     finally:
         os._exit(127)
 

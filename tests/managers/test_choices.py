@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import json
 import os
 import signal
 import threading
@@ -44,11 +46,14 @@ class World:
         self.app, self.sensors = self.system.open_registrar("app"), self.system.open_registrar("sensors")
         self.steps, self.heard = Calls(), Calls()
         self.broken: set[str] = set()
+        self.wanting = 0
         self.failures = Calls()
         self.served = {name: self._serve(name) for name in RATES}
 
     def _serve(self, name: str) -> Served:
         def load(request: Any) -> Any:
+            if self.wanting:
+                raise OSError(self.wanting, os.strerror(self.wanting))
             if name in self.broken:
                 self.failures(name)
                 raise OSError(f"no {name}")
@@ -103,6 +108,23 @@ def test_where_and_prefer_say_which_is_best(world: World) -> None:
     assert slow.response.server == "sensors/lidar"
     first = world.choose(Choose("range"))
     assert first.response.server == "sensors/sonar"
+
+
+@pytest.mark.parametrize("wanted", [errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE])
+def test_want_of_means_is_no_fault_of_an_alternative_and_the_search_goes_on_until_there_are_some(
+    world: World, wanted: int
+) -> None:
+    query = world.choose()
+    world.wanting = wanted
+    world.say("camera", "FATAL")
+    (warning,) = world.heard.wait()
+    assert warning.state is rr.State.WARNING
+    assert f"; no other one can be started now, and that is tried again: {errno.errorcode[wanted]}: " in warning.message
+    world.wanting = 0
+    world.settled(query, "lidar")
+    assert not [status for status in world.heard if status.state is rr.State.FATAL]
+    reliabilities = world.system.registrar("choices").directory / "reliability.json"
+    assert list(json.loads(reliabilities.read_text())["reliability"]) == ['sensors/camera "front"']
 
 
 def test_one_that_cannot_be_loaded_is_passed_over(world: World) -> None:

@@ -10,9 +10,11 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,7 +26,7 @@ import pytest
 from chaos.process_census import stands
 from rr_actors.managers import external_programs, shim
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
-from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
+from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed, Running
 from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
 from rr_actors.runtime.processes.control_groups import ControlGroup, ControlGroups
@@ -159,7 +161,7 @@ def test_a_start_without_free_descriptors_leaves_no_descriptor_and_no_shim(
 ) -> None:
     gc.collect()  # what earlier tests have left closes its descriptors now
     before = descriptors()
-    with NoDescriptors(free), pytest.raises(OSError, match="Too many open files"):
+    with NoDescriptors(free), pytest.raises(ProgramFailed, match="EMFILE"):
         programs.start(KEY, python(SLEEP))
     assert not descriptors() - before
     assert not psutil.Process().children()
@@ -718,6 +720,60 @@ def test_an_end_that_could_not_be_written_is_not_called_a_kill(
     (tmp_path / "programs" / KEY / "state.json.new").mkdir()  # as a full disk would
     os.kill(running, signal.SIGTERM)
     assert "has ended unseen: the process that watched over it was killed, or could not write" in str(exits.wait()[1])
+
+
+def test_a_state_that_a_full_disk_did_not_take_is_written_when_it_has_room(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    code = f"import sys; sys.stdin = open(sys.argv[1]); sys.stdin.readline(); {SLEEP}"
+    os.mkfifo(tmp_path / "go")
+    home, started = tmp_path / "programs" / KEY, Future[Running]()
+
+    def start() -> None:
+        started.set_result(programs.start(KEY, python(code, str(tmp_path / "go"), ready="ready"), timeout_s=30))
+
+    threading.Thread(target=start, daemon=True).start()
+    eventually((home / "state.json").exists)
+    (home / "state.json.new").mkdir()  # as a full disk would
+    (tmp_path / "go").write_text("\n")
+    eventually(lambda: output(tmp_path) == ("ready",))
+    (home / "state.json.new").rmdir()
+    assert is_running(started.result(10).pid)
+
+
+@pytest.mark.parametrize(
+    ("role", "wanted"), [("mkdir", errno.EDQUOT), ("pipe", errno.EMFILE), ("posix_spawn", errno.EAGAIN)]
+)
+def test_a_start_that_fails_for_want_of_means_says_which_and_leaves_nothing(
+    programs: ExternalPrograms, monkeypatch: pytest.MonkeyPatch, role: str, wanted: int
+) -> None:
+    programs.start("other", python(SLEEP, ready="ready"))
+    with monkeypatch.context() as patched:
+        patched.setattr(os, role, lambda *_, **__: _raise(OSError(wanted, os.strerror(wanted))))
+        with pytest.raises(
+            ProgramFailed, match=rf"cannot start '{sys.executable}': {errno.errorcode[wanted]}"
+        ) as failed:
+            programs.start(KEY, python(SLEEP, ready="ready"))
+    assert failed.value.wanted.startswith(errno.errorcode[wanted])
+    assert is_running(programs.start(KEY, python(SLEEP, ready="ready")).pid)
+
+
+def test_a_program_whose_shim_cannot_write_its_state_fails_for_want_of_room(
+    programs: ExternalPrograms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda *_, **__: _raise(full))
+    with pytest.raises(ProgramFailed, match="ENOSPC: the disk is full") as failed:
+        programs.start(KEY, python("import time; time.sleep(600)", ready="ready"), timeout_s=0.2)
+    assert failed.value.wanted.startswith("ENOSPC")
+
+
+def test_a_program_that_cannot_be_executed_is_itself_to_blame(programs: ExternalPrograms, tmp_path: Path) -> None:
+    order = python(SLEEP)
+    too_long = Order(sys.executable, ["-c", "x" * 3_000_000], order.environment, "/")
+    with pytest.raises(ProgramFailed, match="Argument list too long") as failed:  # that is no want
+        programs.start(KEY, too_long)
+    assert failed.value.wanted == ""
 
 
 def test_closing_leaves_the_programs_running(tmp_path: Path, exits: Exits) -> None:

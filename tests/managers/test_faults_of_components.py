@@ -13,12 +13,14 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.managers import Budgets, Components, LoadComponent, LoadRobot, Pipe, Pipes, Pool, Programs, Robots, Share
-from support import Calls, eventually
+from rr_actors.managers import Budgets, Components, LoadComponent, LoadRobot, Pipe, Pipes, Pool, Robots, Share
+from support import Calls, eventually, kill, wait_respawned
+from support_programs import CrampedPrograms, running_programs
 
 Start = Callable[..., rr.System]
 
 LIMIT_S = 30.0
+RUNS = "import time; print('ready', flush=True); time.sleep(600)"  # and costs nothing
 REQUESTS: dict[str, Any] = {
     "components/component": LoadComponent("camera"),
     "components/pipe": Pipe("image"),
@@ -28,7 +30,7 @@ REQUESTS: dict[str, Any] = {
 
 def camera(name: str, code: str = "", **more: object) -> str:
     """Return the entry of a camera whose program runs for ever, and costs 70 W, or runs `code`."""
-    program = code or "import time; print('ready', flush=True); time.sleep(600)"
+    program = code or RUNS
     lines = [f"{key} = {value}" for key, value in more.items()]
     return "\n".join(
         [
@@ -61,7 +63,7 @@ def served(request: pytest.FixtureRequest, start: Start, tmp_path: Path) -> Call
         (tmp_path / "robots.toml").write_text('[[robot]]\nname = "rover"\ndriver = { type = "camera" }\n')
         system = start(
             rr.ChildSpec(Budgets, id="budgets", args=([Pool("watts", 100)],)),
-            rr.ChildSpec(Programs, id="programs"),
+            rr.ChildSpec(CrampedPrograms, id="programs", args=(str(tmp_path / "full"),)),
             rr.ChildSpec(kind, id="components", args=(str(tmp_path / "cameras.toml"),), kwargs={"replace": replace}),
             rr.ChildSpec(Robots, id="robots", args=(str(tmp_path / "robots.toml"),)),
         )
@@ -156,3 +158,64 @@ def test_want_of_room_is_no_fault_of_a_component(served: Any) -> None:
     with pytest.raises(rr.LoadFailed, match=r"asked 70, free 40 of 100"):
         load(Calls())
     assert reliabilities(system) == {}
+
+
+def lose_it_on_a_full_disk(system: rr.System, heard: Calls, full: Path) -> rr.Status:
+    """Have the disk of the programs full, end the program that runs, and return what the holders hear first."""
+    (program,) = running_programs()
+    full.touch()
+    os.kill(program, signal.SIGKILL)
+    (status,) = heard.wait()
+    return status
+
+
+def test_a_full_disk_is_no_fault_of_a_component_and_the_search_goes_on_until_there_is_room(
+    served: Any, tmp_path: Path
+) -> None:
+    system, load = served(camera("front", RUNS, reliability=0.9), camera("rear", RUNS, reliability=0.8))
+    heard = Calls()
+    query = load(heard)
+    status = lose_it_on_a_full_disk(system, heard, tmp_path / "full")
+    assert status.state is rr.State.WARNING
+    said = "no other one can be started now, and that is tried again: EDQUOT: the user's share of the disk is full: "
+    assert status.message.startswith(said)
+    (tmp_path / "full").unlink()
+    eventually(lambda: heard.items[-1].state is rr.State.UPDATE, LIMIT_S)
+    assert query.state is rr.State.UPDATE
+    assert reliabilities(system) == {"front": 0.45}  # the one whose program was killed
+
+
+def test_a_full_disk_fails_a_first_load_by_name_and_lowers_nothing(served: Any, tmp_path: Path) -> None:
+    system, load = served(camera("front", RUNS, reliability=0.9), camera("rear", RUNS, reliability=0.8))
+    (tmp_path / "full").touch()
+    with pytest.raises(rr.LoadFailed, match="EDQUOT: the user's share of the disk is full") as failed:
+        load(Calls())
+    assert failed.value.wanted.startswith("EDQUOT")
+    assert reliabilities(system) == {}
+    (tmp_path / "full").unlink()
+    assert load(Calls()).state is rr.State.OK
+
+
+def test_what_waits_for_room_is_released_at_once(served: Any, tmp_path: Path) -> None:
+    system, load = served(camera("front", RUNS, reliability=0.9))
+    heard = Calls()
+    query = load(heard)
+    lose_it_on_a_full_disk(system, heard, tmp_path / "full")
+    query.unload(timeout_s=LIMIT_S)
+    eventually(lambda: not system.registrar("programs").resources(), LIMIT_S)
+
+
+@pytest.mark.parametrize("orderly", [False, True])
+def test_the_search_for_room_goes_on_in_the_next_process(served: Any, tmp_path: Path, orderly: bool) -> None:
+    system, load = served(camera("front", RUNS, reliability=0.9))
+    heard = Calls()
+    query = load(heard)
+    lose_it_on_a_full_disk(system, heard, tmp_path / "full")
+    if orderly:
+        system.supervisor().terminate_child("components")
+        system.supervisor().restart_child("components")
+    else:
+        wait_respawned(system, "components", kill(system, "components"))
+    (tmp_path / "full").unlink()
+    eventually(lambda: query.state is rr.State.UPDATE, LIMIT_S)
+    assert [status.state for status in heard if status.state is rr.State.FATAL] == []

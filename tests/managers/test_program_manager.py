@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import random
+import resource
 import signal
 import socket
 import sys
@@ -526,3 +527,19 @@ time.sleep(600)
             assert programs.usage()[program.resource_id]["cpu_s"] >= 0.4
     finally:
         group.rmdir()
+
+
+def test_the_end_of_a_program_that_a_full_disk_hides_is_heard_of_when_there_is_room(
+    system: rr.System, app: rr.Registrar
+) -> None:
+    heard = Calls()
+    query = app.load("programs/program", python(SLEEP), on_status=heard)
+    pid = pid_of(system, "programs")
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (600, before[1]))  # its journal is longer
+    os.kill(query.response.pid, signal.SIGKILL)
+    with pytest.raises(rr.CatalogError):
+        system.registrar("programs").send_status(query, rr.Status(rr.State.WARNING))
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+    eventually(lambda: query.state is rr.State.FATAL)
+    assert heard.items[-1].message.startswith("the program was ended by signal 9 (SIGKILL)")

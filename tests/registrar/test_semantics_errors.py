@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -61,6 +62,30 @@ def test_the_traceback_of_the_innermost_callback_is_there_from_its_first_line_on
         assert 'return {"back": 1}[key]' in told.traceback
         assert told.traceback.endswith("KeyError: 'front'")
     assert error.__notes__ == [f"raised in provider/camera:\n{error.traceback}"]
+
+
+@pytest.mark.parametrize(
+    ("error", "wanted"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "ENOSPC: the disk is full, or has no inode left"),
+        (MemoryError(), "ENOMEM: there is no memory left for it"),
+        (BlockingIOError(errno.EAGAIN, "the port is locked"), ""),
+        (OSError(errno.ENOBUFS, "the bus is off"), ""),
+        (ValueError("no such device"), ""),
+    ],
+)
+def test_what_the_machine_had_no_more_of_is_known_to_every_consumer_of_a_failed_load(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, error: Exception, wanted: str
+) -> None:
+    def open_camera(request: str) -> str:
+        raise error
+
+    maps = system.open_registrar("maps")
+    provider.register_server("camera", open_camera)
+    serve(maps, "map", load=loaded_with_parts(maps, ("provider/camera", "front")))
+    with pytest.raises(rr.LoadFailed) as caught:
+        app.load("maps/map", None)
+    assert caught.value.wanted == wanted
 
 
 def test_what_no_line_of_a_callback_raised_has_no_traceback(app: rr.Registrar, provider: rr.Registrar) -> None:

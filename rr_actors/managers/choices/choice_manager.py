@@ -169,7 +169,8 @@ class Choices(Manager):
             raise
         if chosen is None:
             self._addresses.close(search.id)
-            raise LoadFailed(nothing_left(request, search.tried), server=f"{self.registrar.name}/choice")
+            text, server = nothing_left(request, search.tried), f"{self.registrar.name}/choice"
+            raise LoadFailed(text, server=server, wanted=search.wanted)
         self._use(search, chosen)
         if search.held.present != best[0].key:
             self._trials.look()
@@ -285,12 +286,16 @@ class Choices(Manager):
 
     def _fill(self, search: _Search, status: Status, without: Collection[str]) -> bool:
         """Put the first alternative that can be had in the place of the part. Return whether there was one."""
-        with search.telling(SOON_S, "the next one is being loaded"):
+
+        def one_pass() -> bool | None:
             with self._changed:  # else what fails meanwhile is tried once more
                 search.decided_at = time.monotonic()
                 allowed = self._offers.allowed_now(search.held.request)
                 in_turn = self._in_turn(allowed, without, self._trials.well_beside(search.id))
-            return any(self._fill_from(search, status, group) for group in groups(in_turn, _breaks_first))
+            return any(self._fill_from(search, status, group) for group in groups(in_turn, _breaks_first)) or None
+
+        with search.telling(SOON_S, "the next one is being loaded"):
+            return search.until_had(one_pass) is not None
 
     def _fill_from(self, search: _Search, status: Status, group: Sequence[Alternative]) -> bool:
         present = self._in_use(search.held)

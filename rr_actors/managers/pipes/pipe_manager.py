@@ -14,6 +14,7 @@ import msgspec
 from rr_actors.base.errors import LoadFailed, RrError, UnknownQuery, did_you_mean, shown
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.toml import wrong
 from rr_actors.managers.components import (
     LOAD_MARGIN_S,
@@ -124,6 +125,7 @@ class Pipes(Components):
         """
         held: list[tuple[Query, Component]] = []
         failures: dict[str, str] = {}
+        wanted = ""
         while (chain := best_chain(self._links(failures), goal)) is not None:
             self._keep_common(held, chain)
             try:
@@ -134,12 +136,12 @@ class Pipes(Components):
                 if current().stopping.is_set():
                     raise
                 name = chain[len(held)].name
-                failures[name] = str(error)
+                failures[name], wanted = str(error), wanted or wanted_by(error)
                 if is_own_fault(error):
                     self._lower(self._described[name], new_id())
         if failures:
             why = [f"{name}: {text}" for name, text in failures.items()]
-            raise NoPipe("\n".join([f"no pipe for {request.of_type!r} could be run:", *why]))
+            raise NoPipe("\n".join([f"no pipe for {request.of_type!r} could be run:", *why]), wanted=wanted)
         raise NoPipe("\n".join([f"no pipe for {request.of_type!r} can be built:", *why_none(self._links(), goal)]))
 
     def _keep_common(self, held: list[tuple[Query, Component]], chain: Sequence[Link]) -> None:

@@ -17,6 +17,7 @@ from rr_actors.base.errors import (
     RegistrarDown,
     UsageError,
 )
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
@@ -28,7 +29,7 @@ _FAILED = (State.ERROR, State.FATAL)
 
 def is_own_fault(error: BaseException) -> bool:
     """Return whether what could not be loaded is to blame for it."""
-    return isinstance(error, LoadError) and not isinstance(error, _OF_OTHERS)
+    return isinstance(error, LoadError) and not isinstance(error, _OF_OTHERS) and not wanted_by(error)
 
 
 def is_own_failure(status: Status) -> bool:

@@ -32,6 +32,10 @@ class Retries(Generic[K]):
         """End all waits, and those that come."""
         self._is_stopped.set()
 
+    def pause(self, wait_s: float) -> bool:
+        """Wait for so long, or until stop(). Return whether it goes on after that."""
+        return not self._is_stopped.wait(wait_s)
+
     def used(self, key: K) -> None:
         """Note that it is used from now on."""
         with self._lock:
@@ -67,7 +71,7 @@ class Retries(Generic[K]):
         if wait_s is not None:
             if wait_s > SOON_S:
                 say(f"{what} is tried again in {wait_s:.1f} s, as it has failed repeatedly")
-            self._is_stopped.wait(wait_s)
+            self.pause(wait_s)
         return wait_s
 
     def _is_over(self, key: K, now: float, after_s: float) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import functools
+import itertools
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -20,8 +21,10 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import LoadFailed, RegistrarDown, RrError, Unavailable, UnknownQuery
 from rr_actors.base.names import parse_server
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.managers.planning.hedging import HEDGE_S, first_of
 from rr_actors.managers.planning.retries import GIVEN_UP, Retries
+from rr_actors.managers.planning.setbacks import BACKOFF
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
@@ -49,6 +52,7 @@ class Search(Generic[C]):
     Attributes:
         id: of the resource whose callback runs.
         tried: why each candidate before could not be had.
+        wanted: what the machine had no more of for a candidate of this pass, "ENOSPC: ..."; "": it had all.
         decided_at: when it was decided what to load, by the monotonic clock.
     """
 
@@ -64,18 +68,28 @@ class Search(Generic[C]):
         self._registrar, self._name, self._text = registrar, name, text
         self._wait_s: Callable[[C], float | None] = lambda one: retries.wait_s(key(one))
         self._rest: Callable[[C], float | None] = lambda one: retries.rest(key(one), name(one), self.say)
+        self._pause = retries.pause
         self.id = current().resource_id
         self.tried: list[str] = []
+        self.wanted = ""
         self.decided_at = time.monotonic()
         self._lock = threading.Lock()
-        self._is_over = False
+        self._is_over = self._has_said = False
 
     # -- the holders -----------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def telling(self, after_s: float, what: str) -> Generator[None]:
-        """Tell the holders `what` with WARNING if nothing is found within so many seconds. Say nothing after that."""
-        late = threading.Timer(after_s, contextvars.copy_context().run, (self.say, what))  # a part of this callback
+        """Tell the holders `what` with WARNING if nothing is found, or said, within so many seconds.
+
+        Say nothing after that.
+        """
+
+        def tell() -> None:
+            if not self._has_said:
+                self.say(what)
+
+        late = threading.Timer(after_s, contextvars.copy_context().run, (tell,))  # a part of this callback
         late.daemon = True
         late.start()
         try:
@@ -89,6 +103,7 @@ class Search(Generic[C]):
         """Tell the holders WARNING while nothing is found."""
         with self._lock, contextlib.suppress(RrError):  # it is being unloaded
             if not self._is_over:
+                self._has_said = True
                 self._registrar.send_status(self.id, Status(State.WARNING, self._text(what)))
 
     # -- trying ----------------------------------------------------------------------------------------------------
@@ -131,6 +146,7 @@ class Search(Generic[C]):
         def note(one: C, error: Exception) -> None:
             check()
             self.tried.append(f"{self._name(one)}: {error}")
+            self.wanted = self.wanted or wanted_by(error)
             if not isinstance(error, _GivenUp):
                 failed(one, error)
 
@@ -163,6 +179,30 @@ class Search(Generic[C]):
                 note(won.candidate, error)
             else:
                 return taken
+
+    def until_had(self, search: Callable[[], T | None]) -> T | None:
+        """Return what one pass over the candidates finds. While the machine has no more of what one needs, pass again.
+
+        The holders hear WARNING, and each pass waits longer.
+
+        Raises:
+            UnknownQuery: the resource is being unloaded.
+            RegistrarDown: this process stops. The next one hears the status again.
+        """
+        before, said = list(self.tried), ""
+        for count in itertools.count():
+            self.wanted = ""
+            found = search()
+            if found is not None or not self.wanted:
+                return found
+            if said != self.wanted:
+                said = self.wanted
+                self.say(f"no other one can be started now, and that is tried again: {said}")
+            if not self._pause(BACKOFF.delay(count, 0.0)):
+                raise RegistrarDown(f"{self.wanted}; {self._registrar.name} stops", registrar=self._registrar.name)
+            self.check_wanted()
+            self.tried[:] = before
+        return None
 
     def as_part(self, load: Loading) -> Reply[Query]:
         """Begin to load a part of the resource whose callback runs."""

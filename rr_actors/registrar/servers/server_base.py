@@ -7,6 +7,7 @@ from typing import Any, Protocol, cast
 
 from rr_actors.base.errors import CircularDependency, GraphError, LoadFailed, OverCapacity, readable, text_of
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.scarcity import wanted_by_callback
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.server import ServerSpec
@@ -60,6 +61,8 @@ def load_failure(error: BaseException, origin: str) -> Failure:
     else:
         text, lines = text_of(error), traceback_of(error)
     details = {"server": origin, "traceback": lines}
+    if wanted := wanted_by_callback(error):
+        details["wanted"] = wanted
     return Failure("LoadFailed", readable(f"{origin}: {text}"), details, described.trace)
 
 
