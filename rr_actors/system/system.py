@@ -590,17 +590,22 @@ class System:
 
     def _tree_ended(self, report: ExitReport) -> None:
         self._end = report
+        why = report.detail or report.reason
         if self._node is not None:  # the threads that wait for a part of it hear of its end
-            node = self._node
-            why = report.detail or report.reason
-            node.directory.mark(actor_key(self._top), Presence.GONE, why)
-            entries = Entries(node.directory, ChildRecords(node.info.state_dir))
-            for name in entries.registrars_of(as_child_spec(self.root), self._top):
-                if name not in node.registrars:
-                    node.directory.mark(registrar_key(name), Presence.GONE, why)
-        logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
+            try:
+                self._mark_gone(self._node, why)
+            except (RrError, OSError) as error:  # a full disk: they wait for their time limits
+                logger.warning("system %s: the end of its tree could not be marked: %s", self.name, error)
+        logger.error("system %s: its root supervisor has ended: %s", self.name, why)
         self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
+
+    def _mark_gone(self, node: Node, why: str) -> None:
+        node.directory.mark(actor_key(self._top), Presence.GONE, why)
+        entries = Entries(node.directory, ChildRecords(node.info.state_dir))
+        for name in entries.registrars_of(as_child_spec(self.root), self._top):
+            if name not in node.registrars:
+                node.directory.mark(registrar_key(name), Presence.GONE, why)
 
     def _running(self) -> Node:
         node = self._node

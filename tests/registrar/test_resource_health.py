@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import resource
 import signal
 import threading
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 import rr_actors as rr
 from rr_actors.registrar.model.health import ProbeResult, first_counts, judged
 from rr_actors.registrar.model.rows import State
-from support import Calls, Gate, eventually, serve, wait_gone
+from support import Calls, Gate, eventually, pid_of, serve, wait_gone
 
 Start = Callable[..., rr.System]
 
@@ -392,6 +393,10 @@ class Cameras(rr.Manager):
     def __init__(self, folder: str) -> None:
         super().__init__()
         self.folder = Path(folder)
+        self.probed = 0
+
+    def probes(self) -> int:
+        return self.probed
 
     def _note(self, what: str) -> None:
         with (self.folder / "calls").open("a") as calls:
@@ -403,6 +408,7 @@ class Cameras(rr.Manager):
 
     @open_camera.health
     def look(self, request: str, response: str) -> None:
+        self.probed += 1
         self._note("probed")
         if (self.folder / "broken").exists():
             raise OSError("no picture")
@@ -454,3 +460,19 @@ def test_a_server_that_another_process_registers_is_probed_there(
     there = system.registrar("cameras")
     there.register_server("eye", lambda request: request, health=OFTEN, probe=lambda request, response: FATAL)
     assert app.load("cameras/eye", 1).wait_status("FATAL", timeout_s=60).message == "health: FATAL"
+
+
+def test_a_state_that_a_full_disk_did_not_take_is_announced_when_it_has_room(
+    cameras: tuple[rr.System, Callable[[], list[str]]], tmp_path: Path
+) -> None:
+    system, _ = cameras
+    messages = system.ref("cameras").proxy()
+    query, pid = system.open_registrar("app").load("cameras/cam", "front"), pid_of(system, "cameras")
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, before[1]))  # so the callback fails, too
+    probed = messages.probes().get()
+    eventually(lambda: messages.probes().get() > probed + 5)
+    assert query.state is OK
+    (tmp_path / "broken").touch()
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+    query.wait_status(ERROR, timeout_s=30)

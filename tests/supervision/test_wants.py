@@ -7,6 +7,7 @@ import fcntl
 import itertools
 import os
 import resource
+import signal
 import sqlite3
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -144,6 +145,19 @@ def test_a_start_of_a_system_that_fails_for_want_names_it(tmp_path: Path, wants:
     with pytest.raises(rr.StartFailed, match="ENOSPC: the disk is full, or has no inode left") as failed:
         rr.System(tree(), state_dir=tmp_path / "state", config=CONFIG).start()
     assert failed.value.wanted.startswith("ENOSPC")
+
+
+@pytest.mark.parametrize("kind", ["inodes", "descriptors"])
+def test_the_end_of_a_tree_is_heard_although_it_cannot_be_marked(tmp_path: Path, wants: Wants, kind: str) -> None:
+    system = rr.System(tree(max_restarts=0), state_dir=tmp_path / "state", config=CONFIG).start()
+    process = pid_of(system, "maker")
+    wants.arm("application", kind, 1, lasts=True)
+    os.kill(process, signal.SIGKILL)
+    assert system.wait(timeout_s=30.0)
+    assert wants.disarm()
+    assert system.ended is not None
+    assert "1 restart needed within 5 s, 0 allowed" in system.ended.detail
+    system.stop()
 
 
 # -- each request of a scene refused in its turn ---------------------------------------------------------------------

@@ -10,7 +10,7 @@ from concurrent.futures import Future
 from typing import Any, cast
 
 from rr_actors.base.checks import is_number
-from rr_actors.base.errors import InvalidResponse, Unavailable, is_a, readable, shown
+from rr_actors.base.errors import InvalidResponse, RrError, Unavailable, is_a, readable, shown
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.core.callback_runs import deaths_of, is_given_up
@@ -29,7 +29,7 @@ from rr_actors.registrar.model.health import (
 )
 from rr_actors.registrar.model.roles import HEALTH, USAGE
 from rr_actors.registrar.model.rows import LOADED, PAUSED, Resource, State
-from rr_actors.registrar.servers.server_base import ServerBase, nothing, said
+from rr_actors.registrar.servers.server_base import ServerBase, said
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.thread_rules import on_loop
 from rr_actors.runtime.time_limits import Probes, ProbeTimes
@@ -244,6 +244,12 @@ class HealthCallbacks:
         if state is None:
             return
         text = readable(f"health: {found.message or found.state}")
-        if error is not None:
-            log_raised(logger, error, "%s: %s; resource %s has the state %s", self._origin, text, resource_id, state)
-        self._registrar.post(c.SetStatus(resource_id, new_id(), state, text, nothing))
+
+        def done(refused: RrError | None) -> None:
+            if refused is not None:  # a full disk, for instance: the next results announce it
+                self._counts.pop(resource_id, None)
+            elif error is not None:
+                what = "%s: %s; resource %s has the state %s"
+                log_raised(logger, error, what, self._origin, text, resource_id, state)
+
+        self._registrar.post(c.SetStatus(resource_id, new_id(), state, text, done))
