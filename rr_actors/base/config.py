@@ -127,6 +127,10 @@ class SystemConfig:
             Default: True. Turn it off if nobody but the application may.
         clients_limit: the clients (rr.connect) and consoles that may be connected at once, however many connections
             each has. Default: 128. Raise it for a larger pool of workers.
+        events_limit_bytes: the size of the files in which the system remembers what happened. Default: 16,777,216.
+            Raise it if a day does not fit; lower it on a small disk.
+        events_kept_s: for how many seconds the system remembers what happened. Default: 86,400.0, a day. Raise it to
+            ask on Monday about the weekend.
         registrars: other configurations, by the registrar's name. Default: {}, none. Name a registrar that differs from
             the others.
 
@@ -146,6 +150,8 @@ class SystemConfig:
     durability: Durability = "process"
     console: bool = True
     clients_limit: int = 128
+    events_limit_bytes: int = 16 * 2**20
+    events_kept_s: float = 86_400.0
     registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
 
     def __post_init__(self) -> None:
@@ -259,6 +265,8 @@ _SYSTEM_RULES: dict[str, _Rule] = {
     "durability": _DURABILITY,
     "console": _BOOL,
     "clients_limit": _COUNT,
+    "events_limit_bytes": _COUNT,
+    "events_kept_s": _SECONDS,
     "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),
 }
 

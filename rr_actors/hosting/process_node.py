@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
@@ -249,8 +250,8 @@ class ProcessNode(abc.ABC):
         return None if entry is None else entry.status
 
     def emit(self, event: str, **facts: Any) -> None:
-        """Pass an event with its facts to on_event."""
-        self.on_event({"event": event, **facts})
+        """Pass an event with its facts to on_event; `at` is now, if they do not say when it happened."""
+        self.on_event({"event": event, "at": time.time(), **facts})
 
     def _dead_letter(self, letter: DeadLetter, count: int) -> None:
         facts = msgspec.structs.asdict(letter) | {"count": count}

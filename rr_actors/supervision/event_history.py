@@ -1,28 +1,18 @@
 """History: the events of a supervisor's children and their reasons, kept in memory and written to the log.
 
-TreeLog has those of a whole tree, also in a file of the state directory. It outlives the supervisors, the tree and the
-system, so anybody can look at it afterwards.
-
 One line for each record on the logger rr_actors.supervision, "exited path=root/cameras reason=killed ...", with the
 same facts as the log record's attribute `supervision`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import time
 from collections import deque
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import readable
-from rr_actors.base.folder import Folder
-from rr_actors.base.names import child_meant, no_child
 from rr_actors.base.notebook import bundle, table
 from rr_actors.base.reporting.log import Log
 
@@ -169,101 +159,3 @@ def _short(value: object) -> str:
         return f"{value:.3f}"
     text = str(value)
     return repr(text) if " " in text or "\n" in text else text
-
-
-# -- the log of a tree -------------------------------------------------------------------------------------------------
-
-FILE = "history.jsonl"
-"""Each line is a JSON object. When the file is full, it becomes the older one of two."""
-OLDER = "history.1.jsonl"
-_FULL_BYTES = 2**20
-_LOGGED = 2000
-_TRACEBACK = 4000  # characters
-_decoder = msgspec.json.Decoder(Record)
-
-
-class TreeLog:
-    """The log of one run of a tree. take() is called on the loop, the rest from any thread.
-
-    Args:
-        folder: the state directory. records() reads those of earlier runs there.
-    """
-
-    def __init__(self, folder: Folder) -> None:
-        self._folder = folder
-        self._records = deque[Record](maxlen=_LOGGED)
-        self._began = time.time()
-        self._has_failed = False
-
-    def take(self, event: dict[str, Any]) -> None:
-        """Keep the record of a child's event, or of the end of the root supervisor."""
-        facts = {"kind": "supervisor", "run": 0, "at": time.time()} | event
-        record = msgspec.convert(facts, Record)
-        detail, traceback = readable(record.detail), readable(record.traceback[-_TRACEBACK:])
-        record = msgspec.structs.replace(record, detail=detail, traceback=traceback)
-        self._records.append(record)
-        try:
-            self._write(msgspec.json.encode(record) + b"\n")
-        except OSError as error:  # a full disk, or the directory is gone
-            if not self._has_failed:
-                self._has_failed = True
-                logger.warning("%s: not written, from now on: %s", self._folder.path / FILE, error.strerror)
-
-    def _write(self, line: bytes) -> None:
-        with self._folder.open(FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as file:
-            file.write(line)
-            is_full = os.fstat(file.fileno()).st_size > _FULL_BYTES
-        if is_full:
-            self._folder.rename(FILE, OLDER)
-
-    def records(self) -> list[Record]:
-        """Return the newest records of this run and of those before it, oldest first."""
-        earlier = [record for record in _read(self._folder) if record.at < self._began]
-        return [*earlier, *self.of_this_run()][-_LOGGED:]
-
-    def of_this_run(self) -> list[Record]:
-        """Return the records since the system has started."""
-        return list(self._records.copy())
-
-
-def left_records(state_dir: Path) -> list[Record]:
-    """Return the records that the systems of a state directory have left, oldest first; none without the directory."""
-    try:
-        with Folder.at(state_dir, to_read=True) as folder:
-            return list(_read(folder))
-    except OSError:
-        return []
-
-
-def _read(folder: Folder) -> Iterator[Record]:
-    for name in (OLDER, FILE):
-        with contextlib.suppress(OSError):
-            for line in folder.read(name).splitlines():
-                with contextlib.suppress(msgspec.DecodeError):  # its process was killed while it wrote
-                    yield _decoder.decode(line)
-
-
-def records_of(records: list[Record], child: str) -> list[Record]:
-    """Return the records of the child of a path or id, and of all below it; with "" all of them.
-
-    Raises:
-        NotFound: there is no such child among them or above them, or several have the id.
-    """
-    if not child:
-        return records
-    paths = {path for record in records for path in _with_parents(record.path)}  # a root has no record of its own
-    if (found := child_meant(child, paths)) is None:
-        raise no_child(child, paths)
-    return records_below(records, found)
-
-
-def records_below(records: list[Record], path: str) -> list[Record]:
-    """Return the records of the child at this path, and of all below it; none if none is kept."""
-    return [record for record in records if f"{record.path}/".startswith(f"{path}/")]
-
-
-def _with_parents(path: str) -> Iterator[str]:
-    """Yield a path, then those of the supervisors above it."""
-    while path:
-        yield path
-        path = path.rpartition("/")[0]

@@ -71,7 +71,6 @@ from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.streams.stream import StreamInfo
 from rr_actors.supervision.core.rendering import Tree
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, classes_of
-from rr_actors.supervision.event_history import TreeLog
 from rr_actors.supervision.given_up import give_up
 from rr_actors.supervision.hosted import Hosted, check_hostable, prepare
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
@@ -81,6 +80,7 @@ from rr_actors.system.backups import Backup, back_up, restore
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
+from rr_actors.system.recording.event_memory import EventMemory
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings
@@ -236,7 +236,7 @@ class System:
             self._starting = starting
             try:
                 self._state = state = open_state_dir(path)
-                self._log = TreeLog(state.folder)
+                self._memory = EventMemory(state.folder, self.config.events_limit_bytes, self.config.events_kept_s)
                 self._child_logs = KeptLogs()
                 self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
                 place = str(state.path), str(state.run_dir), state.key
@@ -324,7 +324,7 @@ class System:
             await give_up_clients(node, dormant)
             if self.config.console:
                 shut_down = weakly(self._shut_down)
-                kept = self._log, self._child_logs
+                kept = self._memory, self._child_logs
                 self._console = Console(self, node, self._subscribers, self._recordings, *kept, shut_down)
                 await self._console.open()
             self._tree = prepare(node, SupervisorActor, self._top, weakly(self._tree_ended))
@@ -597,7 +597,8 @@ class System:
             except (RrError, OSError) as error:  # a full disk: they wait for their time limits
                 logger.warning("system %s: the end of its tree could not be marked: %s", self.name, error)
         logger.error("system %s: its root supervisor has ended: %s", self.name, why)
-        self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
+        if self._node is not None:
+            self._node.emit("ended", path=self._top, reason=report.reason, detail=report.detail)
         self._ended.set()
 
     def _mark_gone(self, node: Node, why: str) -> None:
@@ -919,8 +920,8 @@ class System:
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
-        elif "path" in event:
-            self._log.take(event)
+        if event.pop("kept", False) or "path" in event:
+            self._memory.take(event)
         if self._subscribers.listened:
             self._subscribers.tell(event)
 

@@ -1,10 +1,11 @@
-"""Explanations: texts that say who holds a resource, for whom, why it waits, and whom an actor waits for."""
+"""Explanations: who holds a resource, for whom, why it waits, how it is since when, and whom an actor waits for."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from rr_actors.actors.messaging.mailbox_looks import COUNTED, ON_START, MailboxInfo, MessageInfo
 from rr_actors.base.errors import NotFound, Unavailable, UnknownQuery, UsageError, few, shown
@@ -14,12 +15,14 @@ from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
 from rr_actors.streams.stream import StreamRow
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import Found
-from rr_actors.system.console.console_questions import Find
-from rr_actors.system.recording.event_texts import ago
+from rr_actors.system.console.console_questions import Find, ListEvents, ListHistory
+from rr_actors.system.recording.event_memory import Event
+from rr_actors.system.recording.event_texts import ago, event_text
 
 _MOST = 5  # things that one beginning of an id may name
 _WELL = ("OK", "UPDATE")
 _DEEP = 8  # resources above one another
+_BEFORE = 5  # events that came before a state
 _ID = re.compile(r"[0-9a-f]{12}7[0-9a-f]{19}")
 _NAMES_KEPT = 10_000
 _names: dict[str, str] = {}  # of resources, by their ids
@@ -79,7 +82,10 @@ def seconds_text(seconds: float) -> str:
 
 
 def _since(id: str) -> str:
-    at = since(id)
+    return _since_time(since(id))
+
+
+def _since_time(at: float | None) -> str:
     if at is None:
         return ""
     return f" since {time.strftime('%H:%M:%S', time.localtime(at))} ({ago(max(0.0, time.time() - at))})"
@@ -105,6 +111,7 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
         yield f"It is revoked ({resource.message}): it is unloaded when its holders have let it go, or at the deadline."
     elif resource.message and resource.phase in ("loaded", "unloading", "paused"):
         yield f"Its last status was {resource.state}: {resource.message}"
+    yield from _past_of(client, resource)
     if not resource.holder_count:
         yield "Nobody holds it."
     elif resource.priority is None:
@@ -120,6 +127,38 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
         yield f"Its stream {stream.info.name!r} {by}."
     for part in resource.parts:
         yield from _of_part(client, part, "", {resource.id})
+
+
+def _past_of(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
+    """Say since when a resource has its state, and what happened before to it and to the child that serves it."""
+    events = [one for one in client.ask(ListEvents(resource.id)).events if one.facts.get("resource_id") == resource.id]
+    since = None
+    for event in reversed([one for one in events if one.event == "status"]):
+        if event.facts["detail"].partition(" ")[0] != resource.state:
+            break
+        since = event.at
+    if since is not None:
+        with contextlib.suppress(NotFound):  # an application's registrar is no child
+            events += client.ask(ListHistory(resource.server.partition("/")[0])).events
+        yield from _past("It", resource.state, since, events)
+
+
+def past_of_child(client: ConsoleClient, id: str) -> Iterator[str]:
+    """Say since when a child has its state, and what happened to it before; nothing of what is no child."""
+    with contextlib.suppress(NotFound):
+        events = client.ask(ListHistory(id)).events
+        path = min((one.path for one in events), key=len, default="")
+        own = [one for one in events if one.path == path and one.facts.get("state") is not None]
+        if len(own) > 1 and path.rpartition("/")[2] == id.rpartition("/")[2]:
+            yield from _past(path, own[-1].facts["state"], own[-1].at, own)
+
+
+def _past(what: str, state: str, since: float, events: Sequence[Event]) -> Iterator[str]:
+    yield f"{what} has been {state}{_since_time(since)}."
+    before = sorted((one for one in events if one.at < since), key=lambda one: one.at)[-_BEFORE:]
+    if before:
+        yield "Before that:"
+        yield from (f"  {event_text(one.at, one.event, one.facts)}" for one in before)
 
 
 def readers_text(stream: StreamRow) -> str:

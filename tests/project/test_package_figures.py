@@ -18,6 +18,16 @@ from package_figures import (
 import rr_actors as rr
 from rr_actors import managers
 
+REMEMBERING = {
+    f"rr_actors/{name}.py"
+    for name in (
+        "base/errors", "base/folder", "base/values/canonical", "base/values/fitting", "hosting/process_node",
+        "supervision/child_main", "supervision/child_runs", "supervision/control_channel",
+        "system/endings", "system/recording/event_memory", "system/system",
+    )
+}  # fmt: skip
+"""The files that a status passes on its way into the system's memory (docs/decisions/0076), not to its holders."""
+
 
 def test_no_room_imports_a_room_above_it() -> None:
     assert imports_up() == []
@@ -40,7 +50,7 @@ def test_functions_are_as_short_as_they_were() -> None:
 def test_a_load_a_status_and_a_restore_pass_no_more_files_than_they_did() -> None:
     assert len(registrar_entries("load")) <= 3
     assert len(passed("load")) <= 25
-    assert len(passed("status")) <= 25
+    assert len(passed("status") - REMEMBERING) <= 25
     assert len(passed("restore")) <= 58
 
 

@@ -21,7 +21,6 @@ import rr_actors as rr
 from rr_actors.base.errors import ConfigError, NotFound, NotRunning, RrError, Unavailable, UnknownQuery, UsageError
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.pages import Page, ResourceRow, Wanted
-from rr_actors.supervision import event_history
 from rr_actors.system.console import console_feed, console_view
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import (
@@ -426,21 +425,21 @@ def test_the_history_of_a_child_tells_of_its_exits(shop: rr.System, console: Con
     assert shop.ref("shop").kill()
 
     def restarted() -> bool:
-        records = console.ask(ListHistory("shop")).records
+        records = console.ask(ListHistory("shop")).events
         return [record.event for record in records] == ["started", "exited", "restarted"]
 
     eventually(restarted)
 
 
-def test_a_child_that_runs_and_of_which_no_record_is_kept_has_an_empty_history(
+def test_a_child_that_runs_and_of_which_no_event_is_kept_has_an_empty_history(
     start: Start, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(event_history, "_LOGGED", 1)
+    monkeypatch.setattr(console_view, "_HISTORY", 1)
     start(rr.Supervisor([rr.ChildSpec(rr.Actor, id=id, placement="thread") for id in ("older", "newer")], id="root"))
 
     with ConsoleClient(find_console(state_dir)) as client:
-        assert [record.path for record in client.ask(ListHistory("root")).records] == ["root/newer"]
-        assert client.ask(ListHistory("older")).records == []
+        assert [event.path for event in client.ask(ListHistory("root")).events] == ["root/newer"]
+        assert client.ask(ListHistory("older")).events == []
         with pytest.raises(NotFound, match="'nobody': there is no child of this path or id"):
             client.ask(ListHistory("nobody"))
 

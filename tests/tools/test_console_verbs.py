@@ -564,7 +564,7 @@ def test_of_records_that_are_too_long_for_one_answer_the_newest_are_shown(start:
         left_out = 2 * ends + 1 - len(lines)
         assert 0 < left_out < ends
         (note,) = shown.stderr.splitlines()
-        assert note.startswith(f"{left_out} older records are not shown: they are too long for one answer")
+        assert note.startswith(f"{left_out} older events are not shown: they are too long for one answer")
 
 
 def test_dead_letters_are_shown(shop: rr.System) -> None:
@@ -1424,3 +1424,56 @@ def test_graph_writes_no_png_to_a_terminal(shop: rr.System) -> None:
 
     assert ran.returncode == 2
     assert "got a terminal: rr-actors graph --format png > graph.png" in ran.stderr
+
+
+# -- what was before -------------------------------------------------------------------------------------------------
+
+
+def test_events_show_what_happened_to_resources_before_they_were_asked_for(app: rr.Registrar, shop: rr.System) -> None:
+    query = app.load("shop/thing", Order("lamp"))
+    shop.registrar("shop").send_status(query, rr.Status("ERROR", "no frame"))
+    query.wait_status("ERROR")
+
+    (line,) = said("events", "--event", "status").splitlines()
+    assert "lamp" in line
+    assert "ERROR no frame" in line
+    assert "heard by app" in line
+    assert said("events", "--server", "shop/thing") == said("events", "--server", "shop") == f"{line}\n"
+    (event,) = map(json.loads, said("events", "--event", "status", "--json").splitlines())
+    assert (event["resource_id"], event["detail"]) == (query.resource_id, "ERROR no frame")
+    assert "status" not in said("history")
+
+
+def test_why_says_since_when_a_resource_is_as_it_is_and_what_came_before(app: rr.Registrar, shop: rr.System) -> None:
+    query = app.load("shop/thing", Order("lamp"))
+    registrar = shop.registrar("shop")
+    assert "has been" not in said("why", query.resource_id)
+    registrar.send_status(query, rr.Status("WARNING", "dusty"))
+    old = kill(shop, "shop")
+    wait_respawned(shop, "shop", old)
+    for state, message in (("ERROR", "no frame"), ("ERROR", "no light")):
+        eventually(lambda: registrar.stats())
+        registrar.send_status(query, rr.Status(state, message))
+    query.wait_status("ERROR")
+
+    lines = said("why", query.resource_id).splitlines()
+
+    at = next(i for i, line in enumerate(lines) if line.startswith("It has been ERROR since "))
+    assert lines[at + 1] == "Before that:"
+    before = lines[at + 2 : at + 6]
+    assert [line.split()[1] for line in before] == ["started", "status", "exited", "restarted"]
+    assert "WARNING dusty" in before[1]
+    assert "SIGKILL" in before[2]
+    assert "no frame" not in "".join(before)
+
+
+def test_why_says_since_when_a_child_runs_and_how_it_ended_before(shop: rr.System) -> None:
+    old = kill(shop, "shop")
+    wait_respawned(shop, "shop", old)
+
+    lines = said("why", "shop").splitlines()
+
+    at = next(i for i, line in enumerate(lines) if line.startswith("root/shop has been running since "))
+    assert lines[at + 1] == "Before that:"
+    assert [line.split()[1] for line in lines[at + 2 :]] == ["started", "exited"]
+    assert "SIGKILL" in lines[-1]

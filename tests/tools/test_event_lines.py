@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from rr_actors.system.console.console_messages import Event
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines
 
 THIRTEEN = time.mktime((2026, 11, 28, 13, 13, 13, 0, 0, -1))

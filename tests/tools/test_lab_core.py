@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rr_actors.base.errors import ConfigError, UsageError
-from rr_actors.system.console.console_messages import Event
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.timeline_lanes import Bar, Lane, Mark
 from rr_actors.system.recording.timelines import Timeline
 from rr_actors.tools.web.lab.lab_declarations import LabDeclaration, LabExperiment, Lever, Question, Seen, Sign

@@ -27,6 +27,7 @@ from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.recording import event_texts
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.tools import explanations
 from rr_actors.tools.tables import load_tables
 from rr_actors.tools.terminal import event_lines, terminal_app, terminal_rows
@@ -86,17 +87,18 @@ LOADS = [
     LoadRow("lenses/lens", 3, 1, 2, 0, 1, 0.012, 0.02, 0.02, 0.024),
     LoadRow("lenses/filter", 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0),
 ]
-HISTORY = [
+_RECORDS = [
     Record("started", "root/inner/cameras", "manager", 2, NOW - 100, "running", PID + 2, ready_s=0.25),
     Record("exited", "root/inner/cameras", "manager", 2, NOW - 12.5, "restarting", PID + 2, "killed", "SIGKILL",
            -9, "SIGKILL", restarts=2, up_s=87.5),
     Record("restarted", "root/inner/cameras", "manager", 5, NOW - 12, "running", PID + 3, restarts=2, ready_s=0.125),
 ]  # fmt: skip
+HISTORY = [Event.of({"event": one.event, **one.facts()}) for one in _RECORDS]
 _DUSTY = {"detail": "WARNING dusty", "status_id": "s", "source": "lenses/lens"}
 EVENTS = [
-    c.Event(1, NOW - 3, "status", {"server": "cameras/camera", "request": '"/dev/video0"', "heard_by": "app"} | _DUSTY),
-    c.Event(2, NOW - 3, "status", {"server": "lenses/lens", "request": '"front"', "heard_by": ""} | _DUSTY),
-    c.Event(3, NOW - 2, "loaded", {"server": "cameras/camera", "request": '"/dev/video1"', "detail": ""}),
+    Event(1, NOW - 3, "status", {"server": "cameras/camera", "request": '"/dev/video0"', "heard_by": "app"} | _DUSTY),
+    Event(2, NOW - 3, "status", {"server": "lenses/lens", "request": '"front"', "heard_by": ""} | _DUSTY),
+    Event(3, NOW - 2, "loaded", {"server": "cameras/camera", "request": '"/dev/video1"', "detail": ""}),
 ]
 
 
@@ -125,7 +127,9 @@ class Stage(ConsoleLink):
                 streams = [row for row in STREAMS if match in row.info.id]
                 return c.Streams(len(streams), streams[offset : offset + limit])
             case questions.ListHistory(path, _):
-                return c.Happenings([record for record in HISTORY if record.path.startswith(path)])
+                return c.Happenings([event for event in HISTORY if event.path.startswith(path)])
+            case questions.ListEvents():
+                return c.Happenings(HISTORY)
             case questions.ListLog(path):
                 return c.ChildLog(path, 0, [])
             case questions.Find(id):

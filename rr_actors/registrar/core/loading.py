@@ -57,6 +57,8 @@ from rr_actors.registrar.model.rows import (
     State,
 )
 
+LONG_S = 1.0
+"""A load callback that took so long is kept in the system's memory."""
 _NONE: dict[bytes, str] = {}
 
 
@@ -234,7 +236,8 @@ def load_ended(decision: Decision, ended: CallbackEnded) -> None:
         return
     resource = replace(resource, phase=LOADED, response=ended.response)
     decision.put(resource)
-    decision.cause(Happened("loaded", resource, ""))
+    is_long = ended.took_s >= LONG_S
+    decision.cause(Happened("loaded", resource, f"took {ended.took_s:.1f} s" if is_long else "", kept=is_long))
     end_limit(decision, resource)
     if catalog.callback_runs or catalog.trial or catalog.accused:
         _ended(decision, resource)
@@ -260,7 +263,7 @@ def _load_failed(decision: Decision, resource: Resource, failure: Failure) -> No
     drop_resource(decision, resource)
     end_limit(decision, resource)
     _ended(decision, resource)
-    decision.cause(Happened("load_failed", resource, failure.message))
+    decision.cause(Happened("load_failed", resource, failure.message, kept=True))
     release_parts(decision, resource.id, after)
     settle(decision, resource.server)
 

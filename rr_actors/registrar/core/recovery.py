@@ -418,7 +418,7 @@ def pause_ended(decision: Decision, ended: CallbackEnded) -> None:
         return
     note_ended(decision, "pause", resource.id)
     if ended.failure is not None:
-        decision.cause(Happened("pause_failed", resource, ended.failure.message))
+        decision.cause(Happened("pause_failed", resource, ended.failure.message, kept=True))
         _runs(decision, resource)
         return
     touch(decision, resource.id)

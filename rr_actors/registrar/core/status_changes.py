@@ -63,9 +63,10 @@ def _note(decision: Decision, resource: Resource, said: Notice) -> Resource:
     if lasting is not resource.state and lasting is State.FATAL:
         touch(decision, resource.id)  # it needs its parts no more
     response = resource.response if said.response is None else said.response
+    is_new = (lasting, said.message) != (resource.state, resource.message)  # else it would fill the memory
     resource = replace(resource, state=lasting, message=said.message, response=response)
     decision.put(resource)
-    decision.cause(Happened("status", resource, f"{said.state} {said.message}".rstrip(), said))
+    decision.cause(Happened("status", resource, f"{said.state} {said.message}".rstrip(), said, is_new))
     if lasting is State.FATAL and resource.phase in RESTING:
         return stay_lost(decision, resource, said.message)
     return resource
@@ -115,7 +116,7 @@ def _is_revocable(catalog: Catalog, resource: Resource) -> bool:
 def _revoke(decision: Decision, resource: Resource, revocation: Revocation, source: str = "") -> None:
     decision.put(revocation)
     limit_grace(decision, revocation)
-    decision.cause(Happened("revoked", resource, revocation.why))
+    decision.cause(Happened("revoked", resource, revocation.why, kept=True))
     source = source or decision.catalog.origin_of(resource)
     place = (revocation.event, "", "", resource.id, revocation.event, State.FATAL, revocation.why, source)
     said = Notice(*place, reason=REVOKED, grace_ms=revocation.grace_ms)

@@ -309,7 +309,7 @@ def _keep(decision: Decision, resource: Resource, failure: Failure) -> None:
     touch(decision, resource.id)  # it may have lost its holders, or its parts their priority
     end_revocation(decision, resource.id)
     decision.put(replace(resource, phase=UNLOAD_FAILED, message=failure.message))
-    decision.cause(Happened("unload_failed", resource, failure.message))
+    decision.cause(Happened("unload_failed", resource, failure.message, kept=True))
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try
             remember(decision, query.id, failure)  # its holder does not let it go any more

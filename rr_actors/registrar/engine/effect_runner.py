@@ -96,7 +96,7 @@ class EffectRunner:
         for effect in effects:
             if type(effect) is e.SendReply and answer is None:
                 answer = effect
-            elif type(effect) is not e.Happened or self._is_heard():
+            elif type(effect) is not e.Happened or effect.kept or self._is_heard():
                 return None
         return _nothing if answer is None else self._consumers.by_line(answer.message)
 
@@ -206,7 +206,7 @@ class EffectRunner:
         registrar, resource = self._registrar, effect.resource
         if registrar.on_happened is not None:
             registrar.on_happened()
-        if not registrar.node.watched.level[0]:
+        if not (effect.kept or registrar.node.watched.level[0]):
             return
         facts: dict[str, Any] = {"request": text_of_value(resource.request), "detail": effect.detail}
         if effect.notice is not None:
@@ -214,7 +214,8 @@ class EffectRunner:
                 holders = dict.fromkeys(q.origin for q in registrar.catalog.queries_of(resource.id) if not q.parent)
             facts |= {"status_id": effect.notice.event, "source": effect.notice.source, "heard_by": ", ".join(holders)}
         server = registrar.catalog.origin_of(resource)
-        registrar.node.emit(effect.what, registrar=registrar.name, server=server, resource_id=resource.id, **facts)
+        where = {"registrar": registrar.name, "server": server, "resource_id": resource.id}
+        registrar.node.emit(effect.what, **where, **facts, kept=effect.kept)
 
     def _died(self, effect: e.Died) -> None:
         name = self._registrar.name

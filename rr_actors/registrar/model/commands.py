@@ -96,6 +96,7 @@ class CallbackEnded(Command, frozen=True, gc=False):
         response: what it returned; None: no response, or no new one.
         event: the id of a status that may follow from that.
         notice: of a status callback: what it heard; `handled`: it has dealt with the notice.
+        took_s: of a load callback: how long it ran, its wait for a thread included.
     """
 
     role: str
@@ -106,6 +107,7 @@ class CallbackEnded(Command, frozen=True, gc=False):
     event: str = ""
     notice: Notice | None = None
     handled: bool = False
+    took_s: float = 0.0
 
 
 class CallbackOverdue(Command, frozen=True):

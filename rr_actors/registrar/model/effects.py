@@ -152,10 +152,11 @@ Happening = Literal[
 class Happened(Effect, frozen=True):
     """Tell the watchers of the system what has happened to a resource: "loaded", "unloaded", "status" ...
 
-    `notice`: the status that the resource has got.
+    `notice`: the status that the resource has got. `kept`: the system's memory keeps it, also while nobody watches.
     """
 
     what: Happening
     resource: Resource
     detail: str
     notice: Notice | None = None
+    kept: bool = False

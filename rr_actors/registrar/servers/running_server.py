@@ -79,9 +79,8 @@ class LoadTimes:
         self.loaded = self.failed = 0
         self.seconds = self.longest_s = 0.0
 
-    def take(self, began_s: float, *, failed: bool) -> None:
-        """Count a callback that began at this time of the monotonic clock, and has ended now."""
-        took_s = time.monotonic() - began_s
+    def take(self, took_s: float, *, failed: bool) -> None:
+        """Count a callback that has ended, and took so long."""
         with self._lock:
             self.failed += failed
             self.loaded += not failed
@@ -267,9 +266,11 @@ class RunningServer:
             if reports.loads and not reports.forget_sent(resource.id):
                 return False
         self._streams_after(run, failed=False)
-        is_decided = self.registrar.decide_here(CallbackEnded(run.role.name, resource.id, run.number, None, response))
+        took_s = time.monotonic() - run.began_s if run.role is LOAD else 0.0
+        ended = CallbackEnded(run.role.name, resource.id, run.number, None, response, took_s=took_s)
+        is_decided = self.registrar.decide_here(ended)
         if is_decided and run.role is LOAD:
-            self.load_times.take(run.began_s, failed=False)
+            self.load_times.take(took_s, failed=False)
         return is_decided
 
     def _ended(self, run: Run, response: bytes | None, error: BaseException | None) -> None:
@@ -278,8 +279,9 @@ class RunningServer:
             self.registrar.progress.end(resource.id)
         if role.answer:
             error = error or self.too_long(resource, response)
+        took_s = time.monotonic() - run.began_s if role is LOAD else 0.0
         if role is LOAD:
-            self.load_times.take(run.began_s, failed=error is not None)
+            self.load_times.take(took_s, failed=error is not None)
         elif role is STATUS and error is not None:
             self.registrar.callback_failures += 1
         self._streams_after(run, failed=error is not None)
@@ -287,7 +289,7 @@ class RunningServer:
         event = new_id() if role.answer and role is not LOAD else ""
         handled = run.heard is not None and run.heard.is_handled
         end = role.name, resource.id, run.number, failure, None if error is not None else response, event
-        self.registrar.post(CallbackEnded(*end, run.effect.notice, handled))
+        self.registrar.post(CallbackEnded(*end, run.effect.notice, handled, took_s))
 
     def _streams_after(self, run: Run, *, failed: bool) -> None:
         """Let readers in to the streams that a callback has opened; close those of a resource that is gone."""

@@ -9,24 +9,23 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import time
 from collections.abc import Callable
 from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import NotSerializable, readable, shown
+from rr_actors.base.errors import TEXT_LIMIT, NotSerializable, readable
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_messages import (
     ANSWER_LIMIT_BYTES,
     BeginRecording,
     Entries,
-    Event,
     Events,
     Follow,
     mentions,
 )
 from rr_actors.system.event_subscribers import Subscribers
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.recordings import Recordings
 from rr_actors.wire.frames import framed
 
@@ -158,9 +157,7 @@ class Feed:
     def heard(self, facts: dict[str, Any]) -> None:
         """Number an event, and keep it for the readers."""
         self.seq += 1
-        at = facts.get("at")
-        rest = {key: value for key, value in facts.items() if key not in ("event", "at")}
-        event = Event(self.seq, at if isinstance(at, float) else time.time(), facts["event"], rest)
+        event = Event.of(facts, self.seq)
         for reader in self._readers:
             if not reader.records:
                 reader.hear(event)
@@ -200,11 +197,4 @@ def _events(events: list[Any]) -> bytes:
     try:
         return framed(Events(events), ANSWER_LIMIT_BYTES)
     except NotSerializable:  # as above
-        return framed(Events([_readable(event) for event in events]), ANSWER_LIMIT_BYTES)
-
-
-def _readable(event: Event) -> Event:
-    facts: dict[str, Any] = {}
-    for key, value in event.facts.items():
-        facts[readable(key)] = value if isinstance(value, bool | float) else readable(shown(value))
-    return msgspec.structs.replace(event, facts=facts)
+        return framed(Events([event.readable(TEXT_LIMIT) for event in events]), ANSWER_LIMIT_BYTES)

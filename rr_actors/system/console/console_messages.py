@@ -21,10 +21,10 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.pages import LoadRow, QueryRow, ResourceRow, ServerRow
 from rr_actors.streams.stream import StreamRow
-from rr_actors.supervision.event_history import Record
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.figures import Figure
 
-VERSION = 6
+VERSION = 7
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request. The longest part of any is a resource's request as JSON."""
@@ -244,9 +244,9 @@ class Found(Message, frozen=True):
 
 
 class Happenings(Message, frozen=True):
-    """Records of the tree, oldest first. `left_out`: how many older ones have no room in the answer."""
+    """Events that the system remembers, oldest first. `left_out`: how many older ones have no room in the answer."""
 
-    records: list[Record]
+    events: list[Event]
     left_out: int = 0
 
 
@@ -375,22 +375,6 @@ class Following(Message, frozen=True):
 
 
 # -- the feed --------------------------------------------------------------------------------------------------------
-
-
-class Event(msgspec.Struct, frozen=True):
-    """Something that happened.
-
-    Attributes:
-        seq: its number. The numbers count all events of the system that the console heard, in their order.
-        at: its time, in seconds since the epoch.
-        event: its kind, as in System.subscribe().
-        facts: the other keys of the event, as plain data.
-    """
-
-    seq: int
-    at: float
-    event: str
-    facts: dict[str, Any]
 
 
 class Events(Message, frozen=True):

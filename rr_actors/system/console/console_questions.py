@@ -15,6 +15,7 @@ from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_view import Verb, View, room_for
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.snapshots import ask_each
 
 _A = TypeVar("_A")
@@ -186,15 +187,28 @@ class ReadResponse(Verb[c.Response], frozen=True):
 
 
 class ListHistory(Verb[c.Happenings], frozen=True):
-    """The newest records of the child at a path and of all below it; with "", of all children."""
+    """The newest events of the child at a path and of all below it; with "", of all children."""
 
     path: c.Text = ""
     limit: c.Limit = 100
 
     def _carry_out(self, view: View, caller: Caller) -> c.Happenings:
-        records = view.history(self.path)[-self.limit :]
-        older = len(records) - room_for(records[::-1])
-        return c.Happenings(records[older:], older)
+        return _with_room(view.history(self.path)[-self.limit :])
+
+
+class ListEvents(Verb[c.Happenings], frozen=True):
+    """The newest events of children and resources that the system remembers, with the text `about` in them."""
+
+    about: c.Text = ""
+    limit: c.Limit = c.PAGE_LIMIT
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Happenings:
+        return _with_room(view.memory.newest(self.limit, about=self.about))
+
+
+def _with_room(events: list[Event]) -> c.Happenings:
+    older = len(events) - room_for(events[::-1])
+    return c.Happenings(events[older:], older)
 
 
 class ListLog(Verb[c.ChildLog], frozen=True):

@@ -21,7 +21,6 @@ from rr_actors.base.steps import Steps
 from rr_actors.base.values.failure import failure_of
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.registrar.engine.node import Node
-from rr_actors.supervision.event_history import TreeLog
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_commands import AwaitStatuses, Hold, OpenRegistrar
@@ -30,6 +29,7 @@ from rr_actors.system.console.console_protocol import REQUESTS, decoder_of
 from rr_actors.system.console.console_view import Command, Verb, View, Viewed
 from rr_actors.system.console.running_systems import ListedSystem
 from rr_actors.system.event_subscribers import Subscribers
+from rr_actors.system.recording.event_memory import EventMemory
 from rr_actors.system.recording.recordings import Recordings
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import Refusals, SocketDir, peer_of
@@ -52,7 +52,7 @@ class Console:
 
     Args:
         subscribers, recordings: the system's; the console's feed uses them.
-        log: the log of the system's tree.
+        memory: what has happened in the system.
         child_logs: the last log lines of its children.
         shut_down: stops the system, in a thread of its own.
     """
@@ -63,13 +63,13 @@ class Console:
         node: Node,
         subscribers: Subscribers,
         recordings: Recordings,
-        log: TreeLog,
+        memory: EventMemory,
         child_logs: KeptLogs,
         shut_down: Callable[[], None],
     ) -> None:
         self.node = node
         self.decoder = decoder_of(REQUESTS)
-        self.view = View(system, node, log, child_logs, shut_down)
+        self.view = View(system, node, memory, child_logs, shut_down)
         self.feed = Feed(subscribers, recordings)
         self.welcome = c.Welcome(c.VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()

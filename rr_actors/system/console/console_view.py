@@ -33,10 +33,10 @@ from rr_actors.registrar.pages import Page, ResourceRow, Wanted
 from rr_actors.registrar.registrar import Registrar, Usages, page
 from rr_actors.runtime.processes.lifeline import stopped
 from rr_actors.streams.stream import StreamRow
-from rr_actors.supervision.event_history import Record, TreeLog, records_below, records_of
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import Caller, ClientRegistrars
+from rr_actors.system.recording.event_memory import Event, EventMemory, events_below, events_of, is_of_child
 from rr_actors.system.recording.figures import Figure
 from rr_actors.system.registrar_lookup import open_registrar, registrar_in
 from rr_actors.system.snapshots import ask_each, describe_supervisor
@@ -45,6 +45,7 @@ from rr_actors.wire.name_service import Presence
 _LOOK_S = 5.0
 """Seconds that one supervisor may take to answer; after that, a console shows the others without it."""
 _USAGE_S = 2.0
+_HISTORY = 2000  # events of children
 _ALIKE = 20  # queries of one name
 REGISTRAR = "console"
 """The registrar of the system that holds the resources that a console loads and keeps. The first such load opens it."""
@@ -88,7 +89,7 @@ class View:
 
     Args:
         system: held weakly, so that a dropped system is noticed.
-        log: the log of its tree.
+        memory: what has happened in it.
         child_logs: the last log lines of its children.
         shut_down: stops the system, in a thread of its own.
 
@@ -97,11 +98,11 @@ class View:
     """
 
     def __init__(
-        self, system: Viewed, node: Node, log: TreeLog, child_logs: KeptLogs, shut_down: Callable[[], None]
+        self, system: Viewed, node: Node, memory: EventMemory, child_logs: KeptLogs, shut_down: Callable[[], None]
     ) -> None:
         self._system = weakref.ref(system)
         self.node = node
-        self._log = log
+        self.memory = memory
         self.child_logs = child_logs
         self.shut_down = shut_down
         self.clients = ClientRegistrars()
@@ -125,7 +126,9 @@ class View:
 
     def _walk(self) -> Iterator[c.ChildRow]:
         if (ended := self.system.ended) is not None:  # what has ended is not asked: that would make a dead letter
-            yield from _last_seen(self._log.of_this_run(), self.system.supervisor().path, readable(ended.detail))
+            yield from _last_seen(
+                self.memory.of_this_run(_HISTORY), self.system.supervisor().path, readable(ended.detail)
+            )
             return
         state = {"state": "running", "pid": os.getpid()}
         root = describe_supervisor(SupervisorRef(self.system.supervisor().path, timeout_s=_LOOK_S), text_of)
@@ -134,13 +137,13 @@ class View:
             said = "" if row.type == "supervisor" else notes.get(row.id, "")
             yield msgspec.structs.replace(row, note=readable(said)) if said else row
 
-    def history(self, path: str) -> list[Record]:
-        """Return the records of the child at `path` and of all below it, oldest first."""
-        records = self._log.records()
+    def history(self, path: str) -> list[Event]:
+        """Return the newest events of the child at `path` and of all below it, oldest first."""
+        events = self.memory.newest(_HISTORY, is_of_child)
         if path and self.system.ended is None:
             with contextlib.suppress(NotFound, Unavailable):
-                return records_below(records, self.path_of(path))
-        return records_of(records, path)
+                return events_below(events, self.path_of(path))
+        return events_of(events, path)
 
     def path_of(self, child: str) -> str:
         """Return the path of a child that is given by its path or its id.
@@ -369,14 +372,14 @@ def _joined(pages: Sequence[Page]) -> Page:
     )
 
 
-def _last_seen(records: list[Record], root: str, why: str) -> Iterator[c.ChildRow]:
-    """Yield the rows of a tree that has ended, as its records know it."""
+def _last_seen(events: list[Event], root: str, why: str) -> Iterator[c.ChildRow]:
+    """Yield the rows of a tree that has ended, as its events tell."""
     yield c.ChildRow(root, 0, "supervisor", "stopped", error=why)
-    newest = {record.path: record for record in records if record.path != root}
-    restarts = Counter(record.path for record in records if record.event == "restarted")
+    newest = {event.path: event.facts for event in events if event.path != root}
+    restarts = Counter(event.path for event in events if event.event == "restarted")
     for path in sorted(newest, key=lambda path: path.split("/")):
-        if newest[path].state is not None:
-            kind = "supervisor" if newest[path].kind == "supervisor" else "worker"
+        if newest[path].get("state") is not None:
+            kind = "supervisor" if newest[path].get("kind") == "supervisor" else "worker"
             yield c.ChildRow(path, path.count("/"), kind, "stopped", restarts=restarts[path])
 
 
@@ -407,7 +410,7 @@ def _rows(node: Mapping[str, Any], depth: int = 0) -> Iterator[c.ChildRow]:
         yield from _rows(child, depth + 1)
 
 
-def room_for(rows: Sequence[ResourceRow | c.UsageRow | StreamRow | Record], notes: Sequence[str] = ()) -> int:
+def room_for(rows: Sequence[ResourceRow | c.UsageRow | StreamRow | Event], notes: Sequence[str] = ()) -> int:
     """Return how many of these rows, from the first on, have room in an answer with the notes: texts may be long."""
     limit = c.RESPONSE_LIMIT_BYTES - len(msgspec.msgpack.encode(notes))
     sizes = itertools.accumulate(len(msgspec.msgpack.encode(row)) for row in rows)

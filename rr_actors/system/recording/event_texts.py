@@ -6,6 +6,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from rr_actors.base.names import named
+
 
 def ago(seconds: float) -> str:
     """Return a time span for people: "5 s", "3 min", "2 h 10 min", "4 days"."""
@@ -38,3 +40,11 @@ def child_text(facts: Mapping[str, Any]) -> str:
         f"starts again in {delay_s:.1f} s" if delay_s else "",
     )
     return ", ".join(filter(None, parts))
+
+
+def event_text(at: float, event: str, facts: Mapping[str, Any]) -> str:
+    """Say what happened to a child or a resource: "12:46:53.020  exited  root/cameras  killed: SIGKILL"."""
+    what, how = facts.get("path", ""), child_text(facts)
+    if not what:
+        what, how = named(facts.get("server", ""), facts.get("request", "")), facts.get("detail", "")
+    return "  ".join(filter(None, (clock(at), event, what, how)))

@@ -19,6 +19,7 @@ from rr_actors.base.names import in_short
 from rr_actors.base.notebook import escape
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.supervision.event_history import Record
+from rr_actors.system.recording.event_memory import event_in
 from rr_actors.system.recording.event_texts import ago, clock
 from rr_actors.system.recording.recordings import LINE_LIMIT, entry_of, read_recording
 from rr_actors.system.recording.timeline_lanes import (
@@ -195,7 +196,7 @@ def timeline_of(entries: Iterable[Entry], title: str = "", missed: int = 0) -> T
 def read_timeline(path: str | os.PathLike[str]) -> Timeline:
     """Return the timeline of a file: of a recording, or of a state directory's history.jsonl.
 
-    A last line that is not whole is left out.
+    A line of a history that is not whole is left out.
 
     Raises:
         ConfigError: the file cannot be read, or is neither; the error names the line.
@@ -207,8 +208,7 @@ def read_timeline(path: str | os.PathLike[str]) -> Timeline:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
     if first.startswith(b'{"event":'):
-        records = _read_history(path)
-        entries = [entry_of({"event": record.event, **record.facts()}) for record in records]
+        entries = _read_history(path)
         return timeline_of(sorted(entries, key=lambda entry: entry.at), path.name)
     recording = read_recording(path)
     entries = recording.entries()
@@ -229,23 +229,23 @@ def _check(path: Path, entry: Entry) -> None:
         raise ConfigError(text, file=str(path)) from error
 
 
-def _read_history(path: Path) -> list[Record]:
-    records: list[Record] = []
+def _read_history(path: Path) -> list[Entry]:
+    entries: list[Entry] = []
     try:
         lines = path.read_bytes().splitlines(keepends=True)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
     for number, line in enumerate(lines, 1):
         try:
-            record = msgspec.json.decode(line, type=Record)
-            time.localtime(record.at)
-            records.append(record)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError, ValueError, OSError) as error:
-            if not line.endswith(b"\n"):  # its process was killed while it wrote
-                break
+            event = event_in(line)
+            time.localtime(event.at)
+            entries.append(entry_of(event.flat()))
+        except (msgspec.MsgspecError, RecursionError, OverflowError, ValueError, OSError) as error:
+            if isinstance(error, msgspec.DecodeError) and not isinstance(error, msgspec.ValidationError):
+                continue  # a crash has cut it
             text = f"{path}: line {number}: expected a recording, or a state directory's history.jsonl: {error}"
             raise ConfigError(text, file=str(path)) from error
-    return records
+    return entries
 
 
 # -- as SVG ------------------------------------------------------------------------------------------------------------

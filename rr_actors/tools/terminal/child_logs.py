@@ -6,10 +6,10 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 
 from rr_actors.hosting.forwarded_logs import LogLine
-from rr_actors.supervision.event_history import Record
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import PAGE_LIMIT, ChildLog
 from rr_actors.system.console.console_questions import ListChildren, ListHistory, ListLog
+from rr_actors.system.recording.event_memory import Event
 
 _TICK_S = 0.3  # between two questions for new lines
 
@@ -19,12 +19,12 @@ class LogText:
 
     Args:
         path: the child's.
-        records: of its history, which say how its processes ended.
+        events: of its history, which say how its processes ended.
     """
 
-    def __init__(self, path: str, records: Sequence[Record] = ()) -> None:
+    def __init__(self, path: str, events: Sequence[Event] = ()) -> None:
         self._path = path
-        self._records = [record for record in records if record.path == path]
+        self._events = [event for event in events if event.path == path]
         self._pid = 0
 
     def of(self, lines: Iterable[LogLine]) -> Iterator[str]:
@@ -40,10 +40,11 @@ class LogText:
 
     def end(self) -> Iterator[str]:
         """Yield a heading with the end of the last life, if it is known."""
-        for record in self._records:
-            if record.pid == self._pid and record.reason:
-                how = ": ".join(dict.fromkeys(filter(None, (record.reason, record.detail))))
-                yield f"-- process {record.pid} ended at {_clock(record.at)}: {how} --"
+        for event in self._events:
+            reason, detail = event.facts.get("reason"), event.facts.get("detail")
+            if event.facts.get("pid") == self._pid and reason:
+                how = ": ".join(dict.fromkeys(filter(None, (reason, detail))))
+                yield f"-- process {self._pid} ended at {_clock(event.at)}: {how} --"
 
 
 def line_texts(line: LogLine) -> list[str]:
@@ -68,9 +69,9 @@ def log_of(client: ConsoleClient, child: str, count: int, *, previous: bool = Fa
     return ChildLog(log.path, log.total, lines[-count:], log.note)
 
 
-def records_of_child(client: ConsoleClient, path: str) -> list[Record]:
-    """Return the newest records of a child's history."""
-    return client.ask(ListHistory(path, PAGE_LIMIT)).records
+def events_of_child(client: ConsoleClient, path: str) -> list[Event]:
+    """Return the newest events of a child's history."""
+    return client.ask(ListHistory(path, PAGE_LIMIT)).events
 
 
 def new_lines(client: ConsoleClient, path: str, after: int) -> Iterator[list[LogLine]]:

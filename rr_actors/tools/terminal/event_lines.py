@@ -13,9 +13,9 @@ from typing import Any
 from rr_actors.base.errors import UsageError, few, shown
 from rr_actors.base.names import named
 from rr_actors.registrar.engine.progress import shown_progress
-from rr_actors.supervision.event_history import Record
-from rr_actors.system.console.console_messages import Event, Missed
+from rr_actors.system.console.console_messages import Missed
 from rr_actors.system.event_subscribers import kinds_for_all
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.event_texts import child_text, clock
 
 _KEPT = 500  # lines
@@ -233,17 +233,6 @@ def event_line(event: Event, above: str = "") -> str:
     return str(EventLine.of(event, above))
 
 
-def event_of(record: Record) -> Event:
-    """Return a record of the history as the event that it was."""
-    return Event(0, record.at, record.event, record.facts())
-
-
 def missed_line(missed: Missed) -> str:
     """Return a sentence that says how many events a reader of the feed has missed."""
     return f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow"
-
-
-def facts_in(event: Event) -> dict[str, Any]:
-    """Return an event for programs."""
-    seq = {"seq": event.seq} if event.seq else {}
-    return {**seq, "event": event.event, "at": event.at, **event.facts}

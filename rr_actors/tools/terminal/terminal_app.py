@@ -28,7 +28,7 @@ from rr_actors.base.names import short_id
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import NotRunning
-from rr_actors.system.console.console_questions import ListHistory
+from rr_actors.system.console.console_questions import ListEvents
 from rr_actors.system.console.console_view import Command
 from rr_actors.tools.tables.row_commands import (
     CHILD_COMMANDS,
@@ -41,7 +41,7 @@ from rr_actors.tools.tables.row_commands import (
 from rr_actors.tools.tables.sheets import SHEETS
 from rr_actors.tools.tables.table import Row, tables_of
 from rr_actors.tools.terminal.console_link import ConsoleLink
-from rr_actors.tools.terminal.event_lines import EventLines, event_of, missed_line
+from rr_actors.tools.terminal.event_lines import EventLines, missed_line
 from rr_actors.tools.terminal.terminal_pane import Pane, plain
 from rr_actors.tools.terminal.terminal_rows import Happenings, Listed, Neighbours, Nothing, Past, Rows, Served, Window
 from rr_actors.tools.terminal.terminal_tables import SheetRows
@@ -439,8 +439,8 @@ class Terminal(App[None]):
         """Post the message that the system was reached, and take what has happened before. In a thread."""
         if self._welcome is None:
             with contextlib.suppress(RrError):
-                for record in self._link.ask(ListHistory(), _WELCOME_S).records:
-                    self._happened.take(event_of(record))
+                for event in self._link.ask(ListEvents(), _WELCOME_S).events:
+                    self._happened.take(event)
                 self._heard += 1
         self.post_message(self.Found(welcome))
 

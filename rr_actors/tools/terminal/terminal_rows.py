@@ -15,17 +15,17 @@ from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.managers.actions.graph_pictures import ShownGraph, shown_graph
 from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
 from rr_actors.streams.stream import StreamRow
-from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
 from rr_actors.system.console.console_view import Verb
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.explanations import bytes_text, name_of_resource, rate_text, since
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.tables.table import STATE_STYLES, Asks, Row
 from rr_actors.tools.terminal.child_logs import line_texts
-from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_of
+from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines
 
 LOOK_S = 10.0  # for the answer to a question
 _HISTORY = 100  # records
@@ -142,21 +142,19 @@ class Past:
         found = link.ask(questions.ListHistory(self.path, _HISTORY), LOOK_S)
         log, more = _log(link, self.path)
         rows = [row for place in _places(link, self.path) for row in _wrapped(_as_it_is(place), window.width, "bold")]
-        happened = [(record.at, self._happened(record, window.width)) for record in found.records]
+        happened = [(event.at, self._happened(event, window.width)) for event in found.events]
         happened += [(line.at, _logged(line, window.width)) for line in log]
         for _, shown in sorted(happened, key=lambda one: one[0])[::-1]:
             rows += shown
-        if found.left_out or len(found.records) == _HISTORY:
-            rows.append(
-                Row("", f"the newest {len(found.records)} events: rr-actors history {self.path} has older ones")
-            )
+        if found.left_out or len(found.events) == _HISTORY:
+            rows.append(Row("", f"the newest {len(found.events)} events: rr-actors history {self.path} has older ones"))
         if more:
             rows.append(Row("", f"the newest {len(log)} of {len(log) + more} log lines: rr-actors logs {self.path}"))
         return _cut(rows, window)
 
-    def _happened(self, record: Record, width: int) -> Lines:
-        line = EventLine.of(event_of(record), self.path)
-        return [*_wrapped(str(line), width, style_of(line)), *_indented(record.traceback.rstrip().splitlines())]
+    def _happened(self, event: Event, width: int) -> Lines:
+        line, traceback = EventLine.of(event, self.path), str(event.facts.get("traceback", ""))
+        return [*_wrapped(str(line), width, style_of(line)), *_indented(traceback.rstrip().splitlines())]
 
 
 @dataclass(frozen=True)

@@ -13,22 +13,14 @@ import typer
 
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotRunning, UsageError, shown
-from rr_actors.supervision.event_history import Record, left_records, records_of
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.recording.event_memory import Event, events_of, is_of_child, left_events
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
-from rr_actors.tools.explanations import explain, explain_actor
-from rr_actors.tools.terminal.event_lines import (
-    EventFilter,
-    EventLine,
-    EventLines,
-    event_line,
-    event_of,
-    facts_in,
-    missed_line,
-)
+from rr_actors.tools.explanations import explain, explain_actor, past_of_child
+from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines, event_line, missed_line
 from rr_actors.tools.verbs.console_options import (
     ChildArgument,
     DryRun,
@@ -48,6 +40,7 @@ from rr_actors.tools.verbs.console_options import (
 
 app = typer.Typer()
 
+_LEFT = 2000  # events that a system has left
 _UNLOAD_S = 60.0  # for the unload callbacks, after a grace
 _PART = "its beginning or end, or a resource's name"
 _TICK_S = 0.1  # while nothing happens, lines that are settled are printed so often
@@ -71,14 +64,16 @@ def events(
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the latest events of the tree; with --follow show new events, also those of resources.
+    """Show what happened lately to children and resources; with --follow go on with what happens.
 
+    Without --follow there are the ends and starts of children, and of resources the statuses, revocations, and loads
+    that failed or took long.
     A status that spreads over many resources is one line, with the number of those that it has reached. Events that say
     the same are one line with their number. With --json each event is a line.
     """
     wanted = EventFilter.of(event or [], child, server, about)
     if not follow:
-        happened = [event_of(record) for record in _history(state, "", c.PAGE_LIMIT)]
+        happened = _remembered(state, questions.ListEvents(server or child.rpartition("/")[2]))
         if as_json:
             chosen = [one for one in happened if wanted.accepts(EventLine.of(one))]
             _say_facts(chosen[-(count or 20) :])
@@ -107,7 +102,7 @@ def _following(client: ConsoleClient, wanted: EventFilter, as_json: bool) -> Ite
         if isinstance(part, c.Missed):
             _say_missed(part, as_json)
         elif as_json:
-            yield [facts_in(one) for one in part.events if wanted.accepts(EventLine.of(one))]
+            yield [one.flat() for one in part.events if wanted.accepts(EventLine.of(one))]
         else:
             for one in part.events:
                 known.take(one)
@@ -115,26 +110,28 @@ def _following(client: ConsoleClient, wanted: EventFilter, as_json: bool) -> Ite
     yield list(filter(wanted.accepts, known.take_settled(all_of_them=True)))
 
 
-def _say_facts(events: list[c.Event]) -> None:
+def _say_facts(events: list[Event]) -> None:
     for event in events:
-        say_json(facts_in(event))
+        say_json(event.flat())
 
 
-def _history(state: Path | None, child: str, limit: int) -> list[Record]:
-    """Return the records of a running system, or those that it has left in its state directory."""
+def _remembered(state: Path | None, question: questions.ListEvents | questions.ListHistory) -> list[Event]:
+    """Return the events of a running system, or those that it has left in its state directory."""
     try:
         with client_of(state) as client:
-            found = client.ask(questions.ListHistory(child, limit))
+            found = client.ask(question)
     except NotRunning:
-        records = left_records(state) if state is not None else []
-        if not records:
+        of_children = isinstance(question, questions.ListHistory)
+        events = left_events(state, _LEFT, is_of_child if of_children else None) if state is not None else []
+        if not events:
             raise
-        records = records_of(records, child)[-limit:]
+        if isinstance(question, questions.ListHistory):
+            events = events_of(events, question.path)
         say(f"no system runs in {state}: this is what it has left", err=True)
-        return records
+        return events[-question.limit :]
     if found.left_out:
-        say(f"{found.left_out} older records are not shown: they are too long for one answer", err=True)
-    return found.records
+        say(f"{found.left_out} older events are not shown: they are too long for one answer", err=True)
+    return found.events
 
 
 def _say_missed(missed: c.Missed, as_json: bool) -> None:
@@ -152,14 +149,14 @@ def history(
     as_json: JsonOption = False,
 ) -> None:
     """Show the starts and exits of a child and all below it, or of all children, with reasons."""
-    records = _history(state, child, min(limit, c.PAGE_LIMIT))
+    happened = _remembered(state, questions.ListHistory(child, min(limit, c.PAGE_LIMIT)))
     if as_json:
-        _say_facts([event_of(record) for record in records])
+        _say_facts(happened)
         return
-    for record in records:
-        say(event_line(event_of(record)))
-        if record.traceback:
-            say_lines(record.traceback.rstrip(), "    ")
+    for event in happened:
+        say(event_line(event))
+        if traceback := event.facts.get("traceback"):
+            say_lines(traceback.rstrip(), "    ")
 
 
 @app.command(epilog="Example: rr-actors stack cameras --timeout 10")
@@ -226,12 +223,12 @@ def why(
 ) -> None:
     """Say who holds a resource, for whom, since when, and what it waits for; or whom an actor waits for.
 
-    An actor that asks waits for the one that it has asked. If these wait for each other, the ring is named.
+    An actor that asks waits for the one that it has asked. If these wait for each other, the ring is named. The events
+    that the system remembers say since when a resource or child has its state, and what came before.
     """
     with client_of(state) as client:
-        for line in explain_actor(lambda one: client.ask(questions.LookAtMailbox(one)).mailbox, id) or explain(
-            client, id
-        ):
+        lines = explain_actor(lambda one: client.ask(questions.LookAtMailbox(one)).mailbox, id)
+        for line in [*lines, *past_of_child(client, id)] if lines else explain(client, id):
             say(line)
 
 

@@ -18,7 +18,7 @@ from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_json, say_lines, shown_again
 from rr_actors.tools.explanations import explain, mailbox_lines
 from rr_actors.tools.process_usage import facts_of
-from rr_actors.tools.terminal.event_lines import event_line, event_of, facts_in
+from rr_actors.tools.terminal.event_lines import event_line
 from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
 from rr_actors.tools.verbs.console_options import (
     DryRun,
@@ -167,13 +167,13 @@ def _show_status(state: Path | None, target: str, as_json: bool) -> None:
             say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
             return
         served = [one for one in client.registrars().rows if one.name == row.id]
-        records = client.ask(ListHistory(row.path, _LATEST)).records
+        happened = client.ask(ListHistory(row.path, _LATEST)).events
     facts = facts_of(row)
     if as_json:
-        say_json(facts | {"registrars": served, "history": [facts_in(event_of(record)) for record in records]})
+        say_json(facts | {"registrars": served, "history": [event.flat() for event in happened]})
     else:
         say_lines("\n".join(_child_lines(row, facts, served)))
-        say_lines("\n".join(event_line(event_of(record)) for record in records), "    ")
+        say_lines("\n".join(map(event_line, happened)), "    ")
     if row.state != "running":
         raise typer.Exit(1)
 

@@ -31,7 +31,7 @@ from rr_actors.tools import graphs
 from rr_actors.tools.cli_commands import JsonOption, StateOption, json_text, say, say_json, say_lines, say_picture
 from rr_actors.tools.explanations import age_text, bytes_text, rate_text, readers_text
 from rr_actors.tools.tables.stream_table import stream_facts
-from rr_actors.tools.terminal.child_logs import LogText, log_of, new_lines, records_of_child
+from rr_actors.tools.terminal.child_logs import LogText, events_of_child, log_of, new_lines
 from rr_actors.tools.terminal.stream_frames import frames_of, png
 from rr_actors.tools.verbs.console_options import SHOWN, ChildArgument, Limit, Timeout, client_of
 from rr_actors.tools.web.timeline_file import html
@@ -214,7 +214,7 @@ def logs(
         raise UsageError("--previous: expected no --follow with it, as a process that has ended logs no more")
     with client_of(state) as client:
         log = log_of(client, child, lines, previous=previous)
-        text = LogText(log.path, [] if as_json else records_of_child(client, log.path))
+        text = LogText(log.path, [] if as_json else events_of_child(client, log.path))
         _say_log(log.path, log.lines, text, as_json)
         if not log.lines:
             whose = f"{log.path}, of the process before" if previous else log.path

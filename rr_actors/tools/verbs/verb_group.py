@@ -108,7 +108,7 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
             "dead-letters": "Show how many messages could not be delivered, and the newest of them",
         },
         _console: {
-            "events": "Show the latest events of the tree; with --follow show new events, also those of resources",
+            "events": "Show what happened lately to children and resources; with --follow go on with what happens",
             "history": "Show the starts and exits of a child and all below it, or of all children, with reasons",
             "stack": "Show where each thread of a child's process is now, also if the child is stuck",
             "top": "Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys",

@@ -27,11 +27,12 @@ from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
 from rr_actors.system.console.console_view import Verb
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.recordings import entry_of
 from rr_actors.system.recording.timeline_lanes import Lane, Lanes
 from rr_actors.system.recording.timelines import Timeline
 from rr_actors.tools.terminal.console_link import ConsoleLink
-from rr_actors.tools.terminal.event_lines import EventLines, event_of
+from rr_actors.tools.terminal.event_lines import EventLines
 from rr_actors.tools.terminal.figure_curves import FigureCurves
 from rr_actors.tools.terminal.stream_frames import Thumbnails
 
@@ -150,7 +151,7 @@ class Watch:
 
     state_dir: str | os.PathLike[str] | None
     moments: Moments = field(default_factory=lambda: Moments([Moment(0.0, problem="not asked yet")]))
-    events: deque[c.Event] = field(default_factory=lambda: deque[c.Event](maxlen=_EVENTS_KEPT))
+    events: deque[Event] = field(default_factory=lambda: deque[Event](maxlen=_EVENTS_KEPT))
     heard: int = 0
     missed: int = 0
     version: int = 0
@@ -168,7 +169,8 @@ class Watch:
         self._lanes, self._lanes_lock = Lanes(), threading.Lock()
         self.figures = FigureCurves()
         self._thumbnails = Thumbnails()
-        self._latest = 0.0  # the time of the newest record in the lanes
+        self._latest = 0.0  # the time of the newest event in the lanes
+        self._known: set[float] = set()  # the times of those that were remembered, of which the feed may tell again
         self._lanes_of: tuple[int, list[Lane], float | None] | None = (
             None  # the lanes of a version, and when they began
         )
@@ -245,12 +247,9 @@ class Watch:
     def _reached(self, welcome: c.Welcome) -> None:
         self.welcome = welcome
         with contextlib.suppress(RrError):  # the system ends
-            records = self._ask(questions.ListHistory(limit=c.PAGE_LIMIT)).records
-            before = [event_of(record) for record in records if record.at > self._latest]
-            for event in before:
-                self.lines.take(event)
-            self._note(*before)
-            self.heard += len(before)
+            known = self._ask(questions.ListEvents()).events
+            self._known = {event.at for event in known}
+            self._take([event for event in known if event.at > self._latest])
         self.look_soon()
 
     def _hear(self, part: c.Events | c.Missed) -> None:
@@ -259,22 +258,22 @@ class Watch:
             self.heard += part.count
             self.look_soon()
         else:
-            self.events.extend(part.events)
-            for event in part.events:
-                self.lines.take(event)
-            self._note(*part.events)
-            self.heard += len(part.events)
+            events = [event for event in part.events if event.at not in self._known]
+            self.events.extend(events)
+            self._take(events)
             self._rows.news.set()
             if any("path" in event.facts for event in part.events):  # an event of the tree
                 self.look_soon()
         self.version = next(self._versions)
 
-    def _note(self, *events: c.Event) -> None:
+    def _take(self, events: Sequence[Event]) -> None:
+        self.heard += len(events)
+        for event in events:
+            self.lines.take(event)
+            self._latest = max(self._latest, event.at)
         with self._lanes_lock:
             for event in events:
-                self._lanes.take(entry_of({**event.facts, "event": event.event, "at": event.at}))
-                if "path" in event.facts:
-                    self._latest = max(self._latest, event.at)
+                self._lanes.take(entry_of(event.flat()))
 
     # -- in the threads that look ------------------------------------------------------------------------------------
 

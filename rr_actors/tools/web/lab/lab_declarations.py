@@ -10,7 +10,7 @@ from typing import Annotated, TypeAlias
 
 import msgspec
 
-from rr_actors.system.console.console_messages import Event
+from rr_actors.system.recording.event_memory import Event
 
 Value: TypeAlias = str | int | float
 
