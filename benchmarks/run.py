@@ -38,6 +38,7 @@ Scenario = Callable[[], list[table.Row]]
 FULL: dict[str, Scenario] = {
     "warm": partial(warm.other_process, 3_000),
     "local": partial(warm.same_process, 5_000),
+    "handler": partial(warm.with_a_handler, 4_000),
     "in-process": partial(in_process.in_process, 5_000),
     "first": partial(first.first_and_last, 2_000),
     "ask": partial(asking.other_process, 3_000),
@@ -74,6 +75,7 @@ MILLION: dict[str, Scenario] = {
 QUICK: dict[str, Scenario] = {
     "warm": partial(warm.other_process, 300),
     "local": partial(warm.same_process, 300),
+    "handler": partial(warm.with_a_handler, 400),
     "in-process": partial(in_process.in_process, 100),
     "first": partial(first.first_and_last, 100),
     "ask": partial(asking.other_process, 300),

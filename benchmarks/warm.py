@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal
 
 import rr_actors as rr
 from benchmarks import placement as placement_of
@@ -16,6 +17,8 @@ from benchmarks.yardsticks import pykka_ask
 
 AT_MOST = {"none": 2.0, "process": 2.5 if find_spec("uvloop") else 3.0, "power": None}
 _P99_AT_MOST = 3.0
+_TURNS = 4
+_PLACES: dict[str, Literal["process", "thread"]] = {"another process": "process", "this process": "thread"}
 
 
 def other_process(times: int) -> list[Row]:
@@ -48,6 +51,30 @@ def same_process(times: int) -> list[Row]:
         rows.append(Row(f"pykka ask, this process, {placement}", asked.median * 1e6, "µs", asked.p99 * 1e6))
         rows.append(_row("warm load, this process", load, asked, "ask", 1.5))
     return rows
+
+
+def with_a_handler(times: int) -> list[Row]:
+    """The same in a program that has a signal handler, as services have, beside one without."""
+    rows: list[Row] = []
+    for name, placement in _PLACES.items():
+        without, handled = Samples(()), Samples(())
+        for _ in range(_TURNS):
+            without += _one_core(placement, times // _TURNS)
+            before = signal.signal(signal.SIGTERM, lambda *_: None)
+            handled += _one_core(placement, times // _TURNS)
+            signal.signal(signal.SIGTERM, before)
+        rows.append(_row(f"warm load from {name}, with a signal handler", handled, without, "without one", 1.1))
+    return rows
+
+
+def _one_core(placement: Literal["process", "thread"], times: int) -> Samples:
+    with placement_of.here(placement_of.ONE_CORE), running("process", placement) as (system, consumer):
+        placement_of.part(placement_of.ONE_CORE)
+        return _measure(_nothing, system, consumer, times)[1]
+
+
+def _nothing() -> None:
+    pass
 
 
 def _measure(

@@ -22,7 +22,6 @@ import pytest
 from hypothesis import settings
 
 import rr_actors as rr
-from rr_actors.actors import turns
 from rr_actors.base.reporting import log
 from rr_actors.runtime import thread_rules
 from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, serve
@@ -174,13 +173,6 @@ def _describe(pid: int) -> str:
         return f"{pid} {process.status()} {' '.join(process.cmdline())}"
     except psutil.NoSuchProcess:
         return f"{pid} (gone now)"
-
-
-@pytest.fixture(autouse=True)
-def short_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The handler of pytest-timeout raises, and waits for nothing: with it the main thread may take short cuts."""
-    handlers = tuple(number for number in turns.CATCHABLE_SIGNALS if number is not signal.SIGALRM)
-    monkeypatch.setattr(turns, "CATCHABLE_SIGNALS", handlers)
 
 
 _handler: Any = pytest.LogCaptureFixture.handler

@@ -77,7 +77,12 @@ class Alarm(Exception):
     """What a handler raises that ends a call after some time."""
 
 
+_rung: list[bool] = []
+"""Something, if an Alarm was raised. A handler may set no threading.Event that its own thread waits for."""
+
+
 def _ring(_number: int, _frame: object) -> None:
+    _rung.append(True)
     raise Alarm
 
 
@@ -134,11 +139,13 @@ class Interrupted:
         points: how many points the call passed.
         where: where the interrupt was injected; "" if the call ended before that.
         error: what the call raised.
+        is_late: whether the call had returned by then: a handler that came in a turn is called behind it.
     """
 
     points: int = 0
     where: str = ""
     error: BaseException | None = None
+    is_late: bool = False
 
     @property
     def was_raised(self) -> bool:
@@ -164,6 +171,7 @@ def interrupted(
         raising: what the handler of SIGINT raises.
     """
     told = Interrupted()
+    _rung.clear()
 
     def reached(frame: FrameType, blocks: bool) -> bool:
         """Whether this is the point. Then a SIGINT is pending as soon as the capsule is gone, as this returns."""
@@ -174,6 +182,7 @@ def interrupted(
         told.where = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno} {frame.f_code.co_name}"
         if told.points - blocks != point:  # the second of the two points of a call that blocks
             told.where += " (blocked)"
+            _rung.append(True)
             raise raising
         capsule = _capsule(1, None, _set_interrupt)  # noqa: F841 - dies as this returns
         return True
@@ -184,6 +193,9 @@ def interrupted(
     try:
         call()
         _watch(None)
+        if told.where and raising is Alarm and not _rung:
+            told.is_late = True
+            eventually(lambda: _rung, 5.0, "a handler that came in a turn is called behind it")
     except BaseException as error:
         _watch(None)
         told.error = error
@@ -640,7 +652,7 @@ class Run:
                 scene.before(world)
                 told = interrupted(lambda: scene.act(world), point, self._raising)
                 self._note(scene.name, point, told)
-                all_raised &= told.was_raised
+                all_raised &= told.was_raised and not told.is_late
                 if left:  # after the last one, _settle() does it
                     scene.after(world)
             if scene.holds_nothing and all_raised:

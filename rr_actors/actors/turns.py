@@ -25,6 +25,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextvars import Context
+from types import FrameType
 from typing import Any, ClassVar, NoReturn, Self, cast
 
 import pykka
@@ -36,8 +37,9 @@ from rr_actors.actors.messaging.exit_reports import Birth, ExitReport
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.actors.messaging.mailbox import is_stop, refuse_all
 from rr_actors.actors.remote.hub import ActorHub
-from rr_actors.base.errors import UsageError, shortened, text_of
+from rr_actors.base.errors import Unavailable, UsageError, shortened, text_of
 from rr_actors.base.reporting.log import Log
+from rr_actors.runtime import event_loop
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
 
@@ -331,12 +333,30 @@ class TurnActor(BaseActor, abc.ABC):
 
 # -- interruptions -----------------------------------------------------------------------------------------------------
 #
-# A Python signal handler may run in the main thread between any two of its instructions. It may stop the system, or
-# make another call that waits for the loop. So the thread must not have a turn then that the loop needs. By default the
-# only handler is that of Ctrl-C, which raises.
+# A Python signal handler may run in the main thread between any two of its instructions. It may stop the system, join a
+# thread that loads, or make another call that waits for the loop. So it must not run while the thread has a turn, which
+# the loop needs. The handlers of a program are therefore wrapped: one that comes in a turn is called a moment later.
 
 CATCHABLE_SIGNALS = tuple(signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP})
 _LOOK_AGAIN_S = 0.05  # asking for all handlers takes some 40 us
+
+_NEVER_WAIT = frozenset({"asyncio", "trio", "unittest"})
+"""Packages whose handlers wait for nothing, and are later compared with what is set: they stay as they are."""
+
+
+class DeferredHandler:
+    """A signal handler that is called when its thread has no turn: at once, or when the loop has sent the signal again.
+
+    Args:
+        handler: the program's own.
+    """
+
+    def __init__(self, handler: Callable[[int, FrameType | None], object]) -> None:
+        self.handler = handler
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if not (has_a_turn() and _send_again(number)):
+            self.handler(number, frame)
 
 
 class _Interruptions:
@@ -355,18 +375,46 @@ def runs_handlers() -> bool:
 
 
 def may_be_interrupted() -> bool:
-    """Return whether a handler other than that of Ctrl-C may interrupt the calling thread; up to 50 ms old."""
+    """Return whether a handler that waits may interrupt a turn of the calling thread; up to 50 ms old.
+
+    The handlers of the program are wrapped here. That of Ctrl-C, which raises, is not: an interrupted turn is undone.
+    """
     if threading.get_ident() != _interruptions.main:
         return False
     now = time.monotonic()
     if now >= _interruptions.look_at:
-        _interruptions.found = any(_waits(signal.getsignal(number)) for number in CATCHABLE_SIGNALS)
+        _interruptions.found = not all(map(_never_waits_in_a_turn, CATCHABLE_SIGNALS))
         _interruptions.look_at = now + _LOOK_AGAIN_S
     return _interruptions.found
 
 
-def _waits(handler: object) -> bool:
-    return callable(handler) and handler is not signal.default_int_handler
+def _never_waits_in_a_turn(number: signal.Signals) -> bool:
+    """Wrap the handler of a signal, if there is one that may wait; return False if that is impossible."""
+    handler: Any = signal.getsignal(number)
+    if not callable(handler) or isinstance(handler, DeferredHandler) or handler is signal.default_int_handler:
+        return True
+    function: object = getattr(handler, "func", handler)  # asyncio's is a partial
+    if str(getattr(function, "__module__", "")).partition(".")[0] in _NEVER_WAIT:
+        return True
+    try:
+        before = signal.signal(number, DeferredHandler(handler))
+    except ValueError:  # a sub-interpreter has no signals
+        return False
+    if before is not handler:  # the handler ran just now, and set another
+        signal.signal(number, before)
+    return True
+
+
+def _send_again(number: int) -> bool:
+    """Have the loop send a signal to the main thread once more; return False if it has ended."""
+    dispatcher, main = event_loop.current(), _interruptions.main
+    if dispatcher is None or main is None:
+        return False
+    try:
+        dispatcher.call(signal.pthread_kill, main, number)
+    except Unavailable:
+        return False
+    return True
 
 
 def _look_who_is_main() -> None:

@@ -6,9 +6,7 @@ Leaving: a thread that releases what others hold, too, decides that itself.
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
-import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rr_actors as rr
-from rr_actors.actors import turns
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import loading, unloading
@@ -425,40 +422,6 @@ def test_it_is_held_when_the_process_was_killed_and_is_back(start: Callable[...,
     (resource,) = (found for found in trader.resources() if found.request == "x")
     assert sorted(resource.holders) == ["app", "trader", "trader"]
     assert keeper.id in resource.queries
-
-
-def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It would hold what the loop waits for. Other threads are not interrupted."""
-    short_cuts: list[str] = []
-
-    def noted(commit_row: Callable[[Any], bool], row: Any) -> bool:
-        if not actor_of(app).node.dispatcher.is_loop_thread():
-            short_cuts.append(type(row).__name__)
-        return commit_row(row)
-
-    for ledger in (actor_of(app).commits, actor_of(provider).commits):
-        monkeypatch.setattr(ledger, "commit_row", functools.partial(noted, ledger.commit_row))
-    heard: list[int] = []
-    before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
-    try:
-        eventually(turns.may_be_interrupted)
-        query = app.load("provider/thing", "x")
-        assert len(app.queries()) == 2
-        os.kill(os.getpid(), signal.SIGUSR1)
-        query.unload()
-        assert short_cuts == []
-        assert heard == [2]
-        thread = threading.Thread(target=lambda: app.load("provider/thing", "x"))
-        thread.start()
-        thread.join()
-        assert short_cuts == ["ServedQuery"]
-    finally:
-        signal.signal(signal.SIGUSR1, before)
-    eventually(lambda: not turns.may_be_interrupted())
-    app.load("provider/thing", "x")
-    assert short_cuts == ["ServedQuery", "ServedQuery"]
 
 
 @pytest.mark.parametrize("handled", [False, True], ids=["no handler", "a handler that may wait for the loop"])
