@@ -631,6 +631,7 @@ _INSTEAD: dict[str, str | None] = {
     "multiprocessing.sharedctypes.SynchronizedBase": _SHARED,
     "multiprocessing.process.BaseProcess": _PROCESS,
     "multiprocessing.pool.Pool": _PROCESS,
+    "multiprocessing.managers.BaseManager": "send its proxies (manager.dict(), manager.Queue()), which may travel",
     "_socket.socket": _OPEN_THERE,
     "sqlite3.Connection": _OPEN_THERE,
     "sqlite3.Cursor": _OPEN_THERE,

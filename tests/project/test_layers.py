@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import graphlib
+import importlib
 import subprocess
 import sys
 import tomllib
@@ -20,7 +21,11 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 PLACES = {
     "pykka": ("actors/", "supervision/", "registrar/", "system/snapshots.py"),
     "cloudpickle": ("base/pickling.py",),
-    "multiprocessing": ("runtime/processes/fork_server.py", "runtime/processes/child_bootstrap.py"),
+    "multiprocessing": (
+        "runtime/processes/forked_process.py",
+        "runtime/processes/child_bootstrap.py",
+        "runtime/processes/fork_server.py",
+    ),
     "sqlite3": ("storage/",),
     "psutil": ("managers/",),
     "uvloop": ("runtime/user_loop.py",),
@@ -107,6 +112,31 @@ def test_every_room_has_its_layer() -> None:
     rooms = {f"rr_actors.{path.parent.name}" for path in PACKAGE.glob("*/__init__.py")}
 
     assert rooms | {"rr_actors.__main__"} == set(layers(1))
+
+
+def private_names_of_multiprocessing() -> set[str]:
+    """The private names in its modules, and of the classes there."""
+    names = ("process", "util", "spawn", "context", "reduction", "resource_tracker", "forkserver", "popen_forkserver")
+    modules = [importlib.import_module(f"multiprocessing.{name}") for name in names]
+    classes = [one for module in modules for one in vars(module).values() if isinstance(one, type)]
+    found = {name for one in (*modules, *classes) for name in vars(one)}
+    return {name for name in found if name.startswith("_") and not name.startswith("__")} - vars(subprocess).keys()
+
+
+def test_two_private_names_of_multiprocessing_are_used_and_in_one_file() -> None:
+    used: set[tuple[str, str]] = set()
+    for place in PLACES["multiprocessing"]:
+        for node in ast.walk(ast.parse((PACKAGE / place).read_text())):
+            match node:
+                case ast.Attribute(value=owner, attr=name) if not (isinstance(owner, ast.Name) and owner.id == "self"):
+                    used.add((place, name))
+                case ast.Constant(value=str(name)) | ast.FunctionDef(name=name):
+                    used.add((place, name))
+                case _:
+                    continue
+    private = private_names_of_multiprocessing()
+    where = "runtime/processes/forked_process.py"
+    assert {one for one in used if one[1] in private} == {(where, "_Popen"), (where, "_exit_function")}
 
 
 @pytest.mark.parametrize("library", sorted(PLACES))

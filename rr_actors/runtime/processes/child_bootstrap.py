@@ -1,7 +1,6 @@
 """The first steps of a child process, and the main program of a fork server.
 
-A process that only starts these does not import this module. Only this module and
-rr_actors/runtime/processes/fork_server.py use multiprocessing.
+A process that only starts these does not import this module.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import contextlib
 import errno
 import gc
 import importlib
-import itertools
 import logging
 import os
 import select
@@ -23,27 +21,20 @@ import time
 import traceback
 import weakref
 from collections.abc import Callable, Sequence
-from multiprocessing import process, resource_tracker, util
-from multiprocessing.context import ForkServerProcess
+from multiprocessing import current_process, parent_process, spawn, util
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, NoReturn
 
 from rr_actors.base import pickling
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime import garbage, interpreter
-from rr_actors.runtime.processes import fork_server, lifeline
-from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, Launch
+from rr_actors.runtime.processes import fork_server, forked_process, lifeline
+from rr_actors.runtime.processes.fork_server import ForkServer, Inherited
+from rr_actors.runtime.processes.forked_process import EntryCall
 
 # Private parts of the standard library; the same in Python 3.11, 3.12 and 3.13.
-_TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
-_ParentProcess: Any = vars(process)["_ParentProcess"]
-_set_start_method: Callable[[str], None] = vars(sys.modules["multiprocessing.context"])["_force_start_method"]
-_close_stdin: Callable[[], None] = vars(util)["_close_stdin"]
-_forget_parents_finalizers: Callable[[], None] = vars(process.BaseProcess)["_after_fork"]
-_renew_native_id: Callable[[threading.Thread], None] = vars(threading.Thread)["_set_native_id"]
 _run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
 _clear_exit_handlers: Callable[[], None] = vars(atexit)["_clear"]
-_end_multiprocessing: Callable[[], None] = vars(util)["_exit_function"]
 _FINALIZERS: Any = weakref.finalize
 
 PRELOAD = (
@@ -51,6 +42,7 @@ PRELOAD = (
     "rr_actors.system.system",
     "rr_actors.system.console.connected_client",
     "rr_actors.actors.timers",
+    "multiprocessing.resource_tracker",
     "tempfile",
 )
 """What a fork server imports before it forks: the modules of all public names, so that no child imports any.
@@ -63,60 +55,47 @@ _AT_EXIT_S = 5.0
 """The longest time for the handlers that were registered with atexit."""
 _REQUEST_S = 5.0  # the longest wait for a request that is connected already
 _RETRY_S = 0.02  # before the next attempt to accept a connection
-_FEWEST_FDS = 4  # of a request: its data, its status, its control channel and its lifeline
+_FEWEST_FDS = 3  # of a request: its status, its control channel and its lifeline
 _FDS = 16  # more descriptors than a request has
 _SAY_WHY = "rr_actors.supervision.child_main:could_not_begin"
 
 
-def enter(data: int, control: socket.socket, life: int, environment: bytes) -> NoReturn:
+def enter(control: socket.socket, life: int, tracker: int | None, family: int, environment: bytes) -> NoReturn:
     """Run a child process from its launch message to its end, on its main thread.
 
     Args:
-        data: the pipe with the launch message.
+        life: its lifeline, by which its launch message comes first.
+        tracker: the descriptor of multiprocessing's resource tracker; None: this process may start its own.
         environment: the environment_block() that this process has.
     """
+    os.setpgid(0, 0)
+    lifeline.mark(family)
+    signal.pthread_sigmask(signal.SIG_SETMASK, [])
+    fork_server.is_tracked = tracker is not None
+    forked_process.run_call = lambda call: _run(call, control, environment)
     try:
-        launch = fork_server.read_launch(data)
-    except EOFError:  # the sender has ended or given the child up, so a traceback would not help anyone
+        spawn.spawn_main(life, tracker_fd=tracker)
+    except pickling.CUT_OFF:  # the sender has ended or given the child up, so a traceback would not help anyone
         os._exit(1)
+    raise AssertionError("a child leaves at the end of its call")
+
+
+def _run(call: EntryCall, control: socket.socket, environment: bytes) -> NoReturn:
+    parent = parent_process()
+    assert parent is not None
+    assert parent.pid is not None
     code = 1
     try:
-        os.setpgid(0, 0)
-        lifeline.mark(launch.family)
-        signal.pthread_sigmask(signal.SIG_SETMASK, [])
-        _be_process_of_multiprocessing(launch, data)
-        _take_surroundings(launch, environment)
-        lifeline.hold(life, launch.parent_pid)
-        code = _called_by_name(launch.entry, Inherited(launch.name, launch.payload, control))
+        if call.environment != environment:
+            _set_environment(call.environment)
+        lifeline.hold(parent.sentinel, parent.pid)
+        code = _called_by_name(call.entry, Inherited(current_process().name, call.payload, control))
     except SystemExit as left:
         code = left.code if isinstance(left.code, int) else int(left.code is not None)
     except BaseException as error:
         _report(control, error)
     finally:
         leave(code)
-
-
-def _be_process_of_multiprocessing(launch: Launch, sentinel: int) -> None:
-    """Give multiprocessing what its own launch of a child would have given it."""
-    own: Any = ForkServerProcess(name=launch.name)
-    own._parent_pid, own._parent_name = launch.parent_pid, launch.parent_name
-    own.authkey = launch.authkey
-    multiprocessing: Any = process
-    multiprocessing._current_process = own
-    multiprocessing._parent_process = _ParentProcess(launch.parent_name, launch.parent_pid, sentinel)
-    multiprocessing._process_counter = itertools.count(1)
-    multiprocessing._children = set()
-    multiprocessing.ORIGINAL_DIR = launch.original_dir
-    _renew_native_id(threading.main_thread())
-    _forget_parents_finalizers()
-
-
-def _take_surroundings(launch: Launch, environment: bytes) -> None:
-    sys.path, sys.argv = launch.sys_path, launch.sys_argv
-    if launch.directory is not None:
-        os.chdir(launch.directory)
-    if launch.environment != environment:
-        _set_environment(launch.environment)
 
 
 def _set_environment(block: bytes) -> None:
@@ -158,6 +137,7 @@ def leave(code: int) -> NoReturn:
     """
 
     def flush() -> None:
+        util.info("process exiting with exitcode %d", code)
         logging.shutdown()
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(Exception):
@@ -223,7 +203,7 @@ def serve(listener: int, alive: int, address: int, errors: int, preload: Sequenc
     atexit.register(clean_up)
     os.register_at_fork(after_in_child=leave_handlers)
     _prepare_for_children()
-    forking = _Forking(listener, alive)
+    forking = _Forking(listener, alive, family)
     garbage.share()
     forking.run()
     leave(0)  # an orderly end of the interpreter would take 4 ms more, for which System.stop() waits
@@ -239,8 +219,7 @@ def _preload(module: str) -> None:
 
 def _prepare_for_children() -> None:
     """Do once what each child would do."""
-    _set_start_method("forkserver")
-    _close_stdin()
+    sys.argv[1:] = ["--multiprocessing-fork"]  # what spawn_main() expects in a child
     pickling.adopt_main()
     ForkingPickler.reducer_override = pickling.of_main_by_value
 
@@ -262,7 +241,8 @@ class _Forking:
     with the error's number, and goes on.
     """
 
-    def __init__(self, listener: int, alive: int) -> None:
+    def __init__(self, listener: int, alive: int, family: int) -> None:
+        self._family = family
         self._listener = socket.socket(fileno=listener)
         self._alive = alive
         self._wake, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -338,11 +318,10 @@ class _Forking:
                 raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
             if len(fds) < _FEWEST_FDS + (kind == fork_server.TRACKED):
                 raise ConnectionResetError(errno.ECONNRESET, os.strerror(errno.ECONNRESET))
-            data, status, *trackers, control, life = fds
+            status, *trackers, control, life = fds
             pid = os.fork()
             if pid == 0:
-                _TRACKER._fd = trackers[0] if kind == fork_server.TRACKED else None  # a child may start its own
-                self._be_child(client, data, status, control, life)
+                self._be_child(client, status, control, life, trackers[0] if trackers else None)
             self._statuses[pid] = status
             fds.remove(status)
             return pid
@@ -350,13 +329,13 @@ class _Forking:
             for fd in fds:
                 os.close(fd)
 
-    def _be_child(self, client: socket.socket, data: int, status: int, control: int, life: int) -> NoReturn:
+    def _be_child(self, client: socket.socket, status: int, control: int, life: int, tracker: int | None) -> NoReturn:
         try:
             end = socket.socket(fileno=control)
             try:
                 client.close()
                 self._leave_to_server(status)
-                enter(data, end, life, self._environment)
+                enter(end, life, tracker, self._family, self._environment)
             except BaseException as error:
                 _report(end, error)
         finally:
@@ -384,7 +363,7 @@ def _forget_exit_handlers() -> None:
     for finalizer in list(_FINALIZERS._registry):
         finalizer.atexit = False
     _FINALIZERS._registered_with_atexit = False
-    for handler in (_end_multiprocessing, *interpreter.of_each_process):
+    for handler in (forked_process.end_multiprocessing, *interpreter.of_each_process):
         atexit.register(handler)
 
 

@@ -2,10 +2,10 @@
 
 A fork server is a small process without threads that has imported the package already; it forks children, collects
 them and reports their exit codes (rr_actors/runtime/processes/child_bootstrap.py). Server and client are this package's
-own: multiprocessing.forkserver's server ends when it cannot fork, and its client ties the server to a resource tracker
-and to this process's default start method, and does not use the server that a child inherits. The parent's __main__ is
-not run again in the child: all that a child needs travels by value, in a launch message of this package's own. To run
-multiprocessing's launch code takes more steps in each child, and each page that they touch is copied.
+own: multiprocessing.forkserver's server ends when it cannot fork and cannot be ended, its client waits without a limit
+and does not use the server that a child inherits, and all code of a process shares one of them
+(docs/on-multiprocessing.md). The children are processes of multiprocessing all the same
+(rr_actors/runtime/processes/forked_process.py).
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from multiprocessing import process
 
 import msgspec
 
-from rr_actors.base import pickling
 from rr_actors.base.errors import UsageError, readable
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes import lifeline
 
-# Private parts of the standard library; the same in Python 3.11, 3.12 and 3.13.
-_ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
+# Parts of the standard library without documentation; the same in Python 3.11, 3.12 and 3.13.
+ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
+"""The working directory at this process's first import of multiprocessing."""
 _interpreter_flags: Callable[[], list[str]] = vars(subprocess)["_args_from_interpreter_flags"]
 
 _LEAVE_GRACE_S = 2.0
@@ -60,11 +60,10 @@ class Inherited(msgspec.Struct, frozen=True):
 
 
 class Forked(msgspec.Struct, frozen=True):
-    """A new process: its id, the pipe for its exit code, and the pipe for its launch message."""
+    """A new process: its id, and the pipe for its exit code."""
 
     pid: int
     status: int
-    data: int
 
 
 class ForkServer:
@@ -108,7 +107,7 @@ class ForkServer:
             theirs.callback(os.close, errors)
             fds = (listener.fileno(), alive_r, address, errors)
             call = (
-                f"import gc, sys; gc.disable(); sys.path[:] = {_sys_path()!r}; "
+                f"import gc, sys; gc.disable(); sys.path[:] = {sys_path()!r}; "
                 "from rr_actors.runtime.processes.child_bootstrap import serve; "
                 f"serve({fds[0]}, {fds[1]}, {fds[2]}, {fds[3]}, {tuple(preload)!r}, {family})"
             )
@@ -116,8 +115,12 @@ class ForkServer:
             on_failure.pop_all()
         return cls(address, alive_w, server, words)
 
-    def fork(self, fds: Sequence[int], deadline: float) -> Forked:
-        """Make a process that inherits `fds`. Blocks until `deadline` (time.monotonic) at most.
+    def fork(self, control: int, life: int, deadline: float) -> Forked:
+        """Make a process that inherits two descriptors. Blocks until `deadline` (time.monotonic) at most.
+
+        Args:
+            control: its control channel.
+            life: the read end of its lifeline, by which its launch message comes first.
 
         Raises:
             TimeoutError: the server has not answered in time.
@@ -128,13 +131,12 @@ class ForkServer:
             deadline = min(deadline, time.monotonic() + ANSWER_S)
         with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
             status_r, status_w = _pipe(on_failure, theirs)
-            data_r, data_w = _pipe(theirs, on_failure)
             tracker = _tracker()
             kind, trackers = (_PLAIN, ()) if tracker is None else (TRACKED, (tracker,))
             with socket.socket(socket.AF_UNIX) as client:
                 client.settimeout(max(0.001, deadline - time.monotonic()))
                 client.connect(f"/proc/self/fd/{self._address}")
-                socket.send_fds(client, [kind], [data_r, status_w, *trackers, *fds])
+                socket.send_fds(client, [kind], [status_w, *trackers, control, life])
                 if not lifeline.is_readable(client.fileno(), deadline - time.monotonic()):
                     raise TimeoutError("the fork server did not answer in time")
                 pid = read_signed(client.fileno())
@@ -144,7 +146,7 @@ class ForkServer:
         self._has_answered = True
         if self._words is not None:
             self._words.close()
-        return Forked(pid, status_r, data_w)
+        return Forked(pid, status_r)
 
     @property
     def pid(self) -> int:
@@ -224,9 +226,13 @@ def _bind(listener: socket.socket, directory: str) -> int:
 
 
 def _tracker() -> int | None:
-    """Return the descriptor of multiprocessing's resource tracker, if this process has one, without starting one."""
-    tracker = sys.modules.get("multiprocessing.resource_tracker")
-    return None if tracker is None else vars(tracker)["_resource_tracker"]._fd
+    """Return the descriptor of multiprocessing's resource tracker, which is started if need be.
+
+    None in a process that has imported no shared memory, and was given no tracker: its children need none.
+    """
+    if not (is_tracked or "multiprocessing.shared_memory" in sys.modules):
+        return None
+    return sys.modules["multiprocessing.resource_tracker"].getfd()
 
 
 def signed(number: int) -> bytes:
@@ -236,18 +242,10 @@ def signed(number: int) -> bytes:
 
 def read_signed(fd: int) -> int:
     """Read a number from a pipe; raise EOFError if the writing process has ended before. Blocks."""
-    return _SIGNED.unpack(_read(fd, _SIGNED.size))[0]
-
-
-def _read(fd: int, size: int) -> bytes:
-    data = bytearray(size)
-    rest = memoryview(data)
-    while rest:
-        count = os.readv(fd, [rest])
-        if not count:
-            raise EOFError("nobody is left to write to this pipe")
-        rest = rest[count:]
-    return bytes(data)
+    number = os.read(fd, _SIGNED.size)  # a pipe gives so few bytes together
+    if len(number) < _SIGNED.size:
+        raise EOFError("nobody is left to write to this pipe")
+    return _SIGNED.unpack(number)[0]
 
 
 def _interpreter(call: str, fds: Sequence[int], words: int) -> subprocess.Popen[bytes]:
@@ -284,79 +282,26 @@ def _placed_apart() -> str:
     return f"import os, sys; {is_alike} and len(sys.argv) < {_PLACINGS} and {again}"
 
 
-def _sys_path() -> list[str]:
-    return [path or _ORIGINAL_DIR or "" for path in sys.path]
+def sys_path() -> list[str]:
+    """Return sys.path with the directory that "" stands for."""
+    return [path or ORIGINAL_DIR or "" for path in sys.path]
 
 
 def _hiding() -> str:
     """Name the files that a new interpreter would import in place of modules of the standard library; "" if none."""
     library = os.path.dirname(os.__file__)
-    specs = (PathFinder.find_spec(name, _sys_path()) for name in sorted(sys.stdlib_module_names))
+    specs = (PathFinder.find_spec(name, sys_path()) for name in sorted(sys.stdlib_module_names))
     files = [spec.origin for spec in specs if spec and spec.origin and not spec.origin.startswith(library)]
     return f"these files hide modules of the standard library: {', '.join(files)}" if files else ""
 
+
+is_tracked = False
+"""Whether the parent of this process has given it a resource tracker. Set by child_bootstrap.py, too."""
 
 inherited: ForkServer | None = None
 """The server that forked this process, or that this process is; None in a process that rr_actors has not made. Set by
 rr_actors/runtime/processes/child_bootstrap.py.
 """
-
-
-# -- the launch message: written by the parent, read by the child ----------------------------------------------------
-
-
-class Launch(msgspec.Struct, frozen=True):
-    """The call that a child makes, and its parent's surroundings.
-
-    Attributes:
-        entry: the function to call, "module:function".
-        payload: not part of the pickle, which may then be a plain one.
-        original_dir: the working directory at the parent's first import of multiprocessing.
-        directory: the working directory; None if it is gone.
-        environment: an environment_block().
-    """
-
-    entry: str
-    name: str
-    family: int
-    parent_pid: int
-    parent_name: str
-    authkey: bytes
-    sys_path: list[str]
-    sys_argv: list[str]
-    original_dir: str | None
-    directory: str | None
-    environment: bytes
-    payload: bytes = b""
-
-
-def launch_message(entry: str, payload: bytes, name: str, family: int) -> bytes:
-    """Return the message for a child's data pipe, which read_launch() reads."""
-    directory: str | None = None
-    with contextlib.suppress(OSError):  # the working directory may be gone
-        directory = os.getcwd()
-    parent = process.current_process()
-    launch = Launch(
-        entry=entry,
-        name=name,
-        family=family,
-        parent_pid=os.getpid(),
-        parent_name=parent.name,
-        authkey=bytes(parent.authkey),  # multiprocessing's class refuses to be pickled
-        sys_path=_sys_path(),
-        sys_argv=sys.argv,
-        original_dir=_ORIGINAL_DIR,
-        directory=directory,
-        environment=environment_block(),
-    )
-    pickled = pickling.dumps(launch, f"the surroundings of {name}")
-    return b"".join((signed(len(pickled)), pickled, signed(len(payload)), payload))
-
-
-def read_launch(fd: int) -> Launch:
-    """Read a launch_message() from a pipe; raise EOFError if its writer has ended before. Blocks."""
-    launch: Launch = pickling.loads(_read(fd, read_signed(fd)))
-    return msgspec.structs.replace(launch, payload=_read(fd, read_signed(fd)))
 
 
 def environment_block() -> bytes:

@@ -273,8 +273,11 @@ def _is_seen_to_end(pid: int, deadline: float) -> bool:
     return True
 
 
-def is_readable(fd: int, timeout_s: float = 0.0) -> bool:
-    """Return whether data or the end can be read within `timeout_s`; for a pidfd, whether its process has ended."""
+def is_readable(fd: int, timeout_s: float | None = 0.0) -> bool:
+    """Return whether data or the end can be read within `timeout_s`; for a pidfd, whether its process has ended.
+
+    None: wait without a limit.
+    """
     poll = select.poll()
     poll.register(fd, select.POLLIN)
-    return bool(poll.poll(max(0.0, timeout_s) * 1000))
+    return bool(poll.poll(None if timeout_s is None else max(0.0, timeout_s) * 1000))

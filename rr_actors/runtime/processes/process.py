@@ -24,10 +24,10 @@ from rr_actors.base.errors import StartFailed, text_of
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer
+from rr_actors.runtime.processes.forked_process import CODE_GRACE_S, EntryCall, ForkedProcess, Popen, launch_message
 
 _CHILD_FDS = 4  # of a Process: its pidfd, its status, its lifeline and its control channel
 _SPARE_FDS = 16  # for the fork server, the start of a child, a registrar
-_CODE_GRACE_S = 0.25  # the longest wait for the exit code after a death
 
 
 def keep_standard_fds() -> None:
@@ -76,30 +76,25 @@ class Exited(NamedTuple):
 
 
 class Process:
-    """A child process, made by Spawner.start(). Call close() when it is dead and no longer needed.
+    """A child process for its supervisor, made by Spawner.start(). Call close() when it is dead and no longer needed.
 
-    One thread at a time uses it: the starting thread, and then the loop's.
+    One thread at a time uses it: the starting thread, and then the loop's. The user's code has the ForkedProcess.
     """
 
-    def __init__(self, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
-        self.pid = forked.pid
+    def __init__(self, child: ForkedProcess, life: int, control: socket.socket) -> None:
+        self.pid = child.launched.pid
         self.control = control
         self.exited: Exited | None = None
-        self._status = forked.status
+        self._child = child
+        self._popen = child.launched
         self._lifeline = life
         self._dead_at: float | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._callback: Callable[[Exited], None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._watched: int | None = None
-        self._pidfd = -1  # a Python that was built on a Linux before 5.3 has no pidfds
-        if hasattr(os, "pidfd_open"):
-            try:
-                self._pidfd = os.pidfd_open(self.pid)
-            except ProcessLookupError:
-                self._collect(_CODE_GRACE_S)
-        if self.exited is None and lifeline.is_readable(self._status):
-            self._collect()  # it died before the pidfd was opened, which may belong to another process
+        if self._popen.returncode is not None:
+            self._collect()
 
     def watch(self, loop: asyncio.AbstractEventLoop, callback: Callable[[Exited], None]) -> None:
         """Call `callback` once, on `loop`, when the process has ended. Only for the loop's thread."""
@@ -107,39 +102,33 @@ class Process:
         if self.exited is not None:
             loop.call_soon(self._notify)
         else:
-            self._add_reader(self._pidfd if self._pidfd >= 0 else self._status, self._noticed)
+            self._add_reader(self._popen.sentinel, self._noticed)
 
     def kill(self, sig: int = signal.SIGKILL) -> bool:
         """Send a signal; return False if the process has ended. Never signals a later process with the same id."""
-        if self.exited is not None or self._dead_at is not None:
-            return False
-        try:
-            if self._pidfd >= 0:
-                signal.pidfd_send_signal(self._pidfd, sig)
-            else:
-                os.kill(self.pid, sig)
-        except ProcessLookupError:
-            return False
-        return True
+        return self.exited is None and self._dead_at is None and self._popen.send(sig)
 
     def wait(self, timeout_s: float) -> Exited | None:
         """Wait for the end of a process that is not watched, and return it; None: it has not ended in time."""
-        if self.exited is None and lifeline.is_readable(self._status, timeout_s):
+        if self.exited is None and self._popen.wait(timeout_s) is not None:
             self._collect()
         return self.exited
 
     def close(self) -> None:
         """Kill the process if it lives, and close its descriptors. On the loop's thread if it is watched."""
+        if self._lifeline < 0:
+            return
         self.kill()
         self._remove_reader()
         if self._timer is not None:
             self._timer.cancel()
         self._callback = None
-        self.exited = self.exited or Exited(None, time.monotonic())
-        for fd in (self._pidfd, self._status, self._lifeline):
-            if fd >= 0:
-                os.close(fd)
-        self._pidfd = self._status = self._lifeline = -1
+        self._collect()
+        with contextlib.suppress(ValueError):  # the user's code has closed it
+            self._child.join(0)  # takes it from multiprocessing's active_children()
+        del self._child, self._popen  # the user's code may still have them, and wait for the sentinel
+        os.close(self._lifeline)
+        self._lifeline = -1
         self.control.close()
 
     # -- on the loop: the process has died; then its exit code has come ---------------------------------------------
@@ -148,18 +137,17 @@ class Process:
         assert self._loop is not None
         self._remove_reader()
         self._dead_at = time.monotonic()
-        if lifeline.is_readable(self._status):
+        if lifeline.is_readable(self._popen.status):
             self._conclude()
         else:
-            self._add_reader(self._status, self._conclude)
-            self._timer = self._loop.call_later(_CODE_GRACE_S, self._conclude)
+            self._add_reader(self._popen.status, self._conclude)
+            self._timer = self._loop.call_later(CODE_GRACE_S, self._conclude)
 
     def _conclude(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
         self._remove_reader()
-        if self.exited is None:
-            self._collect()
+        self._collect()
         self._notify()
 
     def _notify(self) -> None:
@@ -177,12 +165,9 @@ class Process:
         if fd is not None and self._loop is not None:
             self._loop.remove_reader(fd)
 
-    def _collect(self, timeout_s: float = 0.0) -> None:
-        code = None
-        if lifeline.is_readable(self._status, timeout_s):
-            with contextlib.suppress(EOFError, OSError):  # the fork server has ended before
-                code = fork_server.read_signed(self._status)
-        self.exited = Exited(code, self._dead_at or time.monotonic())
+    def _collect(self) -> None:
+        self._popen.collect()
+        self.exited = self.exited or Exited(self._popen.code, self._dead_at or time.monotonic())
 
 
 class Spawner:
@@ -218,9 +203,9 @@ class Spawner:
             StartFailed: no process was started; a process that did not read its payload in time is killed.
         """
         deadline = time.monotonic() + timeout_s
-        message = fork_server.launch_message(entry, payload, name, self._family)
+        call = EntryCall(entry, payload, fork_server.environment_block())
         try:
-            return self._start(message, name, deadline)
+            return self._start(call, name, deadline)
         except (OSError, EOFError) as error:
             wanted = wanted_by(error)
             if isinstance(error, EOFError | ConnectionError):  # two servers have ended in their start
@@ -228,7 +213,7 @@ class Spawner:
             text = f"process {name!r} could not be started: {wanted or text_of(error)}"
             raise StartFailed(text, id=name, wanted=wanted) from error
 
-    def _start(self, message: bytes, name: str, deadline: float) -> Process:
+    def _start(self, call: EntryCall, name: str, deadline: float) -> Process:
         with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
             ends = socket.socketpair()
             control = on_failure.enter_context(ends[0])
@@ -236,23 +221,24 @@ class Spawner:
             life_r, life_w = os.pipe()
             theirs.callback(os.close, life_r)
             on_failure.callback(os.close, life_w)
-            forked = self._fork((ends[1].fileno(), life_r), deadline)
-            theirs.callback(os.close, forked.data)  # a child that does not get its whole message ends
-            try:
-                child = Process(forked, life_w, control)
-            except BaseException:
-                os.close(forked.status)
-                raise
+
+            def launch(child: ForkedProcess) -> Popen:
+                message = launch_message(child)
+                popen = Popen(self._fork(ends[1].fileno(), life_r, deadline))
+                try:
+                    _write_all(life_w, message, deadline)
+                except BrokenPipeError:
+                    pass  # it has ended already: its last message or its exit code says why
+                except OSError as error:
+                    popen.kill()
+                    text = f"process {name!r} (pid {popen.pid}) did not start: {error!r}"
+                    raise StartFailed(text, id=name) from error
+                return popen
+
+            child = ForkedProcess(name, call, launch)
+            child.start()
             on_failure.pop_all()
-            try:
-                _write_all(forked.data, message, deadline)
-            except BrokenPipeError:
-                pass  # it has ended already: its last message or its exit code says why
-            except OSError as error:
-                child.close()
-                text = f"process {name!r} (pid {forked.pid}) did not start: {error!r}"
-                raise StartFailed(text, id=name) from error
-        return child
+        return Process(child, life_w, control)
 
     def sweep(self) -> int:
         """SIGKILL the descendants that dead children left behind, anywhere in this process's application.
@@ -279,10 +265,10 @@ class Spawner:
             server.close()
             self.sweep()
 
-    def _fork(self, fds: Sequence[int], deadline: float) -> fork_server.Forked:
+    def _fork(self, control: int, life: int, deadline: float) -> fork_server.Forked:
         began, server = time.monotonic(), self._running()
         try:
-            return server.fork(fds, deadline)
+            return server.fork(control, life, deadline)
         except TimeoutError:
             if time.monotonic() - began < fork_server.ANSWER_S:
                 raise  # there was little time: the server may be well
@@ -292,7 +278,7 @@ class Spawner:
                 raise
         except (ConnectionError, FileNotFoundError, EOFError):
             self._discard(server)
-        return self._running().fork(fds, deadline)  # the server was killed, or hung: try again with a new one
+        return self._running().fork(control, life, deadline)  # the server was killed, or hung: try again with a new one
 
     def _running(self) -> ForkServer:
         with self._lock:
