@@ -25,11 +25,14 @@ REGISTRAR = "registrar"
 PROVIDERS = "clients"
 """The id in the paths of a registrar's clients, one for each provider, "root/cameras/registrar/clients/maps"."""
 
+SERVERS = "servers"
+"""The id in the paths of a registrar's servers, "root/cameras/registrar/servers/camera"."""
+
 
 def is_part(path: str) -> bool:
     """Return whether the path of an actor is one of a part: a manager's registrar, or the application's, or below."""
     ids = path.split("/")
-    return REGISTRAR in ids[1:] or len(ids) == 1 or ids[1] == PROVIDERS
+    return REGISTRAR in ids[1:] or len(ids) == 1 or ids[1] in (PROVIDERS, SERVERS)
 
 
 NAME_RULE = "1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'"

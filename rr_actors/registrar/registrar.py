@@ -23,7 +23,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
-from rr_actors.base.names import ServerId, check_name, named, new_id, parse_server, parsed_server
+from rr_actors.base.names import SERVERS, ServerId, check_name, named, new_id, parse_server, parsed_server
 from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode, text_of_value
@@ -94,9 +94,10 @@ from rr_actors.registrar.servers.callback_context import (
     serving,
     status_callback_of,
 )
+from rr_actors.registrar.servers.gated_server import server_of
 from rr_actors.registrar.servers.on_demand_callbacks import Measured, Usages
 from rr_actors.registrar.servers.registered_servers import reread_values
-from rr_actors.registrar.servers.running_server import RunningServer
+from rr_actors.registrar.servers.server_actor import ServerActor
 from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import RunningLimit, finite_time, time_limit
 from rr_actors.runtime.user_loop import CallersLoop
@@ -671,7 +672,8 @@ class Registrar(Consumer):
         if is_declared_here:
             log_unread_types(spec, origin)
         types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
-        server = RunningServer(self._actor, spec, types)
+        path = f"{self._actor.actor_ref.path}/{SERVERS}/{spec.name}"
+        server = server_of(path, self._actor, spec, types)
         server.restored = restored
         with self._actor.enter():
             catalog = self._actor.whole()
@@ -682,7 +684,7 @@ class Registrar(Consumer):
         if kept and is_declared_here and spec.recovery is None and spec.recover is None:
             logger.warning(_KEPT, self.name, spec.name, kept)
 
-    def _register(self, server: RunningServer, stored: bytes | None, reread: tuple[c.Reread, ...]) -> int:
+    def _register(self, server: ServerActor, stored: bytes | None, reread: tuple[c.Reread, ...]) -> int:
         """Register a server on the loop, and return how many usable held resources it finds; 0 if it replaces one."""
         name = server.spec.name
         with self._actor.enter():
@@ -821,7 +823,7 @@ class Registrar(Consumer):
         what = f"response for {target_id(query_or_resource_id)}"
         self._calls.command(lambda ticket: c.SetResponse(target, new_id(), raw, text, ticket, own), what)
 
-    def _served(self, target: str) -> tuple[Resource | None, RunningServer | None]:
+    def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:
         with self._actor.enter():
             resource = self._actor.whole().find(target)
         return resource, None if resource is None else self._actor.servers.get(resource.server)
@@ -1077,14 +1079,14 @@ class Registrar(Consumer):
 
     def _resources_now(
         self, ids: Iterable[str] | None = None
-    ) -> list[tuple[Resource, RunningServer | None, list[QueryRow]]]:
+    ) -> list[tuple[Resource, ServerActor | None, list[QueryRow]]]:
         with self._actor.enter():
             catalog, server_of = self._actor.whole(), self._actor.servers.get
             known = catalog.resources
             rows = known.values() if ids is None else [known[id] for id in ids if id in known]
             return [(row, server_of(row.server), catalog.queries_of(row.id)) for row in rows]
 
-    def _info(self, resource: Resource, server: RunningServer | None, queries: list[QueryRow]) -> ResourceInfo:
+    def _info(self, resource: Resource, server: ServerActor | None, queries: list[QueryRow]) -> ResourceInfo:
         """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
         request = (server.request if server else PLAIN).show(resource.request)
         response = None
@@ -1145,7 +1147,7 @@ class Registrar(Consumer):
             ended[resource.id] = late if future is None or not future.done() else future.result()
         return ended
 
-    def _measured_now(self, wanted: frozenset[str] | None) -> list[tuple[Resource, RunningServer]]:
+    def _measured_now(self, wanted: frozenset[str] | None) -> list[tuple[Resource, ServerActor]]:
         """Return the loaded resources, with their servers, of which the usage can be asked."""
         with self._actor.enter():
             rows = self._actor.whole().resources
@@ -1285,7 +1287,7 @@ class Registrar(Consumer):
         self._calls.dispatcher.run(self._node.dismiss((self.name,), limit_s))
 
 
-def _begun(some: list[tuple[Resource, RunningServer]]) -> dict[str, Future[Measured]]:
+def _begun(some: list[tuple[Resource, ServerActor]]) -> dict[str, Future[Measured]]:
     return {row.id: server.usage.measure(row) for row, server in some}
 
 

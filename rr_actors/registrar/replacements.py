@@ -24,14 +24,14 @@ from rr_actors.registrar.model.failures import is_released
 from rr_actors.registrar.model.rows import Held, Hold, Resource, priority_of
 from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.servers.callback_context import status_callback_of
-from rr_actors.registrar.servers.running_server import RunningServer
+from rr_actors.registrar.servers.server_actor import ServerActor
 
 
 class _Found(NamedTuple):
     """A resource, its server, a part that it may hold, and the spares that it holds for this part, newest first."""
 
     resource: Resource
-    server: RunningServer | None
+    server: ServerActor | None
     part: Held | None
     spares: list[Held]
 
@@ -131,7 +131,7 @@ class Replacements:
         self._calls.command(swap, f"replacing {part.id}")
 
 
-def encoded_response(response: Any, resource: Resource | None, server: RunningServer | None) -> bytes:
+def encoded_response(response: Any, resource: Resource | None, server: ServerActor | None) -> bytes:
     """Return the bytes of a new response of a resource.
 
     Raises:

@@ -677,8 +677,8 @@ class System:
         """Return a reference to a child actor anywhere in the tree, by its id or its path ("inner/a").
 
         An id is searched for under the root supervisor first, then below. If several children have it, use a path. A
-        manager's registrar is "cameras/registrar", one of the application's has its name ("app"), and a client of a
-        registrar is "cameras/registrar/clients/maps" or "app/clients/cameras".
+        manager's registrar is "cameras/registrar", and one of the application's has its name ("app"). A client of a
+        registrar is "cameras/registrar/clients/maps" or "app/clients/cameras"; a server is "app/servers/camera".
 
         Raises:
             NotFound: no child has this id, or several have it. The error has their paths.

@@ -1,4 +1,4 @@
-"""Registrars and their clients are actors: a mailbox and a turn, a reference with a path, a monitor, dead letters."""
+"""Registrars, their clients and servers are actors: a mailbox and a turn, references, paths, monitors, dead letters."""
 
 from __future__ import annotations
 
@@ -66,10 +66,16 @@ def delivered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     return found
 
 
-def test_a_registrar_and_its_client_of_a_provider_are_actors_with_a_mailbox(app: rr.Registrar) -> None:
+def test_each_registrar_client_and_server_is_an_actor_with_a_mailbox(app: rr.Registrar) -> None:
+    app.register_server("thing", lambda request: request)
     app.load("cameras/camera", "front")
+    app.load("app/thing", "x")
     registrar = actor_of(app)
-    for actor, path in ((registrar, "app"), (registrar.client("cameras"), "app/clients/cameras")):
+    server = registrar.servers.get("thing")
+    assert server is not None
+    actors: dict[str, TurnActor] = {"app": registrar, "app/servers/thing": server}
+    actors |= {f"app/clients/{provider}": client for provider, client in registrar.clients.items()}
+    for path, actor in actors.items():
         assert isinstance(actor, pykka.Actor)
         assert isinstance(actor.actor_inbox, Mailbox)
         assert len(actor.actor_inbox) == 0
@@ -77,7 +83,29 @@ def test_a_registrar_and_its_client_of_a_provider_are_actors_with_a_mailbox(app:
         assert actor.actor_ref.is_alive()
 
 
-@pytest.mark.parametrize("path", ["cameras/registrar", "root/cameras/registrar", "app", "app/clients/cameras"])
+def test_a_server_ends_when_it_is_unregistered(system: rr.System, app: rr.Registrar) -> None:
+    app.register_server("thing", lambda request: request)
+    ref = system.ref("app/servers/thing")
+    with rr.monitor(ref) as monitor:
+        app.unregister_server("thing")
+        down = monitor.wait(LIMIT_S)
+    assert down is not None
+    assert down.reason == "shutdown"
+    assert not ref.is_alive()
+    app.register_server("thing", lambda request: request)
+    assert ref.is_alive()
+
+
+PATHS = [
+    "cameras/registrar",
+    "root/cameras/registrar",
+    "cameras/registrar/servers/camera",
+    "app",
+    "app/clients/cameras",
+]
+
+
+@pytest.mark.parametrize("path", PATHS)
 def test_a_system_finds_them_by_their_paths(system: rr.System, app: rr.Registrar, path: str) -> None:
     app.load("cameras/camera", "front")
     ref = system.ref(path)
@@ -113,6 +141,15 @@ def test_a_monitor_hears_that_the_process_of_a_managers_registrar_was_killed(sys
         down = monitor.wait(LIMIT_S)
     assert down is not None
     assert down.reason in ("killed", "abnormal")
+
+
+@pytest.mark.parametrize("at_once", [None, 1])
+def test_a_server_answers_what_is_no_message_of_it(system: rr.System, app: rr.Registrar, at_once: int | None) -> None:
+    app.register_server("thing", lambda request: request, at_once=at_once)
+    for _ in range(2):
+        with pytest.raises(rr.UsageError, match="takes messages of the framework alone"):
+            system.ref("app/servers/thing").ask("open", timeout=LIMIT_S)
+    assert app.load("app/thing", "x").response == "x"
 
 
 @pytest.mark.parametrize("path", ["app", "cameras/registrar"])

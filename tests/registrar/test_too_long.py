@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.servers.running_server import RunningServer
+from rr_actors.registrar.servers.server_actor import ServerActor
 from support import Workshop, eventually, serve
 from support_inside import actor_of, on_loop
 from support_managers import Shop
@@ -49,7 +49,7 @@ def pair(start: Start, workshop: Workshop) -> Pair:
 @pytest.fixture
 def higher_limit(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Responses are taken as they were before the limit was lowered."""
-    monkeypatch.setattr(RunningServer, "too_long", lambda *_: None)
+    monkeypatch.setattr(ServerActor, "too_long", lambda *_: None)
     return monkeypatch
 
 

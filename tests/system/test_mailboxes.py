@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 from collections.abc import Callable
@@ -11,7 +12,7 @@ import msgspec
 import pytest
 
 import rr_actors as rr
-from support import Calls, Workshop, eventually, pid_of, wait_respawned
+from support import Calls, Workshop, eventually, kill, pid_of, wait_respawned
 from support_asks import Background
 
 Start = Callable[..., rr.System]
@@ -259,3 +260,63 @@ def test_the_actors_of_the_framework_are_not_paused(debugged: rr.System) -> None
     for path in ("root", "app"):
         with pytest.raises(rr.UsageError, match=f"{path}: it is an actor of the framework"):
             debugged.mailbox(path).pause()
+
+
+class Printers(rr.Manager):
+    """One page is printed at a time."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    @rr.server("page", at_once=1)
+    def print_page(self, page: str) -> str:
+        self.work.step("print", page)
+        return page
+
+    @print_page.unload
+    def take_page(self, page: str, response: str) -> None:
+        self.work.note("took", page)
+
+
+@pytest.mark.parametrize("placement", PLACES)
+def test_loads_that_wait_for_room_wait_in_the_mailbox_of_their_server(
+    start: Start, workshop: Workshop, placement: Literal["process", "thread"]
+) -> None:
+    system = start(rr.ChildSpec(Printers, id="printers", args=(str(workshop.root),), placement=placement))
+    app = system.open_registrar("app")
+    workshop.shut("print")
+    loads = [app.load("printers/page", page, block=False) for page in ("one", "two", "three")]
+    server = "printers/registrar/servers/page"
+    eventually(lambda: look(system, server).length == 2, what="two that wait")
+    workshop.wait("print")
+    found = look(system, server)
+    assert found.types == {"StartCallback": 2}
+    assert found.oldest is not None
+    assert (found.oldest.type, found.oldest.sender) == ("StartCallback", "printers")
+    assert found.oldest.since_s is not None
+    assert found.oldest.since_s > 0
+    workshop.open("print")
+    assert [load.get(timeout=30.0).response for load in loads] == ["one", "two", "three"]
+    assert look(system, server).length == 0
+    assert [line.split()[1] for line in workshop.lines("print")] == ["one", "two", "three"]
+
+
+def test_what_waits_for_a_stored_server_goes_to_the_one_that_replaces_it(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Late, id="shop", args=(str(workshop.root),)))
+    app, shop, root = system.open_registrar("app"), system.registrar("shop"), str(workshop.root)
+
+    def load(word: str, request: str) -> str:
+        Workshop(root).step(word, request)
+        return word
+
+    shop.register_server("late", functools.partial(load, "old"), request_type=str, response_type=str, at_once=1)
+    workshop.shut("old")
+    loads = [app.load("shop/late", request, block=False) for request in ("one", "two")]
+    workshop.wait("old")
+    wait_respawned(system, "shop", kill(system, "shop"))
+    workshop.wait("old", 2)
+    eventually(lambda: look(system, "shop/registrar/servers/late").length == 1, what="one that waits")
+    shop.register_server("late", functools.partial(load, "new"), request_type=str, response_type=str, at_once=1)
+    workshop.wait("new")
+    workshop.open("old")
+    assert sorted(load.get(timeout=30.0).response for load in loads) == ["new", "old"]

@@ -261,6 +261,11 @@ class Mailbox:
             self._at_rest = not self.waiting and not self._control
             return self._at_rest
 
+    def rouse_again(self) -> None:
+        """Have the next put() schedule the actor, also while messages wait."""
+        with self._lock:
+            self._at_rest = True
+
     def close(self) -> list[PykkaEnvelope[Any]]:
         """Refuse messages from now on, and return those that were not handled."""
         with self._lock:

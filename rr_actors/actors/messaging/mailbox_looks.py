@@ -104,14 +104,16 @@ def type_of(message: object) -> str:
 
 
 def message_info(envelope: Any, at: float = 0.0) -> MessageInfo:
-    """Return what is known of a message: an envelope, or a registrar's pair of message and sender.
+    """Return what is known of a message: an envelope, or a delivery, as of a registrar.
 
     Args:
         at: since when it is handled, by time.monotonic(); 0: since it came.
     """
     message = _message(envelope)
     if isinstance(envelope, tuple):
-        return MessageInfo(type_of(message), cast("tuple[Any, str | None]", envelope)[1] or "")
+        pair = cast("tuple[Any, str | None]", envelope)
+        at = getattr(pair, "at", 0.0)
+        return MessageInfo(type_of(message), pair[1] or "", monotonic() - at if at else None)
     sender = message.sender if type(message) is Packed else ""
     if isinstance(envelope, Envelope):  # not one of Pykka's own references
         at = at or envelope.at

@@ -125,7 +125,7 @@ class EffectRunner:
     def _start_callback(self, effect: e.StartCallback) -> None:
         server = self._servers.get(effect.resource.server)
         if server is not None:
-            server.start(effect)
+            server.deliver(effect)
         elif BEGUN[effect.role].phase is None:
             self._registrar.post(c.CallbackEnded(effect.role, effect.resource.id, notice=effect.notice))
 

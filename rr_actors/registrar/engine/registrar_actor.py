@@ -26,7 +26,7 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import Loaded, LoadRefused
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.servers.registered_servers import Servers
-from rr_actors.registrar.servers.running_server import RequestReader
+from rr_actors.registrar.servers.server_actor import RequestReader
 from rr_actors.registrar.servers.server_base import load_failure
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.event_loop import FORKED

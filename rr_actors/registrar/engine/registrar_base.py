@@ -314,7 +314,7 @@ class RegistrarBase(RegistrarState, abc.ABC):
         """Carry out the effects of all decisions in their order."""
         if self._failure and not self._was_logged:
             logger.error("%s: not committed, nothing was done: %s", self.name, self._failure)
-        self._failure = self._failure if self._held_up else ""
+        self._failure = "" if self.takes else self._failure
         try:
             if self._defect is not None:
                 raise self._defect

@@ -29,7 +29,7 @@ from rr_actors.registrar.model.health import (
 )
 from rr_actors.registrar.model.roles import HEALTH, USAGE
 from rr_actors.registrar.model.rows import LOADED, PAUSED, Resource, State
-from rr_actors.registrar.servers.server_base import ServerBase, said
+from rr_actors.registrar.servers.server_base import OnDemandRun, ServerBase, said
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.thread_rules import on_loop
 from rr_actors.runtime.time_limits import Probes, ProbeTimes
@@ -99,7 +99,7 @@ class UsageCallbacks:
         if resource is None:
             done(None, None)
         else:
-            self._server.submit(USAGE, resource, resource.attempt, done)
+            self._server.deliver(OnDemandRun(USAGE.name, resource, done))
 
     def _numbers(self, answer: object) -> dict[str, float]:
         expected = f"a dict of at most {_MOST_NUMBERS} finite numbers by name"
@@ -178,7 +178,7 @@ class HealthCallbacks:
                 elif resource is None:
                     self.probes.ended(id)
                 else:
-                    self._server.submit(HEALTH, resource, resource.attempt, functools.partial(self._probe_ended, id))
+                    self._server.deliver(OnDemandRun(HEALTH.name, resource, functools.partial(self._probe_ended, id)))
         finally:
             self._registrar.workers.threads.go()
 
@@ -204,7 +204,7 @@ class HealthCallbacks:
             self.probes.ended(resource_id)
         else:
             done = functools.partial(self._suspect_ended, resource_id)
-            self._server.submit(HEALTH, resource, resource.attempt, done)
+            self._server.deliver(OnDemandRun(HEALTH.name, resource, done))
 
     def _suspect_ended(self, resource_id: str, found: ProbeResult | None, error: BaseException | None) -> None:
         self._registrar.post(c.CallbackEnded("health", resource_id))

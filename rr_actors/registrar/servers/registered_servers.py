@@ -16,7 +16,7 @@ from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import Described
 from rr_actors.registrar.model.rows import Resource
-from rr_actors.registrar.servers.running_server import RunningServer
+from rr_actors.registrar.servers.server_actor import ServerActor
 from rr_actors.runtime.thread_rules import on_loop
 
 
@@ -26,15 +26,15 @@ class Servers:
     def __init__(self, registrar: RegistrarBase, consumers: Consumers) -> None:
         self._registrar = registrar
         self._consumers = consumers
-        self._by_name: dict[str, RunningServer] = {}
-        self.get: Callable[[str], RunningServer | None] = self._by_name.get
+        self._by_name: dict[str, ServerActor] = {}
+        self.get: Callable[[str], ServerActor | None] = self._by_name.get
 
     def names(self) -> list[str]:
         """Return the names of all servers, in the order in which they were registered."""
         return list(self._by_name)
 
     @on_loop
-    def register(self, server: RunningServer, reread: tuple[c.Reread, ...] = ()) -> None:
+    def register(self, server: ServerActor, reread: tuple[c.Reread, ...] = ()) -> None:
         """Add a server, and go on with its resources; raise NameTaken if there is a server of that name."""
         registrar, name = self._registrar, server.spec.name
         old = self._by_name.get(name)
@@ -43,8 +43,10 @@ class Servers:
             raise NameTaken(text, name=name)
         registrar.node.directory.put_labels(registrar.name, name, server.spec.labels)
         self._by_name[name] = server
-        if old is not None:
-            old.health.probes.close()
+        left = [] if old is None else old.end()
+        server.begin()
+        for message in left:
+            server.deliver(message)
         self._consumers.tell_all(Described(name, server.facts.types))
         if old is None:
             registrar.post(c.Register(server.facts, new_id(), reread, server.digest))
@@ -61,9 +63,9 @@ class Servers:
 
     @on_loop
     def close(self) -> None:
-        """Probe nothing more."""
+        """End all servers."""
         for server in self._by_name.values():
-            server.health.probes.close()
+            server.end()
 
     @on_loop
     def register_again(self) -> None:
@@ -78,7 +80,7 @@ class Servers:
 
         def ended(error: RrError | None) -> None:
             if name not in registrar.catalog.servers and (server := self._by_name.pop(name, None)) is not None:
-                server.health.probes.close()
+                server.end()
                 registrar.node.directory.put_labels(registrar.name, name, "")
             done(error)
 
@@ -90,7 +92,7 @@ class Servers:
 logger = Log("rr_actors.server")
 
 
-def reread_values(server: RunningServer, resources: Iterable[Resource], digest: bytes) -> tuple[c.Reread, ...]:
+def reread_values(server: ServerActor, resources: Iterable[Resource], digest: bytes) -> tuple[c.Reread, ...]:
     """Read stored requests and responses by today's types; return what differs. Not on the loop: users' code runs.
 
     What does not fit goes through the upgrade callback, if there is one. With an unchanged digest of the types only
@@ -101,12 +103,12 @@ def reread_values(server: RunningServer, resources: Iterable[Resource], digest: 
     return tuple(found for resource in resources if (found := _reread(server, resource)) is not None)
 
 
-def _runs_code(server: RunningServer, resource: Resource) -> bool:
+def _runs_code(server: ServerActor, resource: Resource) -> bool:
     response = resource.response
     return server.request.runs_code(resource.request) or (response is not None and server.response.runs_code(response))
 
 
-def _reread(server: RunningServer, resource: Resource) -> c.Reread | None:
+def _reread(server: ServerActor, resource: Resource) -> c.Reread | None:
     place, response = resource.id, resource.response
     try:
         request = server.request.today(resource.request)
@@ -127,7 +129,7 @@ def _reread(server: RunningServer, resource: Resource) -> c.Reread | None:
     return c.Reread(place, resource.request, response, misfit)
 
 
-def _upgraded(server: RunningServer, resource: Resource, upgrade: Callback) -> c.Reread:
+def _upgraded(server: ServerActor, resource: Resource, upgrade: Callback) -> c.Reread:
     old = None if resource.response is None else shown_plain(resource.response)
     request, response = upgrade(shown_plain(resource.request), old)
     new = server.request.canonical(encode(request), server.origin)

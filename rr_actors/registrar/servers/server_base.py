@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
-from rr_actors.base.errors import CircularDependency, GraphError, LoadFailed, OverCapacity, readable, text_of
+import msgspec
+
+from rr_actors.base.errors import (
+    CircularDependency,
+    GraphError,
+    LoadFailed,
+    OverCapacity,
+    Unavailable,
+    readable,
+    shortened,
+    text_of,
+)
+from rr_actors.base.names import short_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by_callback
+from rr_actors.base.values.canonical import text_of_value
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.server import ServerSpec
+from rr_actors.registrar.engine.status import StatusMessage
+from rr_actors.registrar.model.effects import StartCallback
 from rr_actors.registrar.model.roles import RECOVER, Role
 from rr_actors.registrar.model.rows import Resource
 from rr_actors.runtime.callback_errors import Raised, log_raised, traceback_of
 from rr_actors.runtime.user_loop import Done
+from rr_actors.streams.stream import StreamNews
 
 logger = Log("rr_actors.server")
 
@@ -74,6 +92,35 @@ def _alone(error: BaseException) -> BaseException:
     return _alone(group.exceptions[0]) if len(group.exceptions) == 1 else group
 
 
+class OnDemandRun(msgspec.Struct, frozen=True, gc=False):
+    """Run a usage or health callback for a resource.
+
+    Attributes:
+        role: its name.
+        done: called on the loop with the result, or the error.
+    """
+
+    role: str
+    resource: Resource
+    done: Done
+
+
+class Run(msgspec.Struct, frozen=True, gc=False):
+    """One run of a callback.
+
+    Attributes:
+        number: its number, as decisions count it.
+        heard: of a status callback: the status.
+        began_s: when it began, by the monotonic clock.
+    """
+
+    role: Role
+    effect: StartCallback
+    number: int
+    heard: StatusMessage | None
+    began_s: float
+
+
 class ServerBase(Protocol):
     """A server, as its parts see it.
 
@@ -89,8 +136,8 @@ class ServerBase(Protocol):
         """Run callbacks of a role from now on."""
         ...
 
-    def submit(self, role: Role, resource: Resource, number: int, done: Done) -> None:
-        """Run the callback of a role for a resource; `done` is called on the loop."""
+    def deliver(self, message: OnDemandRun) -> None:
+        """Take a message, on the loop: run a callback."""
         ...
 
     def request_and_response_of(self, resource: Resource) -> tuple[Any, Any]:
@@ -100,3 +147,38 @@ class ServerBase(Protocol):
 
 def nothing(*_: Any) -> None:
     """Do nothing: the server has no such callback."""
+
+
+def recorded_end(
+    server: ServerBase, role: Role, resource: Resource, done: Done, at_once: Callable[[Any], bool] | None
+) -> tuple[Done, Callable[[Any], bool] | None]:
+    """Return `done` and `at_once` of a callback changed to record its end first, and only once."""
+    record = functools.partial(server.registrar.recorder.callback, "ended", server.origin, role.name, resource.id)
+    ended: list[bool] = []
+
+    def recorded(result: Any, error: BaseException | None) -> None:
+        if not ended:
+            record("" if error is None else readable(shortened(said(error))))
+        done(result, error)
+
+    def recorded_at_once(result: Any) -> bool:
+        ended.append(True)
+        record()
+        return at_once is not None and at_once(result)
+
+    return recorded, None if at_once is None else recorded_at_once
+
+
+def tell_stream(server: ServerBase, resource: Resource, news: StreamNews) -> None:
+    """Tell the watchers of the system what has happened to a stream. From any thread."""
+    node = server.registrar.node
+    if not node.watched.level[0]:
+        return
+    facts = {"registrar": server.registrar.name, "server": server.origin, "resource_id": resource.id}
+    facts |= {"request": text_of_value(resource.request), "stream": news.stream.name, "detail": news.stream.name}
+    if (before := news.before) is not None:
+        instead = f"{before.name} of resource {short_id(before.resource_id)}"
+        facts["detail"] += f", read by {news.reader} instead of {instead}"
+        facts |= {"reader": news.reader, "before": f"{before.resource_id}/{before.name}"}
+    with contextlib.suppress(Unavailable):  # the loop has ended
+        node.dispatcher.call(functools.partial(node.emit, news.what, **facts))

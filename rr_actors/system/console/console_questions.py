@@ -236,7 +236,7 @@ class ListStacks(Verb[c.ChildStacks], frozen=True):
 
 
 class LookAtMailbox(Verb[c.MailboxSeen], frozen=True):
-    """The mailbox of an actor, which its path or id names: a child, a supervisor, a registrar or one of its clients."""
+    """The mailbox of an actor, which its path or id names: a child, a supervisor, a registrar, a client or a server."""
 
     actor: c.Text
 

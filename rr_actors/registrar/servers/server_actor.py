@@ -1,4 +1,4 @@
-"""RunningServer: one kind of resource of one registrar. It runs its callbacks in workers, and says how they ended.
+"""ServerActor: one kind of resource of one registrar. It runs its callbacks in workers, and says how they ended.
 
 In the worker, a request and a response are decoded, the callback is called, and its result is encoded. The end of a run
 is heard on the event loop; the end of one that goes well is heard first in the worker, which may deal with it.
@@ -14,25 +14,16 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import (
-    InvalidSpec,
-    MailboxFull,
-    NotSerializable,
-    RrError,
-    Unavailable,
-    readable,
-    shortened,
-    shown,
-    text_of,
-)
-from rr_actors.base.names import new_id, short_id
+from rr_actors.actors.turns import CLOSED, Delivery, TurnActor
+from rr_actors.base.errors import InvalidSpec, MailboxFull, NotSerializable, RrError, Unavailable, shown, text_of
+from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.values.canonical import Codec, text_of_value
+from rr_actors.base.values.canonical import Codec
 from rr_actors.base.values.failure import Failure, failure_of
 from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.registrar.core.callback_runs import deaths_of
@@ -50,18 +41,27 @@ from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, STATUS
 from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
 from rr_actors.registrar.servers.callback_context import Current, enter
 from rr_actors.registrar.servers.on_demand_callbacks import HealthCallbacks, UsageCallbacks
-from rr_actors.registrar.servers.server_base import failure_of_callback, load_failure, nothing, said
+from rr_actors.registrar.servers.server_base import (
+    OnDemandRun,
+    Run,
+    failure_of_callback,
+    load_failure,
+    nothing,
+    recorded_end,
+    tell_stream,
+)
 from rr_actors.runtime.callback_errors import Raised, described_error
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.user_loop import COROUTINE, Done, closing
 from rr_actors.runtime.workers import Gate, is_async
-from rr_actors.streams.stream import StreamNews
 from rr_actors.wire.frames import ADVICE
 
 logger = Log("rr_actors.server")
 
 _NEWEST = 500  # load callbacks of a server, of which the times are kept
 _ROW_BYTES = 1024  # room for the names and ids that are sent with a request, a response, or types
+
+Message = StartCallback | OnDemandRun
 
 
 class LoadTimes:
@@ -95,26 +95,8 @@ class LoadTimes:
         return newest[math.ceil(0.95 * len(newest)) - 1] if newest else 0.0
 
 
-class Run(msgspec.Struct, frozen=True, gc=False):
-    """One run of a callback.
-
-    Attributes:
-        number: its number, as decisions count it.
-        heard: of a status callback: the status.
-        began_s: when it began, by the monotonic clock.
-    """
-
-    role: Role
-    effect: StartCallback
-    number: int
-    heard: StatusMessage | None
-    began_s: float
-
-
-class RunningServer:
-    """One server of a registrar: starts its callbacks, and says how they ended.
-
-    The registrar tells it which callback to start (StartCallback); it posts CallbackEnded back.
+class ServerActor(TurnActor):
+    """One server of a registrar, and a part of it: its mailbox takes StartCallback, and it sends CallbackEnded.
 
     Attributes:
         facts: what decisions know of it.
@@ -125,6 +107,24 @@ class RunningServer:
         InvalidSpec: a callback has attributes that cannot be read.
         NotSerializable: the types are too long to be sent to consumers.
     """
+
+    __slots__ = (
+        "_on_demand",
+        "_runs",
+        "_runs_again",
+        "digest",
+        "facts",
+        "health",
+        "load_times",
+        "origin",
+        "registrar",
+        "request",
+        "response",
+        "restored",
+        "spec",
+        "usage",
+    )
+    gate: Gate | None = None
 
     def __init__(self, registrar: RegistrarBase, spec: ServerSpec, types: bytes) -> None:
         self.spec = spec
@@ -143,7 +143,6 @@ class RunningServer:
         self.request = Codec(spec.request_type, f"{self.origin}: request")
         self.response = Codec(spec.response_type, f"{self.origin}: response")
         self.digest = digest_of((self.request.shape, self.response.shape))
-        self._gate = registrar.gate or (None if spec.at_once is None else Gate(spec.at_once))
         self._runs: dict[Role, Callback] = {}
         for role in BEGUN.values():
             if not role.on_demand:
@@ -216,16 +215,43 @@ class RunningServer:
         why = f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
         return NotSerializable(f"{why}: {ADVICE}", path="response")
 
+    # -- life ----------------------------------------------------------------------------------------------------
+
+    @on_loop
+    def begin(self) -> None:
+        """Take messages, and be found at the path, from now on."""
+        self.begin_life(self.registrar.node.dispatcher, self.registrar.node.hub)
+
+    @on_loop
+    def end(self) -> list[Message]:
+        """Take no message any more, and probe nothing more; return the messages that waited. What runs goes on."""
+        self.closed = True
+        self.health.probes.close()
+        left = [item[0] for item in self.waiting if isinstance(item, tuple)]
+        self.end_life(CLOSED)
+        return left
+
+    # -- messages ------------------------------------------------------------------------------------------------
+
+    @on_loop
+    def handle(self, deliveries: Sequence[Delivery]) -> None:
+        """Run the callbacks that the messages ask for."""
+        for message, _ in deliveries:
+            self.take(message)
+
     # -- start and end -------------------------------------------------------------------------------------------
 
     @on_loop
-    def start(self, effect: StartCallback) -> None:
+    def take(self, effect: Message) -> None:
         """Run the callback of a role for a resource, and post CallbackEnded.
 
         A missing unload or status callback has ended at once. Before on_start has returned, a callback goes on with
         work of before the last crash.
         """
         role, resource = BEGUN[effect.role], effect.resource
+        if isinstance(effect, OnDemandRun):
+            self._run(role, resource, resource.attempt, effect.done)
+            return
         if role.on_demand:
             self._on_demand[effect.role].start(resource.id)
             return
@@ -233,7 +259,7 @@ class RunningServer:
         number = resource.tries if role is UNLOAD else resource.attempt
         run = Run(role, effect, number, heard, time.monotonic())
         if role in (UNLOAD, STATUS) and getattr(self.spec, role.option) is None:
-            self._ended(run, None, None)
+            self._run_ended(run, None, None)
             return
         if not self.registrar.serving:  # it may end this process during its start
             self.registrar.node.on_resumed(f"the {role.name} callback of {self.origin} for resource {resource.id}")
@@ -253,8 +279,8 @@ class RunningServer:
         instead = LOAD if role is RECOVER and (run.effect.reload or self.spec.recover is None) else None
         at_once = functools.partial(self._ended_here, run) if role in (LOAD, UNLOAD) else None
         more = () if run.heard is None else (run.heard,)
-        done = functools.partial(self._ended, run)
-        self.submit(role, run.effect.resource, run.number, done, *more, instead=instead, at_once=at_once)
+        done = functools.partial(self._run_ended, run)
+        self._run(role, run.effect.resource, run.number, done, *more, instead=instead, at_once=at_once)
 
     def _ended_here(self, run: Run, response: bytes | None) -> bool:
         """Decide the end in the thread that ran the callback; return False if the loop has to."""
@@ -273,7 +299,7 @@ class RunningServer:
             self.load_times.take(took_s, failed=False)
         return is_decided
 
-    def _ended(self, run: Run, response: bytes | None, error: BaseException | None) -> None:
+    def _run_ended(self, run: Run, response: bytes | None, error: BaseException | None) -> None:
         role, resource = run.role, run.effect.resource
         if role.reports:
             self.registrar.progress.end(resource.id)
@@ -296,14 +322,14 @@ class RunningServer:
         publishers, id = self.registrar.publishers, run.effect.resource.id
         if run.role.reports and not failed:
             if publishers.streams:  # most registrars have none
-                publishers.let_in(id, functools.partial(_tell_stream, self, run.effect.resource))
+                publishers.let_in(id, functools.partial(tell_stream, self, run.effect.resource))
         elif (run.role.reports and failed) or (run.role is UNLOAD and not failed):
             publishers.close(id)
 
     # -- how callbacks run -------------------------------------------------------------------------------------------
 
     @on_loop
-    def submit(
+    def _run(
         self,
         role: Role,
         resource: Resource,
@@ -313,7 +339,7 @@ class RunningServer:
         instead: Role | None = None,
         at_once: Callable[[Any], bool] | None = None,
     ) -> None:
-        """Run the callback of a role for a resource.
+        """Run the callback of a role for a resource in a worker. If it needs room, it has room.
 
         Args:
             number: the number of the run, as decisions count it.
@@ -331,75 +357,21 @@ class RunningServer:
         place = resource.id, attempt, holder, self.spec.name, registrar
         current = Current(*place, role, number, interrupted, resource.request, self._runs_again)
         run = self._runs[instead or role]
-        gate = self._gate
         if registrar.node.watched.level[0] > 1:
-            done, at_once = self._recorded(role, resource, done, at_once)
+            done, at_once = recorded_end(self, role, resource, done, at_once)
+        args = current, role, resource, *more
+        patient = role.patient
+        if (gate := self.gate) is not None:
+            run = gate.around(run, enters=role.in_order)
+            if not role.in_order:
+                patient, done = True, functools.partial(_leave_first, gate, done)
         try:
             if role.in_order:
-                run = run if gate is None else gate.around(run, enters=True)
-                registrar.workers.serial((role.name, resource.id), run, current, role, resource, *more, done=done)
-            elif gate is None:
-                args = current, role, resource, *more
-                registrar.workers.submit(run, *args, done=done, patient=role.patient, at_once=at_once)
+                registrar.workers.serial((role.name, resource.id), run, *args, done=done)
             else:
-                self._enter(gate, run, (current, role, resource, *more), done, at_once)
+                registrar.workers.submit(run, *args, done=done, patient=patient, at_once=at_once)
         except (MailboxFull, Unavailable) as error:
             done(None, error)
-
-    def _enter(
-        self,
-        gate: Gate,
-        run: Callback,
-        args: tuple[Current, Role, Resource, *tuple[Any, ...]],
-        done: Done,
-        at_once: Callable[[Any], bool] | None,
-    ) -> None:
-        """Run a callback when it has room in the gate. It needs no thread before."""
-        registrar, key = self.registrar, f"{args[1].name}:{args[2].id}"
-        inside = gate.around(run, enters=False)
-        registrar.outside.add(key)
-
-        def ended(result: Any, error: BaseException | None) -> None:
-            if error is not None and type(error) is not Raised:  # it got no thread, and so has not left the gate
-                gate.leave()
-            done(result, error)
-
-        def begin() -> bool:
-            registrar.outside.discard(key)
-            call = registrar.node.dispatcher.call
-            try:
-                call(registrar.runner.let_in, key)
-                registrar.workers.submit(inside, *args, done=ended, patient=True, at_once=at_once)
-            except Unavailable as error:
-                with contextlib.suppress(Unavailable):  # the process ends
-                    call(done, None, error)
-                return False
-            return True
-
-        gate.enter(begin)
-
-    # -- recording -----------------------------------------------------------------------------------------------
-
-    def _record(self, event: str, role: Role, resource: Resource, detail: str = "") -> None:
-        self.registrar.recorder.callback(event, self.origin, role.name, resource.id, detail)
-
-    def _recorded(
-        self, role: Role, resource: Resource, done: Done, at_once: Callable[[Any], bool] | None
-    ) -> tuple[Done, Callable[[Any], bool] | None]:
-        """Return `done` and `at_once` changed to record the callback's end first, and only once."""
-        ended: list[bool] = []
-
-        def recorded(result: Any, error: BaseException | None) -> None:
-            if not ended:
-                self._record("ended", role, resource, "" if error is None else readable(shortened(said(error))))
-            done(result, error)
-
-        def recorded_at_once(result: Any) -> bool:
-            ended.append(True)
-            self._record("ended", role, resource)
-            return at_once is not None and at_once(result)
-
-        return recorded, None if at_once is None else recorded_at_once
 
     # -- in the worker -------------------------------------------------------------------------------------------
 
@@ -413,7 +385,7 @@ class RunningServer:
 
         async def run_async(current: Current, role: Role, resource: Resource, *more: Any, begun: Any = None) -> Any:
             while not self._is_over(role, resource):
-                self._begin(current, role, resource)
+                self._enter_context(current, role, resource)
                 try:
                     answer = result(await self._heeding(role, resource, begun or callback(*arguments(resource), *more)))
                 except BaseException as error:
@@ -429,7 +401,7 @@ class RunningServer:
 
         def run(current: Current, role: Role, resource: Resource, *more: Any) -> Any:
             while not self._is_over(role, resource):
-                self._begin(current, role, resource)
+                self._enter_context(current, role, resource)
                 try:
                     answer = callback(*arguments(resource), *more)
                     if type(answer) is COROUTINE:  # the callback is a wrapper or a lambda around an async function
@@ -445,10 +417,10 @@ class RunningServer:
 
         return run_async if is_async(callback) else run
 
-    def _begin(self, current: Current, role: Role, resource: Resource) -> None:
+    def _enter_context(self, current: Current, role: Role, resource: Resource) -> None:
         enter(current)
         if self.registrar.node.watched.level[0] > 1:
-            self._record("began", role, resource)
+            self.registrar.recorder.callback("began", self.origin, role.name, resource.id)
 
     def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
         """Return the failure and the trace that describe a callback's error. In the thread that ran the callback."""
@@ -491,24 +463,16 @@ class RunningServer:
         return left is None or left.phase is UNLOADING
 
 
+def _leave_first(gate: Gate, done: Done, result: Any, error: BaseException | None) -> None:
+    """Call `done`; first leave the gate for a callback that got no thread, and so has not left it itself."""
+    if error is not None and type(error) is not Raised:
+        gate.leave()
+    done(result, error)
+
+
 def _cancel(loop: asyncio.AbstractEventLoop, task: asyncio.Task[Any]) -> None:
     with contextlib.suppress(RuntimeError):  # the loop is closed, and has cancelled its tasks
         loop.call_soon_threadsafe(task.cancel)
-
-
-def _tell_stream(server: RunningServer, resource: Resource, news: StreamNews) -> None:
-    """Tell the watchers of the system what has happened to a stream. From any thread."""
-    node = server.registrar.node
-    if not node.watched.level[0]:
-        return
-    facts = {"registrar": server.registrar.name, "server": server.origin, "resource_id": resource.id}
-    facts |= {"request": text_of_value(resource.request), "stream": news.stream.name, "detail": news.stream.name}
-    if (before := news.before) is not None:
-        instead = f"{before.name} of resource {short_id(before.resource_id)}"
-        facts["detail"] += f", read by {news.reader} instead of {instead}"
-        facts |= {"reader": news.reader, "before": f"{before.resource_id}/{before.name}"}
-    with contextlib.suppress(Unavailable):  # the loop has ended
-        node.dispatcher.call(functools.partial(node.emit, news.what, **facts))
 
 
 class RequestReader:
@@ -519,7 +483,7 @@ class RequestReader:
     """
 
     def __init__(
-        self, registrar: RegistrarBase, consumers: Consumers, server_of: Callable[[str], RunningServer | None]
+        self, registrar: RegistrarBase, consumers: Consumers, server_of: Callable[[str], ServerActor | None]
     ) -> None:
         self._registrar, self._consumers, self._server_of = registrar, consumers, server_of
 
