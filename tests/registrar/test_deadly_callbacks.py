@@ -95,6 +95,73 @@ def states(system: rr.System) -> dict[str, tuple[str, str]]:
     return {info.request: (str(info.phase), str(info.state)) for info in system.registrar("shop").resources()}
 
 
+class Patient(rr.Manager):
+    """Serves "thing": the callback that the workshop has armed does not return until it is disarmed."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    def wait(self, role: str) -> None:
+        if len(self.work.lines(f"armed {role}")) > len(self.work.lines("disarmed")):
+            self.work.note(f"waits in {role}")
+            while len(self.work.lines("armed")) > len(self.work.lines("disarmed")):
+                time.sleep(0.01)
+
+    @rr.server("thing", recovery="keep")
+    def load_thing(self, request: str) -> str:
+        self.wait("load")
+        return request
+
+    @load_thing.unload
+    def unload_thing(self, request: str, response: str | None) -> None:
+        self.wait("unload")
+
+    @load_thing.status
+    def thing_status(self, request: str, status: rr.Status) -> None:
+        self.wait("status")
+
+    @load_thing.recover
+    def recover_thing(self, request: str, response: str) -> str:
+        self.wait("recover")
+        return response
+
+
+def restart(system: rr.System, id: str) -> None:
+    system.supervisor().terminate_child(id)
+    system.supervisor().restart_child(id)
+
+
+@pytest.mark.parametrize("role", ["load", "unload", "status", "recover"])
+def test_a_callback_that_orderly_restarts_interrupt_is_not_to_blame_and_runs_again(
+    start: Start, workshop: Workshop, role: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    system = start(rr.ChildSpec(Patient, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    query = app.load("shop/thing", "first")
+    workshop.note(f"armed {role}")
+    match role:
+        case "load":
+            waiting = app.load("shop/thing", "second", block=False, timeout_s=LIMIT_S)
+        case "unload":
+            waiting = app.unload(query, block=False, timeout_s=LIMIT_S)
+        case "status":
+            system.registrar("shop").send_status(query, rr.Status(rr.State.WARNING, "worn"))
+            waiting = None
+        case _:
+            restart(system, "shop")
+            waiting = None
+    for number in range(4):  # one more than the deaths that a callback is allowed
+        eventually(lambda: len(workshop.lines(f"waits in {role}")) == number + 1, LIMIT_S)  # noqa: B023
+        restart(system, "shop")
+    eventually(lambda: len(workshop.lines(f"waits in {role}")) == 5, LIMIT_S)
+    workshop.note("disarmed")
+    if waiting is not None:
+        waiting.get(timeout=LIMIT_S)
+    if role == "status":
+        assert query.wait_status(timeout_s=LIMIT_S).message == "worn"
+    assert not [record.message for record in caplog.records if "died" in record.message]
+
+
 @pytest.mark.parametrize("how", ENDS)
 def test_a_recover_callback_that_ends_its_process_three_times_loses_the_resource_by_name(
     start: Start, workshop: Workshop, how: str

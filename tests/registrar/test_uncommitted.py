@@ -141,6 +141,7 @@ AGAIN: list[Any] = [
     c.PeerGone("p", LATE, True, "event"),
     c.BeginClosing(LATE),
     c.EndClosing(),
+    c.EndProcess(),
 ]
 
 

@@ -120,6 +120,12 @@ def deaths_of(catalog: Catalog, role: str, resource_id: str) -> int:
     return run.deaths
 
 
+def deaths_of_load(catalog: Catalog, resource: Resource) -> int:
+    """Return how many processes have died in the attempts of this load, of which some may have ended in order."""
+    run = catalog.callback_runs.get(run_id("load", resource.id))
+    return resource.attempt - 1 if run is None else run.deaths
+
+
 def is_given_up(catalog: Catalog, role: str, resource_id: str) -> bool:
     """Return whether the callback is not run any more for this resource."""
     return deaths_of(catalog, role, resource_id) >= ATTEMPTS
@@ -205,7 +211,7 @@ def forget_runs(decision: Decision, resource_id: str) -> None:
     for role in ("load", *ROLES) if catalog.accused else ():
         acquit(decision, run_id(role, resource_id))
     if catalog.callback_runs:
-        for role in ROLES:
+        for role in ("load", *ROLES):
             if (run := catalog.callback_runs.get(run_id(role, resource_id))) is not None:
                 decision.drop(run)
                 decision.forget(catalog.suspects, run.id)

@@ -133,6 +133,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.BeginServing: recovery.begin_serving,
     c.BeginClosing: reconciliation.begin_closing,
     c.EndClosing: reconciliation.end_closing,
+    c.EndProcess: lambda decision, _: recovery.end_process(decision),
     c.SetRows: _set_rows,
     c.RefuseLoad: lambda decision, it: decision.cause(refuse(decision, it.origin, it.query_id, it.failure)),
     c.Register: recovery.register,

@@ -273,6 +273,8 @@ def _ended(decision: Decision, resource: Resource) -> None:
     id = run_id("load", resource.id)
     acquit(decision, id)
     end_trial(decision, id)
+    if decision.catalog.callback_runs and (run := decision.catalog.callback_runs.get(id)) is not None:
+        decision.drop(run)
     forget_request(decision, resource)
 
 

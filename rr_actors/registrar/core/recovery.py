@@ -19,6 +19,7 @@ from rr_actors.registrar.core.callback_runs import (
     ATTEMPTS,
     awaits_trial,
     deaths_of,
+    deaths_of_load,
     end_trial,
     give_up_request,
     health_waits_s,
@@ -96,11 +97,14 @@ def begin_again(decision: Decision) -> None:
         if resource.phase is not Phase.LOADING or resource.tries == NOT_BEGUN:  # no server was there to begin it
             continue
         accused.append(run_id("load", id))
-        if resource.attempt < ATTEMPTS:
+        deaths = deaths_of_load(decision.catalog, resource) + 1
+        if (run := decision.catalog.callback_runs.get(run_id("load", id))) is not None:
+            decision.put(replace(run, deaths=deaths))
+        if deaths < ATTEMPTS:
             decision.put(replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
         else:
             wait_s = give_up_request(decision, resource)
-            failure = failures.interrupted(decision.catalog, resource, wait_s)
+            failure = failures.interrupted(decision.catalog, resource, deaths, wait_s)
             given_up.append(failure.message)
             decision.effects += refuse_all(decision, resource, failure)
             # A part or all of it may be loaded. With the next number, the parts of the last attempt are released.
@@ -116,6 +120,23 @@ def begin_again(decision: Decision) -> None:
         _acquit_health_callbacks(decision)
     for id in accused if not given_up else ():  # else the death is that of a callback which runs no more
         decision.note(decision.catalog.accused, id, True)
+
+
+def end_process(decision: Decision) -> None:
+    """Prepare for the next process, as this one ends in order: no callback that runs now is to blame.
+
+    A load is prepared for its next attempt, so that the parts of this one are released. Else the number of its attempts
+    says how many processes have died in it, so from now on a row does.
+    """
+    catalog = decision.catalog
+    for run in [run for run in catalog.callback_runs.values() if run.begun]:
+        decision.put(replace(run, begun=False))
+    for resource in [catalog.resources[id] for id in catalog.moving]:
+        if resource.phase is Phase.UNLOADING:
+            note_begun(decision, "unload", resource.id, begun=False)
+        elif resource.phase is Phase.LOADING and resource.tries != NOT_BEGUN:
+            decision.put(CallbackRun(run_id("load", resource.id), deaths_of_load(catalog, resource)))
+            decision.put(replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
 
 
 def _acquit_health_callbacks(decision: Decision) -> None:
@@ -306,9 +327,10 @@ def _lose_unread(decision: Decision, resource: Resource, event: str) -> None:
 
 def _interrupted(decision: Decision, resource: Resource) -> None:
     """Run an interrupted load again if somebody holds its resource; otherwise clean up what it left."""
+    deaths = deaths_of_load(decision.catalog, resource)
     if resource.id not in decision.catalog.holders:
         unheld(decision, resource)
-    elif resource.attempt < ATTEMPTS or is_its_turn(decision, run_id("load", resource.id)):
+    elif deaths < ATTEMPTS - 1 or is_its_turn(decision, run_id("load", resource.id)):
         resource = replace(resource, tries=0)
         decision.put(resource)
         start_load(decision, resource)

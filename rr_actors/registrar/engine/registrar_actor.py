@@ -139,6 +139,7 @@ class RegistrarActor(RegistrarBase):
         unloads, self.unloads = self.unloads, {}
         for waiter in (*unloads.values(), *self.callers):
             steps.take("telling who unloads, or has given a command", waiter, down)
+        steps.take("noting what callbacks run", self.commit, ((c.EndProcess(), None),))
         steps.take("closing its catalog", self._close_catalog, erase)
         self.lock_in_use(in_use=False)
         steps.take("reporting its end", self.end_life, report)

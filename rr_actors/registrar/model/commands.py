@@ -41,6 +41,10 @@ class EndClosing(Command, frozen=True):
     """The registrar is closed for good: what it served and held is released, as far as that was possible."""
 
 
+class EndProcess(Command, frozen=True):
+    """The process ends in order: no callback that runs now is to blame for that, and the next process runs it again."""
+
+
 class SetRows(Command, frozen=True):
     """Write rows that need no other decision, for example those of stored servers."""
 

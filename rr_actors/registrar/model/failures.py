@@ -74,11 +74,11 @@ def overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
     return load_failed(catalog, resource, why, timeout_s=limit_s)
 
 
-def interrupted(catalog: Catalog, resource: Resource, wait_s: float) -> Failure:
-    """Return the failure of a load in each of whose attempts the process died; `wait_s`: how long it is refused."""
+def interrupted(catalog: Catalog, resource: Resource, deaths: int, wait_s: float) -> Failure:
+    """Return the failure of a load in whose attempts processes died; `wait_s`: for how long it is refused."""
     how = f" (it died of: {catalog.deaths})" if catalog.deaths else ""
     why = (
-        f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again, and the"
+        f"the process died in each of {deaths} attempts of this load{how}; it is not begun again, and the"
         f" same request is refused for {wait_s:g} s"
     )
     return load_failed(catalog, resource, why)
