@@ -379,6 +379,16 @@ def test_a_new_child_of_an_action_that_has_ended_runs_as_its_relation_says() -> 
     ]
 
 
+def test_a_graph_whose_new_exit_has_ended_is_finished_as_that_ended() -> None:
+    for result in ("on_true", "on_false"):
+        player = Player(graph_of([("a", "b"), ("b", "c")]))
+        player.ends("a")
+        player.ends("b", result)
+        assert player.tell(Change(graph_of([("a", "b")]))) == ["stop c"]
+        player.ends("c", "on_stopped")
+        assert (player.run.state, player.run.result) == ("FINISHED", result)
+
+
 def test_a_halted_graph_says_what_it_waits_for() -> None:
     player = Player(graph_of([("a", "c"), ("b", "c", "on_true -> stop")], entry=["a", "b"]))
     player.ends("a")

@@ -363,7 +363,7 @@ class _Decision:
             self.state, self.result, self.why = "RUNNING", "", ""
         self.graph, self.has_other_graph = graph, True
         self.nodes = {name: self.taken_over(name, before, stay) for name in graph.nodes}
-        self.heard = _still_heard(self.heard, graph.exit, stay)
+        self.heard = _still_heard(self.ended_before(graph.exit, before.exit) | self.heard, graph.exit, stay)
         ready = [name for name in (*graph.nodes, EXIT) if self.is_ready(name)]
         new = [name for name in ready if name not in ready_before or name not in (*stay, EXIT)]
         self.start_in_other(start, [name for name in again if name in graph.nodes], new)
