@@ -7,6 +7,7 @@ import time
 import pytest
 
 from rr_actors.system.recording.event_memory import Event
+from rr_actors.system.recording.event_texts import clock
 from rr_actors.tools.terminal.event_lines import EventFilter, EventLine, EventLines
 
 THIRTEEN = time.mktime((2026, 11, 28, 13, 13, 13, 0, 0, -1))
@@ -52,3 +53,45 @@ def test_a_filter_does_not_search_the_reach_of_a_status() -> None:
 @pytest.mark.parametrize("text", ["loaded", "lamp", "shop/thing"])
 def test_a_filter_searches_the_kind_the_subject_and_how(text: str) -> None:
     assert chosen(EventFilter.parse(text), loaded("4")) == ['shop/thing "lamp 4"']
+
+
+# -- what is one line --------------------------------------------------------------------------------------------------
+
+
+def lines_of(*events: Event) -> list[str]:
+    lines = EventLines()
+    for event in events:
+        lines.take(event)
+    return [str(line) for line in lines.lines()]
+
+
+def sonar(event: str, after_s: float, **facts: object) -> Event:
+    return Event(0, THIRTEEN + after_s, event, {"path": "root/sonar", **facts})
+
+
+def test_each_life_of_a_child_has_lines_of_its_own_in_the_order_in_which_they_happened() -> None:
+    said = lines_of(
+        sonar("started", 0, pid=12, ready_s=0.03),
+        sonar("stopped", 60, pid=12, reason="shutdown", detail="stopped", up_s=60.0),
+        sonar("started", 61, pid=14, ready_s=0.03),
+        sonar("stopped", 200, pid=14, reason="shutdown", detail="stopped", up_s=139.0),
+    )
+
+    assert [line.split("  ")[1].strip() for line in said] == ["started", "stopped", "started", "stopped"]
+    assert not any("times" in line for line in said)
+
+
+def test_events_that_say_the_same_are_one_line_unless_time_has_passed_between_them() -> None:
+    earlier, later = (loaded("4", THIRTEEN + second) for second in (0, 60))
+
+    first, other, last = lines_of(earlier, loaded("4", THIRTEEN + 1), loaded("5", THIRTEEN + 30), later)
+
+    assert first == f'{clock(THIRTEEN + 1)}  loaded        shop/thing "lamp 4"  (2 times)'
+    assert "lamp 5" in other
+    assert last == f'{clock(THIRTEEN + 60)}  loaded        shop/thing "lamp 4"'
+
+
+def test_what_goes_on_and_on_is_one_line_that_says_since_when() -> None:
+    (line,) = lines_of(*(loaded("4", THIRTEEN + 5 * number) for number in range(74)))
+
+    assert line.endswith(f"(74 times since {clock(THIRTEEN)})")

@@ -1,10 +1,12 @@
 """Events as lines for people, the same on the command line, in the terminal and on the web page.
 
-A status that spreads over many resources is one line. Events that say the same are one line, too, with their number.
+A status that spreads over many resources is one line. Events that say the same, and follow each other within ten
+seconds, are one line, too, with their number.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -19,6 +21,7 @@ from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.event_texts import child_text, clock
 
 _KEPT = 500  # lines
+_TOGETHER_S = 10.0
 _SETTLED_S = 0.3
 """A line is settled when nothing has been added to it for so long ..."""
 _LATEST_S = 2.0
@@ -90,6 +93,7 @@ class EventLine:
         servers, names: of the resources; of a status, of all that it has reached.
         heard_by: the registrars that have heard the status for themselves.
         times: how many events say the same; of a status, how often it was sent.
+        first: the time of the first of several.
     """
 
     at: float
@@ -101,6 +105,7 @@ class EventLine:
     names: dict[str, None] = field(default_factory=dict[str, None])
     heard_by: dict[str, None] = field(default_factory=dict[str, None])
     times: int = 1
+    first: float = 0.0
     source: str = ""  # the server where a status began, until its own event has come
     began: float = 0.0
     touched: float = 0.0
@@ -145,7 +150,8 @@ class EventLine:
         if self.kind == "status" and (reach := self.reach):
             how = f"{how} → {reach}"
         if self.times > 1:
-            how = f"{how} ({self.times} times)".lstrip()
+            since = f" since {clock(self.first)}" if 0 < self.first < self.at - _TOGETHER_S else ""
+            how = f"{how} ({self.times} times{since})".lstrip()
         return "  ".join(filter(None, (f"{clock(self.at)}  {self.kind:<12}", self.subject, how))).rstrip()
 
 
@@ -155,7 +161,8 @@ class EventLines:
     def __init__(self) -> None:
         self._lines: dict[object, EventLine] = {}
         self._spreading: dict[str, object] = {}  # statuses, with the keys of their lines
-        self._notes = 0
+        self._newest: dict[object, object] = {}  # the keys of the newest lines, by what they say
+        self._numbers = itertools.count()
 
     def lines(self, wanted: EventFilter | None = None) -> list[EventLine]:
         """Return the lines that a filter accepts, or all."""
@@ -166,8 +173,7 @@ class EventLines:
 
     def note(self, text: str, at: float) -> None:
         """Add a line that is no event."""
-        self._notes += 1
-        self._keep(self._notes, EventLine(at, text, "", ""))
+        self._keep(next(self._numbers), EventLine(at, text, "", ""))
 
     def take(self, event: Event) -> None:
         """Add an event to its line."""
@@ -176,8 +182,7 @@ class EventLines:
         if status_id:
             self._take_status(status_id, event.facts, line)
         else:
-            key = (line.kind, line.subject, line.path and (event.facts.get("reason"), event.facts.get("detail")))
-            self._join(key if line.path or line.servers else object(), line)
+            self._join((line.kind, line.subject, line.path and line.how) if line.path or line.servers else None, line)
 
     def _take_status(self, status_id: str, facts: dict[str, Any], line: EventLine) -> None:
         began_here = facts["source"] == facts["server"]
@@ -198,17 +203,29 @@ class EventLines:
         elif key is not None and key != status_id:
             self._keep(key, line)
         else:
-            key = (line.kind, line.subject, line.how)
-            self._join(key, line)
+            key = self._join((line.kind, line.subject, line.how), line)
         self._spreading[status_id] = key
         while len(self._spreading) > _KEPT:
             del self._spreading[next(iter(self._spreading))]
 
-    def _join(self, key: object, line: EventLine) -> None:
-        """Keep a line in the place of one that says the same."""
-        if (known := self._lines.pop(key, None)) is not None:
-            line.times, line.began = known.times + 1, known.began
+    def _join(self, says: object, line: EventLine) -> object:
+        """Keep a line in the place of one that says the same and is not much older; return its key.
+
+        `says`: what it says; None: nothing that another line could say.
+        """
+        key = self._newest.pop(says, None)
+        known = self._lines.get(key)
+        if known is not None and line.at - known.at <= _TOGETHER_S:
+            del self._lines[key]
+            line.times, line.began, line.first = known.times + 1, known.began, known.first or known.at
+        else:
+            key = next(self._numbers)
+        if says is not None:
+            self._newest[says] = key
+            while len(self._newest) > _KEPT:
+                del self._newest[next(iter(self._newest))]
         self._keep(key, line)
+        return key
 
     def _keep(self, key: object, line: EventLine) -> None:
         line.touched = time.monotonic()

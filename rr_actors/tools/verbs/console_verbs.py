@@ -69,7 +69,7 @@ def events(
     Without --follow there are the ends and starts of children, and of resources the statuses, revocations, and loads
     that failed or took long.
     A status that spreads over many resources is one line, with the number of those that it has reached. Events that say
-    the same are one line with their number. With --json each event is a line.
+    the same within ten seconds are one line with their number. With --json each event is a line.
     """
     wanted = EventFilter.of(event or [], child, server, about)
     if not follow:
