@@ -19,6 +19,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.folder import Folder
+from rr_actors.managers import Alternative, Choices, Choose, Chosen, Keeper, Kept
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_questions import ListEvents, ListHistory
 from rr_actors.system.recording import event_memory
@@ -116,6 +117,45 @@ def test_a_manager_in_a_process_of_its_own_is_killed_and_what_happened_there_is_
     assert kinds(remembered(state_dir, query.resource_id))[0] == "status"
     with ConsoleClient(find_console(state_dir)) as client:
         assert kinds(client.ask(ListHistory("shop")).events) == ["started", "exited", "restarted"]
+
+
+SENSORS = [Alternative("range", f"sensors/{name}", "front", {"rate_hz": rate}) for name, rate in (("a", 30), ("b", 10))]
+
+
+def test_a_choice_that_has_changed_is_remembered(start: Start, state_dir: Path) -> None:
+    system = start(rr.ChildSpec(Choices, id="choices", args=(SENSORS, 600.0)))
+    app, sensors = system.open_registrar("app"), system.open_registrar("sensors")
+    for name in ("a", "b"):
+        serve(sensors, name)
+    choice = app.load("choices/choice", Choose("range", prefer=["rate_hz"]), response_type=Chosen)
+    assert choice.response.server == "sensors/a"
+    sensors.send_status(sensors.resources()[0], rr.Status("FATAL", "unplugged"))
+    assert eventually(lambda: choice.response.server == "sensors/b")
+
+    def told() -> list[str]:
+        events = remembered(state_dir, choice.resource_id)
+        return [event.facts["detail"] for event in events if event.event == "status"]
+
+    (said,) = eventually(told)
+    assert said.startswith("UPDATE ")
+    assert "unplugged" in said
+
+
+def test_a_kept_thing_that_is_missing_is_remembered(start: Start, state_dir: Path, tmp_path: Path) -> None:
+    file = tmp_path / "keep.toml"
+    file.write_text('[[keep]]\nname = "lamp"\nserver = "things/thing"\nrequest = "x"\n')
+    system = start(rr.ChildSpec(Keeper, id="keeper", args=(str(file),)))
+    things = system.open_registrar("things")
+    serve(things, "thing")
+    app = system.open_registrar("app")
+    kept = app.load("keeper/kept", "lamp", response_type=Kept)
+    assert eventually(lambda: kept.response.ready == 1)
+    things.unregister_server("thing")
+
+    def told() -> list[str]:
+        return [event.facts["detail"] for event in remembered(state_dir, kept.resource_id)]
+
+    assert eventually(lambda: any(said.startswith("ERROR") for said in told()))
 
 
 def test_somebody_who_watches_does_not_make_the_system_remember_more(
