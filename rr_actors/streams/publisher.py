@@ -27,7 +27,7 @@ from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import deadline_of, time_limit
 from rr_actors.streams.known_reader import KnownReader, PublishedFrame
 from rr_actors.streams.loan import Loan
-from rr_actors.streams.stream import Stream, StreamInfo, StreamNews, StreamRow
+from rr_actors.streams.stream import Stream, StreamInfo, StreamRow, Tell
 from rr_actors.streams.stream_sockets import (
     IN_BAND_BYTES,
     LARGE_FRAME_BYTES,
@@ -165,7 +165,7 @@ class Publisher:
         self._due: deque[_Publishing] = deque()  # there is no memory for them yet
         self._queues: dict[KnownReader, deque[_Publishing]] = {}  # what readers of all frames have still to get
         self._meter = _Meter()
-        self._tell: Callable[[StreamNews], None] | None = None  # when readers are let in
+        self._tell: Tell | None = None  # when readers are let in
         self._closed = self._ended = self._logged = False
         self._accepts_at: float | None = None  # there was no descriptor for a reader
         self._door = threading.RLock()  # no reader is taken in while the listener is closed
@@ -511,9 +511,9 @@ class Publisher:
 
     def _rebound(self, reader: str, before: Stream) -> None:
         if self._tell is not None:
-            self._tell(StreamNews("stream_rebound", self.stream, reader, before))
+            self._tell("stream_rebound", self.stream, reader, before)
 
-    def let_in(self, tell: Callable[[StreamNews], None]) -> None:
+    def let_in(self, tell: Tell) -> None:
         """Let readers in: the callback that opened the stream has returned.
 
         Args:
@@ -524,7 +524,7 @@ class Publisher:
                 return
             self._tell = tell
             self._listener.listen(128)
-        tell(StreamNews("stream_opened", self.stream))
+        tell("stream_opened", self.stream, "", None)
 
     def close(self) -> None:
         """End the stream, at once: readers wait for it to be opened again, as long as they hold the resource.
@@ -540,7 +540,7 @@ class Publisher:
         with contextlib.suppress(OSError):
             self._wake.send(b"\0")  # the stream's thread closes the rest
         if tell is not None:
-            tell(StreamNews("stream_closed", self.stream))
+            tell("stream_closed", self.stream, "", None)
 
     def _end(self) -> None:
         self._ended = True

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable
 
 from rr_actors.base.errors import NameTaken
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.streams.publisher import Publisher
-from rr_actors.streams.stream import Stream, StreamNews
+from rr_actors.streams.stream import Stream, Tell
 from rr_actors.streams.stream_sockets import IN_BAND_BYTES, OPENED, OPENED_ONCE
 from rr_actors.wire.segments import Segments
 
@@ -59,7 +58,7 @@ class Publishers:
             )
         return publisher
 
-    def let_in(self, resource_id: str, tell: Callable[[StreamNews], None]) -> None:
+    def let_in(self, resource_id: str, tell: Tell) -> None:
         """Let readers in to the streams of a resource: the callback that opens them has returned."""
         with self._lock:
             publishers = list(self.streams.get(resource_id, {}).values())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, cast
 
 import msgspec
@@ -118,13 +118,8 @@ class StreamRow(msgspec.Struct, frozen=True):
     readers: list[ReaderRow]
 
 
-class StreamNews(msgspec.Struct, frozen=True):
-    """Something that has happened to a stream. `reader`, `before`: the registrar that read another stream before."""
-
-    what: StreamHappening
-    stream: Stream
-    reader: str = ""
-    before: Stream | None = None
+Tell = Callable[[StreamHappening, Stream, str, Stream | None], None]
+"""A function that hears what has happened to a stream. If it was rebound: which registrar read which stream before."""
 
 
 def streams_in(response: bytes) -> list[tuple[Place, Stream]]:

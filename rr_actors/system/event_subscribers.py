@@ -60,15 +60,20 @@ class ChildEvent(_ChildEvent, total=False):
     up_s: float
 
 
-class _ResourceEvent(TypedDict):
-    """The keys that every ResourceEvent has."""
+class _OfResource(TypedDict):
+    """The keys of every event of a resource."""
 
-    event: Happening
     at: float
     registrar: str
     server: str
     resource_id: str
     request: str
+
+
+class _ResourceEvent(_OfResource):
+    """The keys that every ResourceEvent has."""
+
+    event: Happening
     detail: str
 
 
@@ -89,28 +94,18 @@ class ResourceEvent(_ResourceEvent, total=False):
     heard_by: str
 
 
-class ProgressEvent(TypedDict):
+class ProgressEvent(_OfResource):
     """A load callback has reported how far it has come. The keys of the resource are as in a ResourceEvent."""
 
     event: Literal["progress"]
-    at: float
-    registrar: str
-    server: str
-    resource_id: str
-    request: str
     fraction: float
     text: str
 
 
-class _StreamEvent(TypedDict):
+class _StreamEvent(_OfResource):
     """The keys that every StreamEvent has."""
 
     event: StreamHappening
-    at: float
-    registrar: str
-    server: str
-    resource_id: str
-    request: str
     stream: str
     detail: str
 

@@ -42,7 +42,7 @@ class Interleaved(deque[Callable[[], None]]):
 
 def test_a_new_reader_is_not_taken_for_one_that_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     publisher = Publisher(Stream("resource", "turns"), Segments(0))
-    publisher.let_in(lambda news: None)
+    publisher.let_in(lambda *_: None)
     address, tasks = address_of(publisher.stream), Interleaved()
 
     class Epoll:

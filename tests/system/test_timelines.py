@@ -14,6 +14,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.recordings import entry_of
 from rr_actors.system.recording.timeline_lanes import (
     KINDS,
@@ -34,12 +35,13 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def child(at: float, event: str, path: str = "root/a", pid: int = 7, **facts: object) -> Entry:
-    return entry_of({"event": event, "at": at, "path": path, "kind": "manager", "run": 1, "pid": pid} | facts)
+    told = {"event": event, "at": at, "path": path, "kind": "manager", "run": 1, "pid": pid}
+    return entry_of(Event.of(told | facts))
 
 
 def resource(at: float, event: str, detail: str = "", registrar: str = "a") -> Entry:
     facts = {"registrar": registrar, "server": f"{registrar}/lamp", "resource_id": "x", "request": '"front"'}
-    return entry_of({"event": event, "at": at, "detail": detail} | facts)
+    return entry_of(Event.of({"event": event, "at": at, "detail": detail} | facts))
 
 
 def lanes_of(*entries: Entry) -> dict[str, Lane]:
@@ -94,7 +96,10 @@ LIVES: list[tuple[str, list[Entry], list[Bar]]] = [
     ("one that cannot start", [child(12.0, "start_failed", detail="ValueError")], []),
     (
         "one that ends with its root",
-        [child(12.0, "started"), entry_of({"event": "ended", "at": 14.0, "path": "root", "reason": "shutdown"})],
+        [
+            child(12.0, "started"),
+            entry_of(Event.of({"event": "ended", "at": 14.0, "path": "root", "reason": "shutdown"})),
+        ],
         [Bar(12.0, 14.0, 12.0, 7, "stopped")],
     ),
 ]

@@ -10,6 +10,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.recordings import Recording, add, entry_of
 from rr_actors.system.recording.timelines import timeline_of
 from rr_actors.tools.web.timeline_file import html
@@ -28,9 +29,8 @@ HOUR = 3600.0
 
 
 def child(after_s: float, event: str, path: str = "root/a", pid: int = 7, **facts: object) -> Entry:
-    return entry_of(
-        {"event": event, "at": BEGAN + after_s, "path": path, "kind": "actor", "run": 1, "pid": pid} | facts
-    )
+    told = {"event": event, "at": BEGAN + after_s, "path": path, "kind": "actor", "run": 1, "pid": pid}
+    return entry_of(Event.of(told | facts))
 
 
 def killed(after_s: float, path: str = "root/a", pid: int = 7) -> Entry:
@@ -207,7 +207,7 @@ OVERLAPS = """(() => {
 
 def resource(after_s: float, event: str, registrar: str) -> Entry:
     facts = {"registrar": registrar, "server": f"{registrar}/lamp", "resource_id": "x", "request": '"front"'}
-    return entry_of({"event": event, "at": BEGAN + after_s, "detail": ""} | facts)
+    return entry_of(Event.of({"event": event, "at": BEGAN + after_s, "detail": ""} | facts))
 
 
 MANY = sorted(

@@ -32,7 +32,7 @@ from rr_actors.registrar.model.roles import RECOVER, Role
 from rr_actors.registrar.model.rows import Resource
 from rr_actors.runtime.callback_errors import Raised, log_raised, traceback_of
 from rr_actors.runtime.user_loop import Done
-from rr_actors.streams.stream import StreamNews
+from rr_actors.streams.stream import Stream, StreamHappening
 
 logger = Log("rr_actors.server")
 
@@ -169,16 +169,18 @@ def recorded_end(
     return recorded, None if at_once is None else recorded_at_once
 
 
-def tell_stream(server: ServerBase, resource: Resource, news: StreamNews) -> None:
+def tell_stream(
+    server: ServerBase, resource: Resource, what: StreamHappening, stream: Stream, reader: str, before: Stream | None
+) -> None:
     """Tell the watchers of the system what has happened to a stream. From any thread."""
     node = server.registrar.node
     if not node.watched.level[0]:
         return
     facts = {"registrar": server.registrar.name, "server": server.origin, "resource_id": resource.id}
-    facts |= {"request": text_of_value(resource.request), "stream": news.stream.name, "detail": news.stream.name}
-    if (before := news.before) is not None:
+    facts |= {"request": text_of_value(resource.request), "stream": stream.name, "detail": stream.name}
+    if before is not None:
         instead = f"{before.name} of resource {short_id(before.resource_id)}"
-        facts["detail"] += f", read by {news.reader} instead of {instead}"
-        facts |= {"reader": news.reader, "before": f"{before.resource_id}/{before.name}"}
+        facts["detail"] += f", read by {reader} instead of {instead}"
+        facts |= {"reader": reader, "before": f"{before.resource_id}/{before.name}"}
     with contextlib.suppress(Unavailable):  # the loop has ended
-        node.dispatcher.call(functools.partial(node.emit, news.what, **facts))
+        node.dispatcher.call(functools.partial(node.emit, what, **facts))

@@ -55,7 +55,7 @@ class Event(msgspec.Struct, frozen=True):
     def of(cls, event: dict[str, Any], seq: int = 0) -> Self:
         """Return the event that System.subscribe() would tell of."""
         facts = event.copy()
-        return cls(seq, facts.pop("at", 0.0) or time.time(), facts.pop("event"), facts)
+        return cls(seq, facts.pop("at"), facts.pop("event"), facts)
 
     @property
     def path(self) -> str:

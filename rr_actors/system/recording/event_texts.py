@@ -42,9 +42,15 @@ def child_text(facts: Mapping[str, Any]) -> str:
     return ", ".join(filter(None, parts))
 
 
+def subject_and_how(facts: Mapping[str, Any]) -> tuple[str, str]:
+    """Say what an event is about, and how it happened: ("root/cameras", "killed: SIGKILL, after 12 s")."""
+    if path := facts.get("path", ""):
+        return path, child_text(facts)
+    if server := facts.get("server", ""):
+        return named(server, facts.get("request", "")), facts.get("detail", "")
+    return str(facts.get("to", "")), f"{facts.get('message', '')}: {facts.get('why', '')}".strip(": ")
+
+
 def event_text(at: float, event: str, facts: Mapping[str, Any]) -> str:
-    """Say what happened to a child or a resource: "12:46:53.020  exited  root/cameras  killed: SIGKILL"."""
-    what, how = facts.get("path", ""), child_text(facts)
-    if not what:
-        what, how = named(facts.get("server", ""), facts.get("request", "")), facts.get("detail", "")
-    return "  ".join(filter(None, (clock(at), event, what, how)))
+    """Say what happened: "12:46:53.020  exited  root/cameras  killed: SIGKILL"."""
+    return "  ".join(filter(None, (clock(at), event, *subject_and_how(facts))))

@@ -23,6 +23,7 @@ from rr_actors.base.steps import Steps
 from rr_actors.registrar.links.recorder import RECORDED, entries_of
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.queries import Query, ResourceInfo
+from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.figures import Counters
 from rr_actors.system.recording.traces import DEAD_LETTER, Trace, messages_of, trace_of
 
@@ -119,7 +120,7 @@ class Recordings:
                 logger.error("what a process has recorded cannot be read: %s", error)
                 return
         else:
-            entries = [entry_of(event)]
+            entries = [entry_of(Event.of(event))]
         numbered = [msgspec.structs.replace(entry, seq=seq) for seq, entry in enumerate(entries, self.seq + 1)]
         self.seq += len(numbered)
         self._counters.take(numbered)
@@ -127,20 +128,19 @@ class Recordings:
             sink(numbered, dropped)
 
 
-def entry_of(event: dict[str, Any]) -> Entry:
+def entry_of(event: Event) -> Entry:
     """Return the entry of an event of the tree or of a resource."""
-    facts = {key: value for key, value in event.items() if key not in ("event", "at")}
-    at = event.get("at")
-    is_letter = event["event"] == DEAD_LETTER
+    facts = event.facts
+    is_letter = event.event == DEAD_LETTER
     return Entry(
-        at if isinstance(at, float) else time.time(),
-        event["event"],
-        process=str(event.get("path", "")),
-        pid=event.get("pid") or 0,
-        registrar=event["to"] if is_letter else event.get("registrar", ""),
-        resource=event.get("resource_id", ""),
-        server=event.get("server", ""),
-        detail=readable(f"{event['message']}: {event['why']}" if is_letter else event.get("detail", "")),
+        event.at,
+        event.event,
+        process=event.path,
+        pid=facts.get("pid") or 0,
+        registrar=facts["to"] if is_letter else facts.get("registrar", ""),
+        resource=facts.get("resource_id", ""),
+        server=facts.get("server", ""),
+        detail=readable(f"{facts['message']}: {facts['why']}" if is_letter else facts.get("detail", "")),
         facts=facts,
     )
 

@@ -13,9 +13,8 @@ from typing import TypeVar
 
 import msgspec
 
-from rr_actors.base.names import named
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.system.recording.event_texts import child_text, clock
+from rr_actors.system.recording.event_texts import event_text
 
 KINDS = {
     "gave_up": "gave up (escalation)",
@@ -259,13 +258,9 @@ class Lanes:
 
 def text_of(entry: Entry) -> str:
     """Return a line that says what happened, and why."""
-    if entry.process and not entry.server:
-        what, how = entry.process, child_text(entry.facts)
-    else:
-        what = named(entry.server, str(entry.facts.get("request", "")))
-        what, how = what or entry.registrar, entry.detail
-    event = "restored" if entry.event == "ended" and entry.name == "recover" else entry.event
-    return "  ".join(filter(None, (clock(entry.at), event, what, how)))
+    if entry.facts:
+        return event_text(entry.at, entry.event, entry.facts)
+    return event_text(entry.at, "restored", {"server": entry.server, "detail": entry.detail})  # its recover callback
 
 
 def _mark_of(entry: Entry) -> Mark | None:

@@ -239,7 +239,7 @@ def _read_history(path: Path) -> list[Entry]:
         try:
             event = event_in(line)
             time.localtime(event.at)
-            entries.append(entry_of(event.flat()))
+            entries.append(entry_of(event))
         except (msgspec.MsgspecError, RecursionError, OverflowError, ValueError, OSError) as error:
             if isinstance(error, msgspec.DecodeError) and not isinstance(error, msgspec.ValidationError):
                 continue  # a crash has cut it

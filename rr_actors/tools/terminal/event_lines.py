@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rr_actors.base.errors import UsageError, few, shown
-from rr_actors.base.names import named
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.system.console.console_messages import Missed
 from rr_actors.system.event_subscribers import kinds_for_all
 from rr_actors.system.recording.event_memory import Event
-from rr_actors.system.recording.event_texts import child_text, clock
+from rr_actors.system.recording.event_texts import clock, subject_and_how
 
 _KEPT = 500  # lines
 _TOGETHER_S = 10.0
@@ -114,18 +113,16 @@ class EventLine:
     def of(cls, event: Event, above: str = "") -> EventLine:
         """Return the line of one event. The path `above` is left out of it."""
         facts = event.facts
-        if path := facts.get("path", ""):
-            below = f"{path}/".removeprefix(f"{above}/") if above else path
-            return cls(event.at, event.event, below.strip("/"), child_text(facts), path)
+        subject, how = subject_and_how(facts)
+        if event.path:
+            below = f"{subject}/".removeprefix(f"{above}/") if above else subject
+            return cls(event.at, event.event, below.strip("/"), how, subject)
         if server := facts.get("server", ""):
-            name = named(server, facts.get("request", ""))
-            how = facts.get("detail", "")
             if "fraction" in facts:
                 how = shown_progress(facts["fraction"], facts.get("text", ""))
             heard = dict.fromkeys(filter(None, str(facts.get("heard_by", "")).split(", ")))
-            return cls(event.at, event.event, name, how, "", {server}, {name: None}, heard)
-        how = f"{facts.get('message', '')}: {facts.get('why', '')}".strip(": ")
-        return cls(event.at, event.event, str(facts.get("to", "")), how)
+            return cls(event.at, event.event, subject, how, "", {server}, {subject: None}, heard)
+        return cls(event.at, event.event, subject, how)
 
     @property
     def said(self) -> str:

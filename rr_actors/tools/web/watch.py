@@ -273,7 +273,7 @@ class Watch:
             self._latest = max(self._latest, event.at)
         with self._lanes_lock:
             for event in events:
-                self._lanes.take(entry_of(event.flat()))
+                self._lanes.take(entry_of(event))
 
     # -- in the threads that look ------------------------------------------------------------------------------------
 
