@@ -242,6 +242,45 @@ def test_a_load_that_heeds_the_event_and_is_asked_for_again_runs_once_more(
     assert runs.items == [1, 1]
 
 
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_a_stopped_load_that_is_asked_for_again_when_it_has_just_raised_runs_once_more(
+    app: rr.Registrar, provider: rr.Registrar, asynchronous: bool
+) -> None:
+    raised, go, runs = Calls(), threading.Event(), Calls()
+
+    class Stopped(Exception):
+        def __str__(self) -> str:  # the error is described when the callback has ended
+            raised(True)
+            go.wait(LONG_S)
+            return "stopped"
+
+    def load(request: Any) -> str:
+        runs(rr.current().attempt)
+        if len(runs.items) == 1:
+            rr.current().stopping.wait()
+            raise Stopped
+        return "loaded"
+
+    async def load_async(request: Any) -> str:
+        runs(rr.current().attempt)
+        if len(runs.items) == 1:
+            try:
+                await asyncio.sleep(LONG_S)
+            except asyncio.CancelledError:
+                raise Stopped from None
+        return "loaded"
+
+    serve(provider, "cam", load_async if asynchronous else load)
+    with pytest.raises(rr.LoadTimeout):
+        app.load("provider/cam", 1, timeout_s=0.05)
+    raised.wait(timeout=LONG_S)
+    again = app.load("provider/cam", 1, block=False, timeout_s=None)
+    eventually(lambda: provider.resources()[0].holders == ("app",))
+    go.set()
+    assert again.get(timeout=LONG_S).response == "loaded"
+    assert runs.items == [1, 1]
+
+
 def test_a_load_that_sets_it_itself_and_raises_does_not_run_again(app: rr.Registrar, provider: rr.Registrar) -> None:
     runs = Calls()
 

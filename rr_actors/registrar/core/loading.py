@@ -231,6 +231,9 @@ def load_ended(decision: Decision, ended: CallbackEnded) -> None:
     resource = running(catalog, ended.resource_id, LOADING, ended.run)
     if resource is None:
         return
+    if ended.stopped and resource.id in catalog.holders:  # somebody has asked again since it ended
+        start_load(decision, resource)
+        return
     if ended.failure is not None:
         _load_failed(decision, resource, ended.failure)
         return

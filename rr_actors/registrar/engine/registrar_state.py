@@ -178,17 +178,18 @@ class RegistrarState(TurnActor):
                 self.end_run(resource_id, phase, attempt)
             return stop
 
-    def end_run(self, resource_id: str, phase: Phase, attempt: int) -> bool:
-        """Forget the event of a run that ends; return whether it was told, and somebody needs the result again."""
+    def end_run(self, resource_id: str, phase: Phase, attempt: int) -> bool | None:
+        """Forget the event of a run that ends. If it was told, return whether somebody needs the result again."""
         if resource_id not in self._stops:
-            return False
+            return None
         with self.lock:
             runs = self._stops.get(resource_id, {})
             stop = runs.pop((phase, attempt), None)
             if not runs:
                 self._stops.pop(resource_id, None)
-            was_told = stop is not None and stop.is_told
-            return was_told and not self.closed and is_unwanted(self.whole(), resource_id, phase, attempt) is False
+            if stop is None or not stop.is_told:
+                return None
+            return not self.closed and is_unwanted(self.whole(), resource_id, phase, attempt) is False
 
     @with_lock
     def _stop_unwanted(self, decision: Decision) -> None:

@@ -101,6 +101,7 @@ class CallbackEnded(Command, frozen=True, gc=False):
         event: the id of a status that may follow from that.
         notice: of a status callback: what it heard; `handled`: it has dealt with the notice.
         took_s: of a load callback: how long it ran, its wait for a thread included.
+        stopped: of a load callback that raised: it was told to stop before, and nobody needed it when it ended.
     """
 
     role: str
@@ -112,6 +113,7 @@ class CallbackEnded(Command, frozen=True, gc=False):
     notice: Notice | None = None
     handled: bool = False
     took_s: float = 0.0
+    stopped: bool = False
 
 
 class CallbackOverdue(Command, frozen=True):

@@ -24,7 +24,7 @@ from rr_actors.base.errors import InvalidSpec, MailboxFull, NotSerializable, RrE
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec
-from rr_actors.base.values.failure import Failure, failure_of
+from rr_actors.base.values.failure import failure_of
 from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.registrar.core.callback_runs import deaths_of
 from rr_actors.registrar.core.decide import Item
@@ -42,6 +42,7 @@ from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
 from rr_actors.registrar.servers.callback_context import Current, enter
 from rr_actors.registrar.servers.on_demand_callbacks import HealthCallbacks, UsageCallbacks
 from rr_actors.registrar.servers.server_base import (
+    CallbackFailure,
     OnDemandRun,
     Run,
     failure_of_callback,
@@ -315,7 +316,8 @@ class ServerActor(TurnActor):
         event = new_id() if role.answer and role is not LOAD else ""
         handled = run.heard is not None and run.heard.is_handled
         end = role.name, resource.id, run.number, failure, None if error is not None else response, event
-        self.registrar.post(CallbackEnded(*end, run.effect.notice, handled, took_s))
+        stopped = role is LOAD and type(error) is Raised and error.details.was_stopped
+        self.registrar.post(CallbackEnded(*end, run.effect.notice, handled, took_s, stopped))
 
     def _streams_after(self, run: Run, *, failed: bool) -> None:
         """Let readers in to the streams that a callback has opened; close those of a resource that is gone."""
@@ -389,10 +391,10 @@ class ServerActor(TurnActor):
                 try:
                     answer = result(await self._heeding(role, resource, begun or callback(*arguments(resource), *more)))
                 except BaseException as error:
-                    begun = None
-                    if self._may_run_again(role, resource, error):
+                    begun, again = None, self._runs_once_more(role, resource, error)
+                    if again:
                         continue
-                    raised = await described_error(error, self._describe)
+                    raised = await described_error(error, self._describe if again is None else self._describe_stopped)
                 else:
                     self._end_run(role, resource)
                     return answer
@@ -408,8 +410,9 @@ class ServerActor(TurnActor):
                         return closing(answer, run_async(current, role, resource, *more, begun=answer))
                     answer = result(answer)
                 except BaseException as error:
-                    if not self._may_run_again(role, resource, error):
-                        raise Raised(error, self._describe) from None
+                    again = self._runs_once_more(role, resource, error)
+                    if not again:
+                        raise Raised(error, self._describe if again is None else self._describe_stopped) from None
                 else:
                     self._end_run(role, resource)
                     return answer
@@ -422,9 +425,12 @@ class ServerActor(TurnActor):
         if self.registrar.node.watched.level[0] > 1:
             self.registrar.recorder.callback("began", self.origin, role.name, resource.id)
 
-    def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
-        """Return the failure and the trace that describe a callback's error. In the thread that ran the callback."""
-        return load_failure(error, self.origin), failure_of(error, self.origin).trace
+    def _describe(self, error: BaseException) -> CallbackFailure:
+        """Describe a callback's error. In the thread that ran the callback."""
+        return CallbackFailure(load_failure(error, self.origin), failure_of(error, self.origin).trace)
+
+    def _describe_stopped(self, error: BaseException) -> CallbackFailure:
+        return self._describe(error)._replace(was_stopped=True)
 
     async def _heeding(self, role: Role, resource: Resource, answer: Awaitable[Any]) -> Any:
         """Await the answer of a callback. If it may be stopped, it is cancelled when nobody needs it any more."""
@@ -435,20 +441,21 @@ class ServerActor(TurnActor):
         self.registrar.stop_event(resource.id, role.phase, resource.attempt, cancel)
         return await answer
 
-    def _may_run_again(self, role: Role, resource: Resource, error: BaseException) -> bool:
-        """Note that a run has ended by an error; return whether it was told to stop, and its result is needed again."""
-        if not self._end_run(role, resource):
-            return False
+    def _runs_once_more(self, role: Role, resource: Resource, error: BaseException) -> bool | None:
+        """Note that a run has ended by an error. If it was told to stop, return whether its result is needed again."""
+        again = self._end_run(role, resource)
+        if not again:
+            return again
         if not isinstance(error, asyncio.CancelledError):
-            return isinstance(error, Exception)
+            return True if isinstance(error, Exception) else None
         if (task := asyncio.current_task()) is not None:
             while task.cancelling():
                 task.uncancel()
         return True
 
-    def _end_run(self, role: Role, resource: Resource) -> bool:
+    def _end_run(self, role: Role, resource: Resource) -> bool | None:
         if role.phase is None or not role.reports:
-            return False
+            return None
         return self.registrar.end_run(resource.id, role.phase, resource.attempt)
 
     def _is_over(self, role: Role, resource: Resource) -> bool:

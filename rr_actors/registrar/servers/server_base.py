@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import msgspec
 
@@ -37,6 +37,14 @@ from rr_actors.streams.stream import Stream, StreamHappening
 logger = Log("rr_actors.server")
 
 
+class CallbackFailure(NamedTuple):
+    """What is known of the error of a callback. `was_stopped`: it was told to stop, as nobody needed its result."""
+
+    failure: Failure
+    trace: list[tuple[str, str]]
+    was_stopped: bool = False
+
+
 def said(error: BaseException) -> str:
     """Return the text of an error; that of a callback's is made already."""
     return error.text if type(error) is Raised else text_of(error)
@@ -49,7 +57,7 @@ def failure_of_callback(role: Role, origin: str, resource: Resource, error: Base
             return load_failure(error, origin)
         case "unload":
             text = readable(f"{origin}: {said(error)}")
-            trace = error.details[1] if type(error) is Raised else failure_of(error, origin).trace
+            trace = error.details.trace if type(error) is Raised else failure_of(error, origin).trace
             log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
             text += "; the resource is kept as unload_failed, and may be unloaded again"
             return Failure("UnloadFailed", text, {"resource_id": resource.id, "server": origin}, trace)
@@ -69,7 +77,7 @@ def failure_of_callback(role: Role, origin: str, resource: Resource, error: Base
 def load_failure(error: BaseException, origin: str) -> Failure:
     """Return the failure that consumers hear if a load callback raises; a group of one error is that error."""
     if type(error) is Raised:
-        return error.details[0]
+        return error.details.failure
     error = _alone(error)
     described = failure_of(error, origin)
     if isinstance(error, (CircularDependency, GraphError, OverCapacity)):
