@@ -37,9 +37,16 @@ def wanted_by(error: BaseException) -> str:
 
 
 def wanted_by_callback(error: BaseException) -> str:
-    """Name what was wanting as wanted_by() does, for the error of a user's callback, which may be about a device."""
-    causes = (cause for cause in _causes(error) if not (isinstance(cause, OSError) and cause.errno in _DRIVERS_RAISE))
-    return next((wanted for cause in causes if (wanted := _wanted(cause))), "")
+    """Name what was wanting as wanted_by() does, for the error of a user's callback, which may be about a device.
+
+    A user's class may be unusual: its attributes may be missing, of another kind, or raise. Then nothing is known.
+    """
+    try:
+        causes = [one for one in _causes(error) if not (isinstance(one, OSError) and one.errno in _DRIVERS_RAISE)]
+        wanted = next((wanted for cause in causes if (wanted := _wanted(cause))), "")
+    except Exception:
+        return ""
+    return wanted if type(wanted) is str else ""
 
 
 def _wanted(error: BaseException) -> str:
