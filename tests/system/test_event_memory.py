@@ -24,6 +24,7 @@ from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_questions import ListEvents, ListHistory
 from rr_actors.system.recording import event_memory
 from rr_actors.system.recording.event_memory import FILE, OLDER, Event, EventMemory, left_events
+from rr_actors.tools.web.watch import Watch
 from support import LIMIT_S, Workshop, eventually, kill, pid_of, serve, wait_respawned
 from support_inside import node_of
 from support_managers import Order, Shop
@@ -357,3 +358,27 @@ def test_a_file_that_is_removed_while_the_system_runs_is_made_again(system: rr.S
     (line,) = (state_dir / FILE).read_text().splitlines()
     assert json.loads(line)["detail"] == "ERROR 2"
     assert "kept" not in json.loads(line)
+
+
+# -- what shows it -----------------------------------------------------------------------------------------------------
+
+
+def test_a_page_that_is_opened_later_begins_with_what_happened_before_and_tells_it_once(
+    app: rr.Registrar, provider: rr.Registrar, state_dir: Path
+) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", 1)
+    provider.send_status(query, rr.Status("ERROR", "no frame"))
+    assert eventually(lambda: kinds(remembered(state_dir)) == ["status"])
+
+    watch = Watch(state_dir)
+    watch.start()
+    try:
+        assert eventually(lambda: [line.how for line in watch.lines.lines()] == ["ERROR no frame"])
+        provider.send_status(query, rr.Status("WARNING", "dusty"))
+        assert eventually(lambda: [line.times for line in watch.lines.lines()] == [1, 1])
+        marks = [mark.text for lane in watch.timeline().lanes for mark in lane.marks]
+    finally:
+        watch.stop()
+
+    assert ["no frame" in mark for mark in marks] == [True, False]

@@ -36,7 +36,7 @@ from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import Caller, ClientRegistrars
-from rr_actors.system.recording.event_memory import Event, EventMemory, events_below, events_of, is_of_child
+from rr_actors.system.recording.event_memory import Event, EventMemory, events_below, events_of
 from rr_actors.system.recording.figures import Figure
 from rr_actors.system.registrar_lookup import open_registrar, registrar_in
 from rr_actors.system.snapshots import ask_each, describe_supervisor
@@ -126,9 +126,8 @@ class View:
 
     def _walk(self) -> Iterator[c.ChildRow]:
         if (ended := self.system.ended) is not None:  # what has ended is not asked: that would make a dead letter
-            yield from _last_seen(
-                self.memory.of_this_run(_HISTORY), self.system.supervisor().path, readable(ended.detail)
-            )
+            events = self.memory.of_children(_HISTORY, self.memory.began)
+            yield from _last_seen(events, self.system.supervisor().path, readable(ended.detail))
             return
         state = {"state": "running", "pid": os.getpid()}
         root = describe_supervisor(SupervisorRef(self.system.supervisor().path, timeout_s=_LOOK_S), text_of)
@@ -139,7 +138,7 @@ class View:
 
     def history(self, path: str) -> list[Event]:
         """Return the newest events of the child at `path` and of all below it, oldest first."""
-        events = self.memory.newest(_HISTORY, is_of_child)
+        events = self.memory.of_children(_HISTORY)
         if path and self.system.ended is None:
             with contextlib.suppress(NotFound, Unavailable):
                 return events_below(events, self.path_of(path))
