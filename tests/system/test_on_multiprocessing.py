@@ -145,7 +145,7 @@ def run(directory: Path, program: str) -> tuple[str, str]:
     ran = subprocess.run(
         [sys.executable, "program.py"],
         cwd=directory,
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY), "PYTHONWARNINGS": "ignore"},  # of os.fork()
         timeout=60,
         capture_output=True,
         text=True,
