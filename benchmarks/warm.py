@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
+import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any, Literal
@@ -18,6 +20,7 @@ from benchmarks.yardsticks import pykka_ask
 AT_MOST = {"none": 2.0, "process": 2.5 if find_spec("uvloop") else 3.0, "power": None}
 _P99_AT_MOST = 3.0
 _TURNS = 4
+_HELD = 100  # at a time
 _PLACES: dict[str, Literal["process", "thread"]] = {"another process": "process", "this process": "thread"}
 
 
@@ -65,6 +68,28 @@ def with_a_handler(times: int) -> list[Row]:
             signal.signal(signal.SIGTERM, before)
         rows.append(_row(f"warm load from {name}, with a signal handler", handled, without, "without one", 1.1))
     return rows
+
+
+def awaited(times: int) -> list[Row]:
+    """A load that a task of asyncio awaits, beside the blocking call: of one process, on one core."""
+    with placement_of.here(placement_of.ONE_CORE), running("process", "thread") as (system, consumer):
+        placement_of.part(placement_of.ONE_CORE)
+        blocking = _measure(_nothing, system, consumer, times)[1]
+        with asyncio.Runner() as runner:
+            load = runner.run(_awaited(consumer, times))
+    return [_row("awaited warm load, this process", load, blocking, "blocking", 1.3)]
+
+
+async def _awaited(consumer: rr.Registrar, times: int) -> Samples:
+    took = list[float]()
+    while len(took) < times:
+        queries = list[rr.Query]()
+        for _ in range(_HELD):
+            began = time.perf_counter()
+            queries.append(await consumer.load_async(SERVER, Ask(0)))
+            took.append(time.perf_counter() - began)
+        unload_all(queries, consumer)
+    return Samples(tuple(took))
 
 
 def _one_core(placement: Literal["process", "thread"], times: int) -> Samples:

@@ -49,6 +49,10 @@ T = TypeVar("T")
 
 CALL_TIMEOUT_S = 30.0
 """Seconds for which a thread waits until the loop has answered a short call."""
+
+_JOINS_AT_ONCE = 16
+"""The most loads of tasks that are answered without a turn of their event loop."""
+
 GRACE_S = 5.0
 """Seconds for which a thread waits, after a time limit, until the loop says how the call has ended."""
 
@@ -229,6 +233,18 @@ def exchanged(actor: RegistrarActor, client: ProviderLink, line: Exchange, messa
     return answer
 
 
+def answered(actor: RegistrarActor, client: ProviderLink, message: Message) -> Any:
+    """Return a provider's answer if it is in this process, and answers at once; None if it has not taken the message.
+
+    Record both if there is a recording.
+    """
+    answer = client.answer_at_once(message)
+    if answer is not None and actor.node.watched.level[0] > 1:
+        actor.recorder.message("sent", actor.name, client.provider, message)
+        actor.recorder.message("received", actor.name, client.provider, answer)
+    return answer
+
+
 # -- loads -------------------------------------------------------------------------------------------------------------
 
 
@@ -290,6 +306,7 @@ class Loads:
         self.calls = calls
         self.limits = calls.limits
         self.views = views
+        self._joins = 0
 
     def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Loading:
         """Begin a load, and return the future of its query at once. A worker calls the hearer of its progress.
@@ -350,7 +367,11 @@ class Loads:
         query = self.views.new(new_id(), target, request, parent, options.codec)
         try:
             self._listen(query, options)
-            return await self._begin(query, request, options, None if hearer is None else HearsOnThisLoop(hearer))
+            if hearer is not None:
+                return await self._begin(query, request, options, HearsOnThisLoop(hearer))
+            if not await self._joined(query, request, options):
+                await self._begin(query, request, options)
+            return query
         except RrError:
             raise
         except BaseException:  # cancelled, or KeyboardInterrupt, which may come anywhere
@@ -359,6 +380,34 @@ class Loads:
         finally:
             if hearer is not None:
                 hearer.close()
+
+    async def _joined(self, query: Query, request: bytes, options: LoadOptions) -> bool:
+        """Join a resource of this process that others hold, as a thread does. Return False if the loop has to load."""
+        actor, id = self.actor, query.id
+        client = actor.clients.get(query.registrar)
+        if client is None or (epoch := client.epoch_here()) is None or self.calls.connections_to(client) is None:
+            return False
+        load = actor.begin_directly(query, request, _unheard, _rank(options), options.own)
+        if load is None:
+            return False
+        self.views.add(query)
+        answer = answered(actor, client, load)
+        if answer is None and actor.forget_refused(id):
+            return False
+        if type(answer) is not Loaded or client.checksums.get(query.server, 0) != answer.types:
+            command: c.Command = c.SendAgain(id)
+        elif actor.hold(answer):
+            loaded_directly(query, answer.resource_id, answer.response, answer.state)
+            self._joins += 1
+            if self._joins % _JOINS_AT_ONCE == 0:
+                await asyncio.sleep(0)  # other tasks have their turns, too
+            return True
+        else:
+            command = c.Got(id, answer.resource_id, answer.response, answer.state, epoch)
+        loading = Loading(self, query, options.timeout_s, options.timeout_s)
+        self.calls.dispatcher.call(loading.begin, actor.go_on_loading, id, loading.ended, command)
+        await loading
+        return True
 
     def check_order(self, target: ServerId) -> None:
         """Raise UsageError if on_start runs this code, and the provider starts only after it."""
@@ -821,6 +870,10 @@ class Unloads:
             self.calls.limits.begin(timeout_s, overdue)
             reply.when_set(lambda: self.calls.limits.end(timeout_s, overdue))
         return reply
+
+
+def _unheard(_held: Held | None, _error: RrError | None) -> None:
+    pass  # how a load has ended that its task asks for again
 
 
 def _no_one(_error: RrError | None) -> None:

@@ -5,6 +5,7 @@ It lives on the process's loop, with its servers and clients. Nothing here block
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from rr_actors.actors.messaging.exit_reports import ExitReport, abnormal
@@ -23,7 +24,7 @@ from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.links.provider_link import THREADS, ProviderLink, ProviderLinks, ServerTypes
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.messages import Loaded, LoadRefused
+from rr_actors.registrar.model.messages import Loaded, LoadRefused, Message
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.servers.registered_servers import Servers
 from rr_actors.registrar.servers.server_actor import RequestReader
@@ -160,11 +161,13 @@ class RegistrarActor(RegistrarBase):
         """Close the registrar after a defect. Its supervisor starts it again from its catalog."""
         logger.critical("registrar %s: failed", self.name, exc_info=error)
         self._why_down = "closed after a defect, which the log has; open it again: its catalog is as it was"
-        self.close(report=abnormal(raised_by(error)))
+        steps = Steps()
+        steps.take("closing it", functools.partial(self.close, report=abnormal(raised_by(error))))
         if self.on_defect is not None:
-            self.on_defect(error)
+            steps.take("reporting its defect", self.on_defect, error)
         else:  # no supervisor starts it; it may be opened again
-            self.node.close_registrar(self.name, Presence.DORMANT)
+            steps.take("freeing its name", self.node.close_registrar, self.name, Presence.DORMANT)
+        steps.report(logger, f"registrar {self.name!r}: not closed altogether")
 
     # -- what its parts ask of each other ------------------------------------------------------------------------
 
@@ -176,6 +179,9 @@ class RegistrarActor(RegistrarBase):
 
     def line(self, hello: Hello) -> Exchange:
         return LocalLine(self.node, self, hello)
+
+    def answer_at_once(self, message: Message, hello: Hello) -> Message | None:
+        return None if self.closed else self.consumers.answer_here(message, hello)
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
         resource = self.catalog.resources.get(loaded.resource_id)

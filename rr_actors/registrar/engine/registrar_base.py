@@ -352,5 +352,9 @@ class RegistrarBase(RegistrarState, abc.ABC):
         """Return a line for a thread of another registrar of this process."""
 
     @abc.abstractmethod
+    def answer_at_once(self, message: Message, hello: Hello) -> Message | None:
+        """Answer a registrar of this process without waiting. None: the message was not taken. From any thread."""
+
+    @abc.abstractmethod
     def fail(self, error: Exception) -> None:
         """Close the registrar after a defect."""

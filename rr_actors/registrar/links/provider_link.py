@@ -42,6 +42,7 @@ from rr_actors.registrar.model.messages import (
     Load,
     Loaded,
     LoadRefused,
+    Message,
     Noticed,
     Progressed,
     Reprioritised,
@@ -203,6 +204,18 @@ class ProviderLink(TurnActor):
             line.close()
             return None
         return line
+
+    @any_thread
+    def epoch_here(self) -> int | None:
+        """Return the provider's epoch if it is in this process, and the link is to its present incarnation."""
+        here, link = self._registrar.peers.get(self.provider), self.link
+        return None if here is None or link is None or here.epoch != link.welcome.epoch else here.epoch
+
+    @any_thread
+    def answer_at_once(self, message: Message) -> Message | None:
+        """Have a provider of this process answer without waiting. None: it has not taken the message."""
+        here = self._registrar.peers.get(self.provider)
+        return None if here is None else here.answer_at_once(message, self._hello(THREADS))
 
     # -- for the registrar ---------------------------------------------------------------------------------------
 
