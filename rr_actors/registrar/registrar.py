@@ -94,9 +94,8 @@ from rr_actors.registrar.servers.callback_context import (
     serving,
     status_callback_of,
 )
-from rr_actors.registrar.servers.gated_server import server_of
 from rr_actors.registrar.servers.on_demand_callbacks import Measured, Usages
-from rr_actors.registrar.servers.registered_servers import reread_values
+from rr_actors.registrar.servers.registered_servers import reread_values, server_of
 from rr_actors.registrar.servers.server_actor import ServerActor
 from rr_actors.runtime.event_loop import check_asyncio
 from rr_actors.runtime.time_limits import RunningLimit, finite_time, time_limit
