@@ -129,7 +129,7 @@ class SystemConfig:
             each has. Default: 128. Raise it for a larger pool of workers.
         events_limit_bytes: the size of the files in which the system remembers what happened. Default: 16,777,216.
             Raise it if a day does not fit; lower it on a small disk.
-        events_kept_s: for how many seconds the system remembers what happened. Default: 86,400.0, a day. Raise it to
+        events_kept_s: for how many seconds the system remembers what happened. Default: 86400.0, a day. Raise it to
             ask on Monday about the weekend.
         registrars: other configurations, by the registrar's name. Default: {}, none. Name a registrar that differs from
             the others.
