@@ -212,7 +212,7 @@ class Group:
 
     def _check_order(self) -> None:
         for server, _, _ in self._requests:
-            self._loads.check_order(server)
+            self._loads.check_order(server, self._parent)
 
     def _withdraw(self) -> None:
         """Release and withdraw all, as no caller waits any more."""

@@ -19,6 +19,7 @@ from typing import Any, Protocol, TypeVar
 
 import pykka
 
+from rr_actors.actors.messaging import ask_cycles
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.actors.remote.hub import why_registrar_too_early
 from rr_actors.actors.turns import has_a_turn
@@ -75,6 +76,20 @@ class Calls:
         if has_a_turn():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
+
+    def check_order(self, what: object, registrar: str, wait: str, starting: str = "") -> None:
+        """Raise UsageError if an on_start waits for this code, and a provider starts only after it.
+
+        Args:
+            what: what this code wants, for the error.
+            wait: the verb for what on_start should do later.
+            starting: the path of the manager whose on_start waits; "": of one whose on_start runs this code.
+        """
+        client = self.actor.clients.get(registrar)
+        if client is not None and client.link is not None:  # the provider is up
+            return
+        if why := why_registrar_too_early(self.actor.node.directory, registrar, wait, starting):
+            raise UsageError(f"{what}: {why}", registrar=registrar)
 
     def connections_to(self, client: ProviderLink) -> ThreadConnections[Exchange] | None:
         """Return the connections of threads to a provider, beside the present link; None if the link is to be used.
@@ -286,6 +301,10 @@ class Loading(InFlight[Query]):
         if self.hearing is not None:
             self.hearing.ended()  # last: the thread that it wakes reads at once how the load has ended
 
+    def check_wait(self) -> None:
+        """Raise UsageError if on_start waits for this load, and the provider starts only after it."""
+        self._loads.check_order(ServerId(self.query.registrar, self.query.server), self.query.parent)
+
     def unawaited(self) -> None:
         """Withdraw the load, or release the query, which nobody has got."""
         if not self.cancel():
@@ -307,6 +326,7 @@ class Loads:
         self.limits = calls.limits
         self.views = views
         self._joins = 0
+        self._starting = set[str]()  # the queries for whose loads on_start waits
 
     def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Loading:
         """Begin a load, and return the future of its query at once. A worker calls the hearer of its progress.
@@ -335,13 +355,16 @@ class Loads:
         Raises:
             RrError: how the load ended.
         """
-        self.check_order(target)
+        self.check_order(target, parent)
         dispatcher = self.calls.dispatcher
         if has_a_turn() or asyncio._get_running_loop() is not None:  # else this thread is no loop's
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
             self.calls.check_may_wait()
         hearer = None if options.progress is False else hearer_of(options.progress, self.actor)
         query = self.views.new(query_id or new_id(), target, request, parent, options.codec)
+        starts = not self.actor.serving and ask_cycles.starting() is not None
+        if starts:
+            self._starting.add(query.id)
         try:
             self._listen(query, options)
             with LettingIn():
@@ -354,6 +377,9 @@ class Loads:
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
             self.withdraw(query)
             raise
+        finally:
+            if starts:
+                self._starting.discard(query.id)
         return query
 
     async def awaited(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
@@ -362,9 +388,12 @@ class Loads:
         Raises:
             RrError: how the load ended.
         """
-        self.check_order(target)
+        self.check_order(target, parent)
         hearer = hearer_of(options.progress, self.actor)
         query = self.views.new(new_id(), target, request, parent, options.codec)
+        starts = not self.actor.serving and ask_cycles.starting() is not None
+        if starts:
+            self._starting.add(query.id)
         try:
             self._listen(query, options)
             if hearer is not None:
@@ -378,6 +407,8 @@ class Loads:
             self.withdraw(query)
             raise
         finally:
+            if starts:
+                self._starting.discard(query.id)
             if hearer is not None:
                 hearer.close()
 
@@ -409,13 +440,29 @@ class Loads:
         await loading
         return True
 
-    def check_order(self, target: ServerId) -> None:
-        """Raise UsageError if on_start runs this code, and the provider starts only after it."""
-        client = self.actor.clients.get(target.registrar)
-        if client is not None and client.link is not None:  # the provider is up
-            return
-        if why := why_registrar_too_early(self.actor.node.directory, target.registrar):
-            raise UsageError(f"{target}: {why}", registrar=target.registrar)
+    def check_order(self, target: ServerId, parent: str = "") -> None:
+        """Raise UsageError if an on_start waits for this load, and the provider starts only after it.
+
+        Args:
+            parent: the resource of this registrar whose callback loads. on_start may wait for that in turn, as for a
+                resource with a `cost`.
+        """
+        actor = self.actor
+        starting = actor.path if parent and not actor.serving and self._is_for_start(parent) else ""
+        self.calls.check_order(target, target.registrar, "load", starting)
+
+    def _is_for_start(self, resource_id: str) -> bool:
+        """Return whether on_start waits for a load of a resource, or for one of which that is a part."""
+        with self.actor.lock:
+            catalog, seen, wholes = self.actor.whole(), set[str](), [resource_id]
+            while wholes:
+                for query in catalog.queries_of(wholes.pop()):
+                    if query.id in self._starting:
+                        return True
+                    if query.origin == self.actor.name and query.parent and query.parent not in seen:
+                        seen.add(query.parent)
+                        wholes.append(query.parent)
+        return False
 
     def _listen(self, query: Query, options: LoadOptions) -> None:
         self.calls.check_open()
@@ -623,9 +670,26 @@ class Unloading(InFlight[None]):
         self._unloads, self._limits, self.query_id = unloads, unloads.calls.limits, query_id
         self.limit_s, self.timeout_s = limit_s, timeout_s  # the second as the caller gave it
 
+    def check_wait(self) -> None:
+        """Raise UsageError if on_start waits for this unload, and the provider starts only after it."""
+        self._unloads.check_order(self.query_id)
+
     def give_up(self) -> None:
         """Send its caller the error that the provider has not answered in time. On the loop."""
         self._unloads.release_overdue(self.query_id, self.timeout_s)
+
+
+class UnloadingAll(Reply[None]):
+    """The unloads of several queries: the future of their end."""
+
+    def __init__(self, unloads: Unloads, query_ids: Sequence[str]) -> None:
+        super().__init__()
+        self._unloads, self.query_ids = unloads, query_ids
+
+    def check_wait(self) -> None:
+        """Raise UsageError if on_start waits for these unloads, and a provider starts only after it."""
+        for query_id in self.query_ids:
+            self._unloads.check_order(query_id)
 
 
 class UnloadWays(Protocol):
@@ -673,9 +737,16 @@ class Unloads:
         if has_a_turn():  # a finalizer, which the garbage collector runs: it cannot wait
             self.begin(query_id, timeout_s)
             return
+        self.check_order(query_id)
         with LettingIn():
             if not self._directly(query_id, timeout_s):
                 self._finish(self.begin(query_id, timeout_s))
+
+    def check_order(self, query_id: str) -> None:
+        """Raise UsageError if on_start waits for this unload, and the provider starts only after it."""
+        held = None if ask_cycles.starting() is None else self._actor.catalog.held.get(query_id)
+        if held is not None:
+            self.calls.check_order(f"unloading {held.registrar}/{held.server}", held.registrar, "unload")
 
     def begin(self, query_id: str, timeout_s: float | None) -> Unloading:
         """Begin to release a query, and return a future of its end at once."""
@@ -843,7 +914,7 @@ class Unloads:
 
     def _many_now(self, wanted: Callable[[Held | Query], bool], timeout_s: float | None) -> Reply[None]:
         """Begin to release. The reply raises the first error; the others are its notes."""
-        reply: Reply[None] = Reply()
+        reply = UnloadingAll(self, ())
         errors: list[RrError] = []
 
         def ended(query_id: str, error: RrError | None) -> None:
@@ -862,6 +933,7 @@ class Unloads:
             held = self._actor.whole().held
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             pending = dict.fromkeys(mine)
+            reply.query_ids = mine
             releases = Releases(self._actor, mine, ended)
         self._views.forget_taken(wanted)
         if not mine:

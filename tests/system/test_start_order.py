@@ -14,6 +14,7 @@ import pykka
 import pytest
 
 import rr_actors as rr
+from rr_actors.managers import Budgets, Pool
 from support import eventually
 
 both = pytest.mark.parametrize("placement", ["process", "thread"])
@@ -49,6 +50,81 @@ class AwaitsLoad(rr.Manager):
         await self.registrar.load_async("cameras/camera", "front")
 
 
+class GetsLater(rr.Manager):
+    def on_start(self) -> None:
+        self.registrar.load("cameras/camera", "front", block=False).get()
+
+
+class AwaitsLater(rr.Manager):
+    async def on_start(self) -> None:
+        await self.registrar.load("cameras/camera", "front", block=False)
+
+
+class LoadsWithoutWaiting(rr.Manager):
+    def on_start(self) -> None:
+        self.camera = self.registrar.load("cameras/camera", "front", block=False)
+
+    def on_receive(self, message: Any) -> Any:
+        return [self.camera.get().response]
+
+
+class Costs(rr.Manager):
+    @rr.server("map", cost={"watts": 4})
+    def load(self, request: str) -> str:
+        return request
+
+    def on_start(self) -> None:
+        self.registrar.load("maps/map", "hall")
+
+
+class CostsInPart(rr.Manager):
+    """What its on_start loads has a part with a cost."""
+
+    @rr.server("map")
+    async def load(self, request: str) -> str:
+        await self.registrar.load("maps/tile", request, block=False)
+        return request
+
+    @rr.server("tile", cost={"watts": 4})
+    async def load_tile(self, request: str) -> str:
+        return request
+
+    async def on_start(self) -> None:
+        await self.registrar.load_async("maps/map", "hall")
+
+
+class Unloads(rr.Manager):
+    """Loads when it is asked to, and unloads in on_start of its next life."""
+
+    said = ""
+
+    def on_start(self) -> None:
+        for query in self.registrar.queries():
+            try:
+                self.unload(query)
+            except rr.UsageError as error:
+                self.said = str(error)
+
+    def unload(self, query: rr.Query[Any]) -> None:
+        query.unload()
+
+    def on_receive(self, message: Any) -> Any:
+        if message == "load":
+            self.registrar.load("cameras/camera", "front")
+            self.registrar.save_catalog()  # the next life finds the query
+        return self.said
+
+
+class UnloadsLater(Unloads):
+    def unload(self, query: rr.Query[Any]) -> None:
+        self.registrar.unload(query, block=False).get()
+
+
+class UnloadsAll(Unloads):
+    def unload(self, query: rr.Query[Any]) -> None:
+        self.registrar.unload_all()
+
+
 class Asks(rr.Manager):
     def on_start(self) -> None:
         self.ref("echo").ask("hello")
@@ -68,7 +144,7 @@ def refused(tmp_path: Path, *children: Any, strategy: Any = "one_for_one") -> st
 
 
 @both
-@pytest.mark.parametrize("cls", [Loads, LoadsAll, AwaitsLoad])
+@pytest.mark.parametrize("cls", [Loads, LoadsAll, AwaitsLoad, GetsLater, AwaitsLater])
 @pytest.mark.parametrize("strategy", ["one_for_one", "rest_for_one", "one_for_all"])
 def test_a_load_in_on_start_from_a_later_sibling_is_refused_at_once(
     tmp_path: Path, cls: Any, placement: Any, strategy: Any
@@ -86,6 +162,42 @@ def test_a_load_in_on_start_below_an_earlier_supervisor_is_refused_too(tmp_path:
     text = refused(tmp_path, inner, later)
     assert "root/later/cameras starts after root/inner/maps" in text
     assert "put 'later' before 'inner' in the list of root" in text
+
+
+@both
+def test_a_future_in_on_start_for_which_that_does_not_wait_is_no_fault(tmp_path: Path, placement: Any) -> None:
+    maps = rr.ChildSpec(LoadsWithoutWaiting, id="maps", placement=placement)
+    with rr.System([maps, rr.ChildSpec(Cameras, id="cameras", placement=placement)], state_dir=tmp_path) as system:
+        assert len(system.ref("maps").ask("?")) == 1
+
+
+@both
+@pytest.mark.parametrize("cls", [Costs, CostsInPart])
+def test_a_cost_of_what_on_start_loads_is_refused_at_once_if_budgets_starts_later(
+    tmp_path: Path, cls: Any, placement: Any
+) -> None:
+    maps = rr.ChildSpec(cls, id="maps", placement=placement)
+    text = refused(
+        tmp_path, maps, rr.ChildSpec(Budgets, id="budgets", args=([Pool("watts", 10)],), placement=placement)
+    )
+    assert "root/budgets starts after root/maps" in text
+    assert "put 'budgets' before 'maps' in the list of root" in text
+
+
+@both
+@pytest.mark.parametrize("cls", [Unloads, UnloadsLater, UnloadsAll])
+def test_an_unload_in_on_start_at_a_later_sibling_is_refused_at_once(tmp_path: Path, cls: Any, placement: Any) -> None:
+    """Both are killed: under one_for_all the manager is started again before the one at which it holds a query."""
+    maps = rr.ChildSpec(cls, id="maps", placement="process")
+    cameras = rr.ChildSpec(Cameras, id="cameras", placement=placement)
+    with rr.System(_tree([maps, cameras], "one_for_all"), state_dir=tmp_path) as system:
+        system.ref("maps").ask("load")
+        began = time.monotonic()
+        system.ref("maps").kill()
+        text = eventually(lambda: _camera(system), SOON_S)
+        assert time.monotonic() - began < SOON_S
+    assert "unloading cameras/camera: root/cameras starts after root/maps" in text
+    assert "put 'cameras' before 'maps' in the list of root, or unload after on_start, in a thread" in text
 
 
 @both

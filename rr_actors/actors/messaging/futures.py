@@ -405,6 +405,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         event_loop.check_may_block(f"waiting for {self._whose()}")
         waiter = threading.Lock()
         waiter.acquire()
+        self.check_wait()
         waiting = ask_cycles.begin_wait(self)
         try:
             self.when_set(waiter.release)
@@ -431,6 +432,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 logger.debug("%r was set after the loop that awaited it had closed", self)
                 self.unawaited()
 
+        self.check_wait()
         waiting = ask_cycles.begin_wait(self)
         try:
             self.when_set(call_back)
@@ -441,6 +443,9 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         finally:
             self._forget(call_back)
             ask_cycles.end_wait(waiting, self)
+
+    def check_wait(self) -> None:
+        """Raise if the calling code must not wait for this future, as it would hang."""
 
     def unawaited(self) -> None:
         """Note that a task that awaited this future was cancelled, or its loop closed. A load is withdrawn."""

@@ -430,16 +430,17 @@ class ActorHub:
 # The start order: what the on_start of an actor cannot wait for, as it starts only after that actor.
 
 
-def why_too_early(directory: Directory, path: str, wait: str) -> str:
+def why_too_early(directory: Directory, path: str, wait: str, starting: str = "") -> str:
     """Say why the actor at `path` cannot come before the on_start that runs this code returns; "" if it can.
 
     Args:
         wait: the verb for what on_start should do later: "load", "ask".
+        starting: the path of the actor whose on_start waits for this code; "": for the on_start that runs it.
     """
-    asker = ask_cycles.starting()
-    if asker is None:
+    asker = starting or _starting()
+    if not asker:
         return ""
-    mine, theirs = asker.name.split("/"), path.split("/")
+    mine, theirs = asker.split("/"), path.split("/")
     same = next((at for at, parts in enumerate(zip(mine, theirs, strict=False)) if parts[0] != parts[1]), 0)
     if not same:  # in other trees, or one is above the other
         return ""
@@ -448,20 +449,25 @@ def why_too_early(directory: Directory, path: str, wait: str) -> str:
         return ""
     above, first, later = "/".join(mine[:same]), theirs[same], mine[same]
     return (
-        f"{path} starts after {asker.name}, whose on_start has not returned: put {first!r} before {later!r} in the "
+        f"{path} starts after {asker}, whose on_start has not returned: put {first!r} before {later!r} in the "
         f"list of {above}, or {wait} after on_start, in a thread"
     )
 
 
-def why_registrar_too_early(directory: Directory, name: str) -> str:
-    """Say as why_too_early() why a manager, whose registrar has this name, cannot come before this on_start returns."""
-    asker = ask_cycles.starting()
-    entry = None if asker is None else directory.lookup(registrar_key(name))
-    if asker is None or entry is None or entry.status is not Presence.STARTING:
+def why_registrar_too_early(directory: Directory, name: str, wait: str, starting: str = "") -> str:
+    """Say as why_too_early() why a manager, whose registrar has this name, cannot come before that on_start returns."""
+    asker = starting or _starting()
+    entry = directory.lookup(registrar_key(name)) if asker else None
+    if entry is None or entry.status is not Presence.STARTING:
         return ""
-    top = asker.name.partition("/")[0]
+    top = asker.partition("/")[0]
     paths = [path for path in directory.actor_paths(top) if path.endswith(f"/{name}")]
-    return why_too_early(directory, paths[0], "load") if len(paths) == 1 else ""
+    return why_too_early(directory, paths[0], wait, asker) if len(paths) == 1 else ""
+
+
+def _starting() -> str:
+    asker = ask_cycles.starting()
+    return "" if asker is None else asker.name
 
 
 def _is_gone(address: str) -> bool:
