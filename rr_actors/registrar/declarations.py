@@ -234,6 +234,10 @@ class Declared(Generic[Request, Returned, Response]):
             load = self._cost.paid_before(load, manager)
         return checked_whole(checked_spec(replace(self._spec, load=load, **roles)))
 
+    def _cost_from(self) -> str:
+        """Return the id of the child whose pools its resources hold amounts of; "" if they cost nothing."""
+        return "" if self._cost is None else self._cost.budgets
+
     def _declaring(self) -> Declaring:
         """Return which class declares the server.
 
@@ -277,6 +281,7 @@ class Declaring(NamedTuple):
 # For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
 declaring = Declared[Any, Any, Any]._declaring  # pyright: ignore[reportPrivateUsage]
+cost_from = Declared[Any, Any, Any]._cost_from  # pyright: ignore[reportPrivateUsage]
 
 
 # -- what a resource costs -----------------------------------------------------------------------------------------
@@ -312,7 +317,7 @@ class _Cost:
 
     def __init__(self, spec: ServerSpec, cost: Cost, budgets: str) -> None:
         self._who = f"server {spec.name!r}"
-        self._share = f"{budgets}/share"
+        self.budgets, self._share = budgets, f"{budgets}/share"
         self._timeout_s = spec.load_timeout_s or _SHARE_S
         self._amounts = cost if callable(cost) else self._checked(cost)
 

@@ -241,3 +241,12 @@ def ref(id: str) -> ActorRef[Any]:
 class _Failed:
     def __init__(self, error: BaseException) -> None:
         self.error = error
+
+
+def declared_servers(cls: type[Manager]) -> dict[str, Declared[Any, Any, Any]]:
+    """Return the servers that a class of managers declares, by name, for the package's own modules.
+
+    Raises:
+        NameTaken: two methods declare the same name.
+    """
+    return cls._declared_servers()  # pyright: ignore[reportPrivateUsage] - same file

@@ -14,6 +14,7 @@ from rr_actors.supervision.core.specs import Supervisor
 from rr_actors.system.system import System
 from rr_actors.tools.log_lines import begin_logging
 from rr_actors.tools.module_watcher import LOOK_S, ModuleWatcher
+from rr_actors.tools.tree_check import misordered
 
 
 class _Told(BaseException):
@@ -41,10 +42,7 @@ def run_tree(
         RrError: a file cannot be read, or the system does not start.
     """
     begin_logging(log_level, as_json=log_json)
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    settings = SystemConfig() if config is None else SystemConfig.from_toml(config)
-    root = Supervisor.from_toml(tree)
+    root, settings = _read(tree, config)
     system = System(root, name=name, state_dir=state_dir, config=settings, debug=debug)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _told)
@@ -63,6 +61,22 @@ def run_tree(
         return False  # the log has it
     ended = system.ended
     return ended is not None and ended.reason in ("normal", "shutdown") and ended.exception is None
+
+
+def verified(tree: Path, config: Path | None) -> list[str]:
+    """Return what of the tree of a TOML file cannot start, a sentence each. Modules that the tree names are imported.
+
+    Raises:
+        ConfigError: a file cannot be read, or has a wrong value.
+    """
+    return misordered(_read(tree, config)[0])
+
+
+def _read(tree: Path, config: Path | None) -> tuple[Supervisor, SystemConfig]:
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    settings = SystemConfig() if config is None else SystemConfig.from_toml(config)
+    return Supervisor.from_toml(tree), settings
 
 
 def _told(number: int, _frame: object) -> None:

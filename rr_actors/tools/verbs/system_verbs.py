@@ -11,7 +11,7 @@ import typer
 
 from rr_actors.tools.cli_commands import JsonOption, say
 from rr_actors.tools.doctor import examine
-from rr_actors.tools.tree_runner import run_tree
+from rr_actors.tools.tree_runner import run_tree, verified
 
 app = typer.Typer()
 
@@ -34,6 +34,25 @@ def run(
     Exit code 1 if the tree gave up by itself.
     """
     if not run_tree(tree, state, config, name, log_level=log, log_json=as_json, watch=watch, debug=debug):
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: rr-actors verify robot.toml --config robot-config.toml")
+def verify(
+    tree: Annotated[Path, typer.Argument(metavar="TREE.toml", help="The tree, as Supervisor.from_toml reads it.")],
+    config: Annotated[Path | None, typer.Option(help="Its configuration, as SystemConfig.from_toml reads it.")] = None,
+) -> None:
+    """Say what cannot start of a tree: wrong keys, unknown classes, an on_start that waits for what starts later.
+
+    Exit code 1 if anything cannot. It imports the modules that the tree names, and calls nothing in them: it reads the
+    source of on_start, and of the methods that this calls. It finds a load or an ask whose name is written there, and a
+    cost at Budgets. It does not find a name that is computed, a declared function in place of a name, a wait in a
+    callback of another manager, children that are added at run time, or what needs a device or a file.
+    """
+    found = verified(tree, config)
+    for sentence in found:
+        say(sentence)
+    if found:
         raise typer.Exit(1)
 
 

@@ -194,7 +194,11 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
             "run": (
                 "Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second "
                 "one kills what is left"
-            )
+            ),
+            "verify": (
+                "Say what cannot start of a tree: wrong keys, unknown classes, an on_start that waits for what "
+                "starts later"
+            ),
         },
     },
     "Record what happens": {
