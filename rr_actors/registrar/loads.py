@@ -448,6 +448,9 @@ class Loads:
                 resource with a `cost`.
         """
         actor = self.actor
+        client = actor.clients.get(target.registrar)
+        if client is not None and client.link is not None:  # the provider is up, as for nearly all loads
+            return
         starting = actor.path if parent and not actor.serving and self._is_for_start(parent) else ""
         self.calls.check_order(target, target.registrar, "load", starting)
 

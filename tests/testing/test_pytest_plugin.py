@@ -25,7 +25,7 @@ class Lamps(rr.Manager):
 def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str) -> pytest.RunResult:
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
     pytester.makepyfile(HEAD + test)
-    return pytester.runpytest_subprocess("-p", "no:cacheprovider")
+    return pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:rerunfailures")  # that has a thread
 
 
 def test_a_test_gets_a_system_that_is_stopped_after_it(
