@@ -39,13 +39,11 @@ def wanted_by(error: BaseException) -> str:
 def wanted_by_callback(error: BaseException) -> str:
     """Name what was wanting as wanted_by() does, for the error of a user's callback, which may be about a device.
 
-    A user's class may be unusual: its attributes may be missing, of another kind, or raise. Then nothing is known.
+    Raises:
+        Exception: what an attribute of a user's class raised.
     """
-    try:
-        causes = [one for one in _causes(error) if not (isinstance(one, OSError) and one.errno in _DRIVERS_RAISE)]
-        wanted = next((wanted for cause in causes if (wanted := _wanted(cause))), "")
-    except Exception:
-        return ""
+    causes = [one for one in _causes(error) if not (isinstance(one, OSError) and one.errno in _DRIVERS_RAISE)]
+    wanted = next((wanted for cause in causes if (wanted := _wanted(cause))), "")
     return wanted if type(wanted) is str else ""
 
 

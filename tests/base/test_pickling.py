@@ -638,7 +638,7 @@ def test_a_global_variable_of_main_that_cannot_travel_is_named() -> None:
 
 
 _LONG = b"\x93" * 70_000
-"""Looks like names to whoever reads only the bytes."""
+"""Bytes that a pickle has where it names a class."""
 
 
 @pytest.mark.parametrize(

@@ -282,10 +282,10 @@ with system() as running:
     running.ref("one").ask("a message")
 """,
     )
-    lines = said.splitlines()
-    assert "[INFO/root/one] child process calling self.run()" in lines
-    assert "[INFO/root/one] heard a message" in lines
-    assert "[INFO/root/one] process exiting with exitcode 0" in lines
+    lines, path = said.splitlines(), "root/one"
+    assert f"[INFO/{path}] child process calling self.run()" in lines
+    assert f"[INFO/{path}] heard a message" in lines
+    assert f"[INFO/{path}] process exiting with exitcode 0" in lines
 
 
 def test_a_child_is_silent_where_the_parent_does_not_show_the_log(tmp_path: Path) -> None:

@@ -87,8 +87,11 @@ def load_failure(error: BaseException, origin: str) -> Failure:
     else:
         text, lines = text_of(error), traceback_of(error)
     details = {"server": origin, "traceback": lines}
-    if wanted := wanted_by_callback(error):
-        details["wanted"] = wanted
+    try:
+        if wanted := wanted_by_callback(error):
+            details["wanted"] = wanted
+    except Exception as odd:  # of the error's own class, whose attributes may be missing, or raise
+        logger.debug("%s: its error does not say what was wanting: %s", origin, text_of(odd))
     return Failure("LoadFailed", readable(f"{origin}: {text}"), details, described.trace)
 
 
