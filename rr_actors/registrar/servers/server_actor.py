@@ -164,9 +164,11 @@ class ServerActor(TurnActor):
             InvalidSpec: the callback has attributes that cannot be read.
         """
         what = f"{self.origin}: {role.option}"
-        callback = getattr(self.spec, role.option) or nothing
+        callback = getattr(self.spec, role.option)
         try:
-            taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
+            taking = nothing
+            if callback is not None:
+                taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
             self._runs[role] = self._wrapped(taking, arguments, result)
         except Exception as error:
             expected = "a callable whose attributes can be read"
