@@ -14,7 +14,7 @@ import rr_actors as rr
 from rr_actors.managers import Budgets, Measure, Pool, PoolInfo, Share
 from rr_actors.managers.budgets.gauge import Gauge
 from rr_actors.managers.budgets.measures import next_capacity
-from rr_actors.managers.budgets.probes import NoProbe, probe_of
+from rr_actors.managers.planning.probes import NoProbe, probe_of
 from support import Calls, eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
