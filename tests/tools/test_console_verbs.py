@@ -183,6 +183,21 @@ def test_a_resource_is_revoked_from_outside(app: rr.Registrar) -> None:
     assert "no registrar serves a resource" in refused(2, "revoke", query.id, "again")
 
 
+def test_a_resource_is_reloaded_from_outside(app: rr.Registrar) -> None:
+    heard = Calls()
+    query = app.load("shop/thing", Order("lamp"), on_status=heard)
+    name = 'shop/thing {"name":"lamp","parts":[]}'
+    assert re.fullmatch(rf"would reload {re.escape(name)} \(\w+\), held by app\n", said("reload", name, "--dry-run"))
+    assert len(heard) == 0
+    assert "; `rr-actors reload" in refused(2, "restart", query.resource_id)
+    assert f"got a resource, {name}; `rr-actors reload {query.resource_id}`" in refused(2, "restart", name)
+    done = json.loads(said("reload", query.resource_id, "--json"))
+    assert (done["resource_id"], done["server"], done["holders"]) == (query.resource_id, "shop/thing", 1)
+    assert heard.wait()[0].message == "reloaded"
+    assert "no registrar serves a resource" in refused(2, "reload", "0000000000")
+    assert "no child 'nobody' (it has: shop)" in refused(2, "restart", "nobody")
+
+
 # -- finding it ------------------------------------------------------------------------------------------------------
 
 

@@ -37,7 +37,7 @@ from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.commands import CallbackEnded
 from rr_actors.registrar.model.effects import StartCallback
 from rr_actors.registrar.model.messages import Load
-from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, STATUS, UNLOAD, USAGE, Role
+from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, RELOAD, RESUME, STATUS, UNLOAD, USAGE, Role
 from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
 from rr_actors.registrar.servers.callback_context import Current, enter
 from rr_actors.registrar.servers.on_demand_callbacks import HealthCallbacks, UsageCallbacks
@@ -164,7 +164,8 @@ class ServerActor(TurnActor):
             InvalidSpec: the callback has attributes that cannot be read.
         """
         what = f"{self.origin}: {role.option}"
-        callback = getattr(self.spec, role.option) or nothing
+        given: Callback | None = getattr(self.spec, role.option)
+        callback = nothing if given is None else given  # one that is empty, as a list may be, is false
         try:
             taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
             self._runs[role] = self._wrapped(taking, arguments, result)
@@ -259,7 +260,7 @@ class ServerActor(TurnActor):
         heard = None if effect.notice is None else self._received(effect.notice, repeated=effect.repeated)
         number = resource.tries if role is UNLOAD else resource.attempt
         run = Run(role, effect, number, heard, time.monotonic())
-        if role in (UNLOAD, STATUS) and getattr(self.spec, role.option) is None:
+        if role in (UNLOAD, RELOAD, STATUS) and getattr(self.spec, role.option) is None:
             self._run_ended(run, None, None)
             return
         if not self.registrar.serving:  # it may end this process during its start
@@ -313,7 +314,7 @@ class ServerActor(TurnActor):
             self.registrar.callback_failures += 1
         self._streams_after(run, failed=error is not None)
         failure = None if error is None else failure_of_callback(role, self.origin, resource, error)
-        event = new_id() if role.answer and role is not LOAD else ""
+        event = new_id() if role in (RECOVER, RELOAD, RESUME) else ""
         handled = run.heard is not None and run.heard.is_handled
         end = role.name, resource.id, run.number, failure, None if error is not None else response, event
         stopped = role is LOAD and type(error) is Raised and error.details.was_stopped
@@ -325,7 +326,7 @@ class ServerActor(TurnActor):
         if run.role.reports and not failed:
             if publishers.streams:  # most registrars have none
                 publishers.let_in(id, functools.partial(tell_stream, self, run.effect.resource))
-        elif (run.role.reports and failed) or (run.role is UNLOAD and not failed):
+        elif (run.role.reports and failed) or (run.role in (UNLOAD, RELOAD) and not failed):
             publishers.close(id)
 
     # -- how callbacks run -------------------------------------------------------------------------------------------

@@ -157,6 +157,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
                 "Take a resource away from its holders in its owner's name: what depends on it ends "
                 "first, or replaces it"
             ),
+            "reload": (
+                "Unload a resource and load it again for the same request; its holders keep it, and hear "
+                "the new response"
+            ),
         },
         _mailboxes: {
             "status": (
