@@ -12,6 +12,7 @@ from rr_actors.managers.budgets.measures import Measure
 from rr_actors.managers.budgets.pools import Pool, Reserve
 from rr_actors.managers.budgets.requests import PoolInfo, Share, Supply
 from rr_actors.managers.choices.alternatives import Alternative
+from rr_actors.managers.choices.by_hand import ChoiceInfo
 from rr_actors.managers.choices.choice_manager import Choices
 from rr_actors.managers.choices.chosen import Choose, Chosen
 from rr_actors.managers.components import Component, Components, LoadComponent
@@ -28,6 +29,7 @@ __all__ = [
     "Alternative",
     "Budgets",
     "BuiltPipe",
+    "ChoiceInfo",
     "Choices",
     "Choose",
     "Chosen",
