@@ -192,11 +192,15 @@ class ServerRow(msgspec.Struct, frozen=True):
         server: "registrar/server"; for what a registrar holds itself, "registrar".
         states: how many resources are in each state (ResourceRow.condition).
         holds: how many queries they hold at each "registrar/server".
+        runs: how many of its callbacks run now, by their roles, "load" for instance.
+        waiting: how many messages wait in its mailbox, of callbacks that have no room yet.
     """
 
     server: str
     states: dict[str, int] = {}
     holds: dict[str, int] = {}
+    runs: dict[str, int] = {}
+    waiting: int = 0
 
 
 class LoadRow(msgspec.Struct, frozen=True):
@@ -344,8 +348,17 @@ def _server_rows(actor: RegistrarActor) -> list[ServerRow]:
     for query in held:
         if query.hold is not Hold.OWED:
             holds.setdefault(homes.get(query.parent, ""), Counter())[f"{query.registrar}/{query.server}"] += 1
-    rows = [ServerRow(f"{actor.name}/{name}", dict(states[name]), dict(holds.get(name, {}))) for name in states]
+    rows = [
+        ServerRow(f"{actor.name}/{name}", dict(states[name]), dict(holds.get(name, {})), *_doing(actor, name))
+        for name in states
+    ]
     return [*rows, ServerRow(actor.name, {}, dict(holds[""]))] if "" in holds else rows
+
+
+def _doing(actor: RegistrarActor, name: str) -> tuple[dict[str, int], int]:
+    """Return the callbacks of a server that run now, by their roles, and how many wait in its mailbox."""
+    server = actor.servers.get(name)
+    return ({}, 0) if server is None else (dict(Counter(list(server.inside.values()))), len(server.waiting))
 
 
 def load_rows(actor: RegistrarActor) -> list[LoadRow]:

@@ -255,6 +255,49 @@ def test_where_nothing_runs_the_error_says_what_to_do(tmp_path: Path) -> None:
 # -- looking ---------------------------------------------------------------------------------------------------------
 
 
+class Gated(rr.Manager):
+    """Opens doors one at a time, and each when the test says so."""
+
+    gate = Gate()
+
+    @rr.server("door", at_once=1)
+    def open_door(self, door: str) -> str:
+        self.gate(door)
+        return door
+
+    @rr.server("lamp")
+    def switch_on(self, lamp: str) -> str:
+        return lamp
+
+
+def test_ps_shows_the_parts_of_a_manager_and_what_they_do(start: Start) -> None:
+    Gated.gate = Gate()
+    system = start(
+        rr.ChildSpec(Gated, id="house", placement="thread"), rr.ChildSpec(Quiet, id="quiet", placement="thread")
+    )
+    app = system.open_registrar("app")
+    app.load("house/lamp", "hall")
+    loads = [app.load("house/door", number, block=False) for number in ("1", "2", "3")]
+    Gated.gate.wait_arrived()
+    assert "registrar" not in said("ps")
+    eventually(lambda: "2 wait" in said("ps", "--parts"))
+    rows = {row["path"]: row for row in json.loads(said("ps", "--parts", "--json"))}
+    place = "root/house/registrar"
+    assert list(rows) == ["root", "root/house", place, f"{place}/servers/door", f"{place}/servers/lamp", "root/quiet"]
+    assert [
+        (rows[f"{place}/servers/{name}"]["type"], rows[f"{place}/servers/{name}"]["note"]) for name in ("door", "lamp")
+    ] == [("server", "runs 1 load; 2 wait; 3 resources"), ("server", "1 resource")]
+    assert f"{place}/servers/door" in said("ps", "house", "--parts")
+    Gated.gate.open()
+    for load in loads:
+        load.get(timeout=LIMIT_S)
+    eventually(lambda: "runs" not in said("ps", "--parts"))
+
+
+class Quiet(rr.Actor):
+    """Has no registrar."""
+
+
 def test_ps_shows_each_child_with_its_process(shop: rr.System) -> None:
     pid = shop.ref("shop").pid
 

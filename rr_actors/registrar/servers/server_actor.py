@@ -102,6 +102,7 @@ class ServerActor(TurnActor):
     Attributes:
         facts: what decisions know of it.
         usage, health: these two callbacks.
+        inside: the callbacks that run now, each with the name of its role. From any thread.
         digest: of the types of requests and responses.
 
     Raises:
@@ -116,6 +117,7 @@ class ServerActor(TurnActor):
         "digest",
         "facts",
         "health",
+        "inside",
         "load_times",
         "origin",
         "registrar",
@@ -152,6 +154,7 @@ class ServerActor(TurnActor):
         self.health = HealthCallbacks(self)
         self._on_demand = {USAGE.name: self.usage, HEALTH.name: self.health}
         self.load_times = LoadTimes()
+        self.inside: dict[int, str] = {}
 
     def add(self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]) -> None:
         """Run callbacks of a role from now on.
@@ -392,12 +395,12 @@ class ServerActor(TurnActor):
                 try:
                     answer = result(await self._heeding(role, resource, begun or callback(*arguments(resource), *more)))
                 except BaseException as error:
-                    begun, again = None, self._runs_once_more(role, resource, error)
+                    begun, again = None, self._runs_once_more(current, role, resource, error)
                     if again:
                         continue
                     raised = await described_error(error, self._describe if again is None else self._describe_stopped)
                 else:
-                    self._end_run(role, resource)
+                    self._end_run(current, role, resource)
                     return answer
                 raise raised from None
             return None
@@ -411,11 +414,11 @@ class ServerActor(TurnActor):
                         return closing(answer, run_async(current, role, resource, *more, begun=answer))
                     answer = result(answer)
                 except BaseException as error:
-                    again = self._runs_once_more(role, resource, error)
+                    again = self._runs_once_more(current, role, resource, error)
                     if not again:
                         raise Raised(error, self._describe if again is None else self._describe_stopped) from None
                 else:
-                    self._end_run(role, resource)
+                    self._end_run(current, role, resource)
                     return answer
             return None
 
@@ -423,6 +426,7 @@ class ServerActor(TurnActor):
 
     def _enter_context(self, current: Current, role: Role, resource: Resource) -> None:
         enter(current)
+        self.inside[id(current)] = role.name
         if self.registrar.node.watched.level[0] > 1:
             self.registrar.recorder.callback("began", self.origin, role.name, resource.id)
 
@@ -442,9 +446,9 @@ class ServerActor(TurnActor):
         self.registrar.stop_event(resource.id, role.phase, resource.attempt, cancel)
         return await answer
 
-    def _runs_once_more(self, role: Role, resource: Resource, error: BaseException) -> bool | None:
+    def _runs_once_more(self, current: Current, role: Role, resource: Resource, error: BaseException) -> bool | None:
         """Note that a run has ended by an error. If it was told to stop, return whether its result is needed again."""
-        again = self._end_run(role, resource)
+        again = self._end_run(current, role, resource)
         if not again:
             return again
         if not isinstance(error, asyncio.CancelledError):
@@ -454,7 +458,8 @@ class ServerActor(TurnActor):
                 task.uncancel()
         return True
 
-    def _end_run(self, role: Role, resource: Resource) -> bool | None:
+    def _end_run(self, current: Current, role: Role, resource: Resource) -> bool | None:
+        self.inside.pop(id(current), None)
         if role.phase is None or not role.reports:
             return None
         return self.registrar.end_run(resource.id, role.phase, resource.attempt)
