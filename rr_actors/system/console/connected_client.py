@@ -17,7 +17,16 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.base.errors import NotRunning, NotSerializable, RrError, Unavailable, UnknownQuery, UsageError, is_a
+from rr_actors.base.errors import (
+    InvalidRequest,
+    NotRunning,
+    NotSerializable,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UsageError,
+    is_a,
+)
 from rr_actors.base.names import ServerId, parse_server_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode
@@ -101,17 +110,18 @@ class Client:
     def ask(self, actor: str, message: Any, *, timeout_s: float | None = 30.0) -> Any:
         """Ask an actor of the system, and return its answer. Both are plain data, as requests are (docs/values.md).
 
+        The handler sees who asks as `rr.current().origin`: "client.pid-" and the number of this process.
+
         Args:
             actor: its id or its path, as for System.ref().
 
         Raises:
             NotFound: there is no such actor.
             NotSerializable: the message or the answer is no plain data, or too long (as for load()).
-            RrError: the actor did not answer, or its handler raised.
+            AskFailed: its handler raised; an error of this package keeps its class.
+            Unavailable: it has not answered in time, or is being started again.
         """
-        limit_s = _limit(timeout_s)
-        command = AskActor(actor, _encoded(message, f"message to {actor}"), limit_s)
-        return Codec(None, "answer").show(self._connections.ask(command, limit_s + _GRACE_S).answer)
+        return _asked(self._connections, actor, message, timeout_s)
 
     def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
         """Have the system back itself up to a directory of its machine, as System.backup() does, with its errors."""
@@ -331,6 +341,10 @@ class ClientRegistrar(Consumer):
         given.value = value
         return given
 
+    def ask(self, actor: str, message: Any, *, timeout_s: float | None = 30.0) -> Any:
+        """Ask an actor of the system as Client.ask() does. `rr.current().origin` of its handler is this registrar."""
+        return _asked(self._connections, actor, message, timeout_s, self._name)
+
     def set_on_status(self, query_or_id: Query | str, callback: StatusCallback | None) -> None:
         """Replace the status callback of a query of this registrar, as `query.on_status(callback)` does.
 
@@ -453,6 +467,22 @@ def connect(state_dir: str | os.PathLike[str] | None = None, *, wait_s: float | 
         time.sleep(_RETRY_S)
 
 
+def _asked(connections: SystemConnections, actor: str, message: Any, timeout_s: float | None, asker: str = "") -> Any:
+    limit_s, what = _limit(timeout_s), f"message to {actor}"
+    try:
+        data = _encoded(message, what)
+        _any.decode(data, what, "message")
+    except (NotSerializable, InvalidRequest) as error:
+        if "limit" in error.details:
+            raise
+        got = error.message.rpartition("got ")[2].partition(", which only")[0]
+        text = "an actor that is asked from outside knows no classes: send the fields of an object, in a dict, say"
+        plain = "numbers, strings, bytes, lists, dicts and the like"
+        raise NotSerializable(f"{what}: expected {plain}, got {got}; {text}", path=what) from error
+    command = AskActor(actor, data, limit_s, asker)
+    return Codec(None, "answer").show(connections.ask(command, limit_s + _GRACE_S).answer)
+
+
 def _limit(timeout_s: float | None) -> float:
     limit_s = time_limit(timeout_s)
     return TIMEOUT_LIMIT_S if limit_s is None else min(limit_s, TIMEOUT_LIMIT_S)
@@ -462,7 +492,7 @@ def _encoded(value: Any, what: str) -> bytes:
     data = encode(value, what)
     if len(data) > VALUE_LIMIT_BYTES:
         text = f"{what}: {len(data)} bytes is over a client's limit of {VALUE_LIMIT_BYTES}"
-        raise NotSerializable(f"{text}; give the name of a file, say", path=what)
+        raise NotSerializable(f"{text}; give the name of a file, say", path=what, limit=VALUE_LIMIT_BYTES)
     return data
 
 
