@@ -7,11 +7,11 @@ import os
 from typing import Annotated, Any, Literal
 
 import msgspec
-import pykka
 
 from rr_actors.actors.mailbox_refs import MailboxRef
 from rr_actors.actors.messaging.ask_cycles import asking_as
 from rr_actors.actors.messaging.mailbox_looks import MailboxInfo
+from rr_actors.actors.refs import Timeout
 from rr_actors.base.errors import (
     ActorUnavailable,
     AskFailed,
@@ -529,7 +529,7 @@ class AskActor(Command[c.Replied], frozen=True):
         try:
             with asking_as(name):
                 answer = ref.ask(message, timeout=self.timeout_s)
-        except pykka.Timeout as late:
+        except Timeout as late:
             text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
             raise Unavailable(text) from late
         except Exception as error:
