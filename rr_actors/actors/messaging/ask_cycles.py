@@ -80,7 +80,7 @@ def asking_as(name: str) -> Generator[None]:
 
 
 def asker() -> str | None:
-    """Return the name of the actor or client that asks what is handled, "" if it is not known; None outside of a handler."""
+    """Return the name of the actor or client that asks, "" if it is not known; None outside of a handler."""
     me = activity.get()
     if me is None or not me.active or me.starts_in is not None:
         return None
