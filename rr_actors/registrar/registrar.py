@@ -1117,7 +1117,7 @@ class Registrar(Consumer):
 
     def _info(self, resource: Resource, server: ServerActor | None, queries: list[QueryRow]) -> ResourceInfo:
         """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
-        request = (server.request if server else PLAIN).show(resource.request)
+        request = (server.request if server else PLAIN).show_stored(resource.request)
         response = None
         if resource.response is not None:
             response = (server.response if server else PLAIN).show(resource.response)

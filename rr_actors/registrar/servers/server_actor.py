@@ -429,7 +429,8 @@ class ServerActor(TurnActor):
         enter(current)
         self.inside[id(current)] = role.name
         if self.registrar.node.watched.level[0] > 1:
-            self.registrar.recorder.callback("began", self.origin, role.name, resource.id)
+            again = f"attempt {current.attempt}" if current.attempt > 1 else ""
+            self.registrar.recorder.callback("began", self.origin, role.name, resource.id, again)
 
     def _describe(self, error: BaseException) -> CallbackFailure:
         """Describe a callback's error. In the thread that ran the callback."""
