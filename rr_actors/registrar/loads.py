@@ -901,8 +901,23 @@ class Unloads:
         begin = functools.partial(self.calls.start, start)
         self._end_of(target, "the revocation", "another thread may make it", begin, timeout_s)
 
+    def reload(self, target: str, timeout_s: float | None) -> None:
+        """Unload a resource that is served here, load it again, and return when that is done.
+
+        Raises:
+            RrError: how the reload ended.
+        """
+        begin = functools.partial(self.calls.start, functools.partial(self._actor.reload, target))
+        self._end_of(target, "the reload", "another thread may make it", begin, timeout_s, "reloading")
+
     def _end_of(
-        self, target: str, called: str, instead: str, begin: Callable[[], Reply[None]], timeout_s: float | None
+        self,
+        target: str,
+        called: str,
+        instead: str,
+        begin: Callable[[], Reply[None]],
+        timeout_s: float | None,
+        doing: str = "unloading",
     ) -> None:
         resource, is_served = self.calls.call(self._find, target)
 
@@ -911,7 +926,7 @@ class Unloads:
 
         what = f"registrar {self._actor.name!r}: {called} of {shortened(target)}"
         check_not_own(what, is_of_it, instead)
-        what = f"unloading {shortened(target)}"
+        what = f"{doing} {shortened(target)}"
         if resource is not None and not is_served:
             what += f", which waits for its server {self._actor.catalog.origin_of(resource)!r} to be registered again,"
         self.calls.finish(begin(), timeout_s, what)

@@ -215,11 +215,14 @@ class Query(Generic[Response]):
 
     @property
     def request(self) -> Any:
-        """The request, decoded as the server's request type."""
+        """The request, decoded as the server's request type.
+
+        It is plain data if the query was loaded before an upgrade, and does not fit the type of today.
+        """
         request = self._request
         if type(request) is _Bytes:
             codec = self._types(self.server_id)[0]
-            request = codec.decode(request.raw, self.server_id)
+            request = codec.show_stored(request.raw)
             if codec is not PLAIN:  # else the types are not known yet, and the next read tries again
                 self._request = request
         return request

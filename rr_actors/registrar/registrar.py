@@ -812,6 +812,28 @@ class Registrar(Consumer):
         self._unloads.revoke(target, message_text(why), seconds, limit_s)
 
     @for_handles(repeatable=False)
+    def reload(self, query_or_resource_id: Query | ResourceInfo | str, *, timeout_s: float | None = None) -> None:
+        """Unload a resource served here and load it again for the same request; return when that is done.
+
+        The unload callback runs, the parts of the resource are released, and the load callback runs, which may load
+        them again. The holders keep their queries, and hear UPDATE with the new response. Loads and unloads of the
+        resource wait meanwhile. After a crash the reload goes on where it was.
+
+        Args:
+            query_or_resource_id: the resource or its id, or a query on it or the query's id.
+            timeout_s: seconds to wait. The reload goes on after them.
+
+        Raises:
+            UnknownQuery: this registrar serves no such resource.
+            UsageError: the resource is not loaded, or is FATAL, revoked or being reloaded already; or a callback of the
+                resource made the call, and would wait for itself.
+            UnloadFailed: the unload callback raised. The resource is not loaded again, and its holders hear ERROR.
+            LoadFailed: the load callback raised. The holders hear FATAL.
+        """
+        self._check_open()
+        self._unloads.reload(target_id(query_or_resource_id), time_limit(timeout_s))
+
+    @for_handles(repeatable=False)
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
     ) -> None:
@@ -1095,7 +1117,7 @@ class Registrar(Consumer):
 
     def _info(self, resource: Resource, server: ServerActor | None, queries: list[QueryRow]) -> ResourceInfo:
         """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
-        request = (server.request if server else PLAIN).show(resource.request)
+        request = (server.request if server else PLAIN).show_stored(resource.request)
         response = None
         if resource.response is not None:
             response = (server.response if server else PLAIN).show(resource.response)

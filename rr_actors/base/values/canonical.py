@@ -156,6 +156,17 @@ class Codec:
         except (InvalidRequest, InvalidResponse):
             return shown_plain(raw)
 
+    def show_stored(self, raw: bytes) -> Any:
+        """Return the value of a request that an earlier version may have stored.
+
+        It is a plain value if it does not fit the type, also by today(): the type could only be guessed.
+        """
+        try:
+            self.today(raw)
+        except (InvalidRequest, NotSerializable):
+            return shown_plain(raw)
+        return self.decode(raw)
+
     def canonical(self, raw: bytes, server: str = "", what: str = "request") -> bytes:
         """Return the canonical bytes for a value's bytes: equal requests have equal canonical bytes.
 
