@@ -20,6 +20,7 @@ from rr_actors.managers.keeper.keep_manager import Keeper, Kept
 from rr_actors.managers.pipes.pipe_manager import BuiltPipe, Pipe, Pipes
 from rr_actors.managers.program_conditions import ProgramHealth
 from rr_actors.managers.programs import Program, Programs, Ready, RunProgram
+from rr_actors.managers.replays import Replays
 from rr_actors.managers.robots import LoadRobot, Robot, Robots
 
 __all__ = [
@@ -51,6 +52,7 @@ __all__ = [
     "ProgramHealth",
     "Programs",
     "Ready",
+    "Replays",
     "Reserve",
     "Robot",
     "Robots",

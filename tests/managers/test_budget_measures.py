@@ -16,7 +16,7 @@ from rr_actors.base.errors import ConfigError
 from rr_actors.managers import Budgets, Measure, Pool, PoolInfo, Share, Sink
 from rr_actors.managers.budgets.gauge import Gauge
 from rr_actors.managers.budgets.measures import next_capacity, surplus
-from rr_actors.managers.budgets.probes import NoProbe, probe_of
+from rr_actors.managers.planning.probes import NoProbe, probe_of
 from support import Calls, eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]

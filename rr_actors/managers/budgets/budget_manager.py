@@ -24,7 +24,6 @@ from rr_actors.managers.budgets.gauge import Gauge
 from rr_actors.managers.budgets.measures import Measure, next_capacity, surplus
 from rr_actors.managers.budgets.planner import LEAST, Asked, Plan, plan, urgencies
 from rr_actors.managers.budgets.pools import Pool, check_amount, read_pools
-from rr_actors.managers.budgets.probes import probe_of
 from rr_actors.managers.budgets.requests import PoolInfo, Share, Supply, check_request
 from rr_actors.managers.budgets.reserves import Record, Reserves
 from rr_actors.managers.budgets.rings import Wait, one_to_refuse, without_ground
@@ -32,6 +31,7 @@ from rr_actors.managers.budgets.words import NAMED, Around, gives_way, has_room,
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.last_good import still_standing
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.probes import probe_of
 from rr_actors.managers.planning.setbacks import Setbacks
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager

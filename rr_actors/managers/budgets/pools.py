@@ -39,8 +39,8 @@ from rr_actors.base.names import parse_server_id
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.budgets.measures import Measure, faults
 from rr_actors.managers.budgets.planner import Step
-from rr_actors.managers.budgets.probes import NoProbe, probe_of
 from rr_actors.managers.planning.last_good import last_good_file
+from rr_actors.managers.planning.probes import NoProbe, probe_of
 from rr_actors.registrar.manager import Beginning
 
 POLICY: tuple[Step, ...] = get_args(Step)

@@ -167,10 +167,11 @@ class ServerActor(TurnActor):
             InvalidSpec: the callback has attributes that cannot be read.
         """
         what = f"{self.origin}: {role.option}"
-        given: Callback | None = getattr(self.spec, role.option)
-        callback = nothing if given is None else given  # one that is empty, as a list may be, is false
+        callback = getattr(self.spec, role.option)
         try:
-            taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
+            taking = nothing
+            if callback is not None:
+                taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
             self._runs[role] = self._wrapped(taking, arguments, result)
         except Exception as error:
             expected = "a callable whose attributes can be read"
@@ -428,7 +429,8 @@ class ServerActor(TurnActor):
         enter(current)
         self.inside[id(current)] = role.name
         if self.registrar.node.watched.level[0] > 1:
-            self.registrar.recorder.callback("began", self.origin, role.name, resource.id)
+            again = f"attempt {current.attempt}" if current.attempt > 1 else ""
+            self.registrar.recorder.callback("began", self.origin, role.name, resource.id, again)
 
     def _describe(self, error: BaseException) -> CallbackFailure:
         """Describe a callback's error. In the thread that ran the callback."""

@@ -94,8 +94,19 @@ def _say_kept(rows: list[dict[str, Any]], as_json: bool) -> None:
     if as_json:
         say_json(rows)
     elif rows:
-        cells = [(row["name"], f"{row['ready']} of {row['wanted']}", row["why"], row["detail"]) for row in rows]
-        say_table(("kept", "ready", "why", ""), cells, gives_way=("",), right=("ready",))
+        cells = [
+            (
+                row["name"],
+                f"{row['ready']} of {row['wanted']}",
+                "" if row["least"] is None else f"{row['least']}-{row['most']}",
+                row["scaled"],
+                row["why"],
+                row["detail"],
+            )
+            for row in rows
+        ]
+        heads = ("kept", "ready", "range", "scaled", "why", "")
+        say_table(heads, cells, gives_way=("", "scaled"), right=("ready",))
     else:
         say("nothing is kept", err=True)
 
