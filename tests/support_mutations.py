@@ -796,8 +796,15 @@ def never_pauses_what_is_on_standby(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def forgets_a_reload_in_a_crash(patch: Patch) -> type[SimRegistrar]:
+    """A reload that a crash interrupts does not go on."""
+    patch(recovery, "is_reloaded", lambda catalog, id: False)
+    return SimRegistrar
+
+
 MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a pause lost in a crash": loses_a_pause_in_a_crash,
+    "a reload lost in a crash": forgets_a_reload_in_a_crash,
     "what is needed left paused": leaves_what_is_needed_paused,
     "what is on standby never paused": never_pauses_what_is_on_standby,
     "reply before commit": _in_place(AnswersFirst),

@@ -56,7 +56,7 @@ def test_pools_are_read_from_a_file_or_taken_as_they_are(tmp_path: Path) -> None
             "capacity = 2.5",
             "capcity = 2.5",
             "pool[1].capcity",
-            "one of name, capacity, policy, reserve, measure",
+            "one of name, capacity, policy, reserve, sink, measure",
             "capcity",
         ),
         ("capacity = 2.5", "", "pool[1]", "the key capacity", {"name": "lanes", "policy": ["wait"]}),

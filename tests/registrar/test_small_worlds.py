@@ -29,6 +29,7 @@ FOUND = {
     "reply before commit": ("at once", 8),
     "what is needed left paused": ("pauses", 15),
     "a pause lost in a crash": ("crash and pauses", 7),
+    "a reload lost in a crash": ("crash and reload", 5),
 }
 """Our protocol broken in one place, a small world in which that shows, and the least number of steps it takes."""
 

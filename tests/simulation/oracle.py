@@ -74,6 +74,7 @@ class Ledger:
         self.answered: dict[str, bool] = {}
         self.wishes: dict[str, list[tuple[int, int | None]]] = {}  # query -> ticket and priority; None: it inherits
         self.acknowledged = 0
+        self.given_up_reloads: set[tuple[str, str]] = set()  # registrar and resource: it may be unloaded in part
 
     # -- callbacks -----------------------------------------------------------------------------------------------
 
@@ -125,6 +126,7 @@ class Ledger:
     def reload_began(self, registrar: str, id: str) -> None:
         """An owner has a resource reloaded: what was given up before is tried again."""
         self.deaths.pop((registrar, "renew", id), None)
+        self.given_up_reloads.discard((registrar, id))
 
     def given_up_unload(self, registrar: str, id: str, *, died: bool) -> None:
         """That a resource is kept as unload_failed is on disk: its unload callback has ended so, or runs no more.

@@ -253,6 +253,7 @@ def _check_resources(world: World, registrar: SimRegistrar) -> None:
         if resource.phase not in (Phase.LOADED, Phase.UNLOAD_FAILED, Phase.PAUSED):
             _fail("stuck", registrar, f"at rest, and still {resource}")
         _check_idleness(world, registrar, resource)
+        _check_reloaded(world, registrar, resource)
         warm = world.lingering(registrar, resource.id)
         if resource.phase is Phase.LOADED and resource.id not in catalog.holders and not warm:
             _fail("leak", registrar, f"nobody holds {resource}")
@@ -273,6 +274,15 @@ def _check_resources(world: World, registrar: SimRegistrar) -> None:
             query.seq,
         ):
             _fail("disagree", registrar, f"{query} is {held} for its origin")
+
+
+def _check_reloaded(world: World, registrar: SimRegistrar, resource: Resource) -> None:
+    """What was unloaded to be loaded again is loaded, unless that failed for good."""
+    place = registrar.name, resource.id
+    life = world.ledger.lives.get(place)
+    given_up = resource.state is State.FATAL or place in world.ledger.given_up_reloads
+    if life is not None and life.stage in ("renewing", "renewed") and not given_up:
+        _fail("callbacks", registrar, f"{resource} is held, and its reload has not ended: {life}")
 
 
 def _is_released(world: World, catalog: Catalog, notice: Notice) -> bool:

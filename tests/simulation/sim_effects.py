@@ -4,6 +4,7 @@ are made up.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -165,6 +166,9 @@ def _happened(shell: SimShell, effect: e.Happened) -> None:
 
 
 def _died(shell: SimShell, effect: e.Died) -> None:
+    for text in effect.given_up:
+        if (found := re.search(r"the reload callback for resource ([^;]+);", text)) is not None:
+            shell.world.ledger.given_up_reloads.add((shell.name, found[1]))
     shell.world.note(f"{shell.name}: its last process died in {'; '.join(effect.runs)}")
 
 

@@ -125,7 +125,9 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
             "graph": (
                 "Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz"
             ),
-            "stream": "Show a stream's rate; or read it as one reader more, and show its frames or save one",
+            "stream": (
+                "Show a stream's rate; or read it as one reader more, and show its frames, save one, or record them"
+            ),
         },
         _mailboxes: {
             "mailbox": (
