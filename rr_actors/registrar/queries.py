@@ -56,6 +56,9 @@ class Holder(Protocol):
     def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Release the query, and return when that is done; with ``block=False``, a future of the end at once."""
 
+    async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
+        """Release the query, awaited."""
+
     def fetch_state(self, query_or_id: Query, /) -> str:
         """Return the state of the query's last status, as the registrar has it."""
         ...
@@ -255,7 +258,7 @@ class Query(Generic[Response]):
     async def unload_async(self, *, timeout_s: float | None = 30.0) -> None:
         """Release the query as unload() does, awaited. If it is cancelled, the unload goes on."""
         check_asyncio("unload_async")
-        await self._at_holder().unload(self, timeout_s=timeout_s, block=False)
+        await self._at_holder().unload_async(self, timeout_s=timeout_s)
         self._is_released = True
 
     def fetch_state(self) -> str:

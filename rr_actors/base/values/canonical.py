@@ -93,10 +93,11 @@ class Codec:
         self.type = type_
         wanted = Any if type_ is None else _declared_type(type_)
         self.shape = shape_of(wanted, what)
-        self._gaps = gaps_of(self.shape)
+        parts = [part for _, part in walk(self.shape, "")]
+        self._gaps = gaps_of(parts)
         self._has_class = has_class(self.shape)
-        self._runs_code = runs_code(self.shape)
-        self._takes_any = any(isinstance(part, AnyType) for _, part in walk(self.shape, ""))
+        self._runs_code = runs_code(parts)
+        self._takes_any = any(isinstance(part, AnyType) for part in parts)
         self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=_value_of).decode
         self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=_value_of).decode
 

@@ -231,6 +231,29 @@ class Revoke(Command[c.Done], frozen=True):
         return c.Done(f"revoked {text}", facts)
 
 
+class Reload(Command[c.Done], frozen=True):
+    """Unload a resource and load it again for the same request, in its owner's name; its holders keep it.
+
+    `id` may also be a part of its id, its name, or a query's id.
+    """
+
+    id: c.Text
+    timeout_s: c.Seconds = 30.0
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        resource = _only_resource(self.id, view.find(self.id).resources)
+        holders = resource.held_by or "nobody"
+        more = resource.holder_count - len(resource.holders)
+        text = f"{resource.name} ({short_id(resource.id)}), held by {holders}{f' and {more} more' if more else ''}"
+        facts = {"resource_id": resource.id, "server": resource.server, "holders": resource.holder_count}
+        if self.dry_run:
+            return c.Done(f"would reload {text}", facts)
+        registrar = view.registrar(resource.server.partition("/")[0])
+        registrar.reload(resource.id, timeout_s=self.timeout_s)
+        return c.Done(f"reloaded {text}", facts)
+
+
 def _only_resource(id: str, resources: list[ResourceRow]) -> ResourceRow:
     if len(resources) > 1:
         ids = short_ids(row.id for row in resources)
@@ -316,7 +339,13 @@ class Restart(Command[c.Done], frozen=True):
     dry_run: bool = False
 
     def _carry_out(self, view: View, caller: Caller) -> c.Done:
-        path, supervisor, child = _child(view, self.child)
+        try:
+            path, supervisor, child = _child(view, self.child)
+        except (NotFound, UsageError) as error:
+            if not (found := _resources_of(view, self.child)):
+                raise
+            text = f"{shown(self.child)}: expected a child of the tree, got a resource, {found[0].name}"
+            raise UsageError(f"{text}; `rr-actors reload {found[0].id}` unloads it and loads it again") from error
         spec = supervisor.get_childspec(child.id)
         is_dynamic = supervisor.describe()["strategy"] == "simple_one_for_one"
         if spec.restart == "temporary" or (is_dynamic and child.state != "stopped"):
@@ -328,6 +357,14 @@ class Restart(Command[c.Done], frozen=True):
             supervisor.terminate_child(child.id)
         supervisor.restart_child(child.id)
         return c.Done(f"started {path} again", facts | {"pid": supervisor.which_child(child.id).pid})
+
+
+def _resources_of(view: View, id: str) -> list[ResourceRow]:
+    """Return the resources that an id may mean; none if it is no id of any."""
+    try:
+        return view.find(id).resources
+    except (NotFound, UsageError):
+        return []
 
 
 class StartChild(Command[c.Done], frozen=True):
