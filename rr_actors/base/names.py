@@ -140,14 +140,17 @@ os.register_at_fork(after_in_child=_renew)
 
 # -- as people read them ----------------------------------------------------------------------------------------------
 
-NAME_WIDTH = 60
-"""The most characters of a resource's name in a sentence or a line."""
+NAME_WIDTH, NAME_LIMIT = 60, 500
+"""The most characters of a resource's name in a sentence or a line, and of one that is stored, for people."""
+_SPARED = 15
+"""A name that is longer by so few characters is not shortened: it would lose more than it saves."""
 _SHORT_ID = 8
 
 
 def named(server: str, request: str, width: int = NAME_WIDTH) -> str:
     """Return a resource's name, its server and its request, shortened in the middle: cameras/camera "/dev/video7"."""
-    return in_short(f"{server} {request}".rstrip(), width)
+    whole = f"{server} {request}".rstrip()
+    return whole if len(whole) <= width + _SPARED else in_short(whole, width)
 
 
 def in_short(text: str, width: int) -> str:

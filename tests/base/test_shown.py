@@ -13,6 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import shown
+from rr_actors.base.names import named
 from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model.catalog import Catalog
 
@@ -134,3 +135,10 @@ def test_so_has_one_about_what_is_no_message(sender: str | None) -> None:
     with pytest.raises(TypeError) as caught:
         decide(Catalog("p"), [(HUGE, sender)])
     assert len(str(caught.value)) < LONGEST
+
+
+def test_a_name_is_not_shortened_to_save_a_few_characters() -> None:
+    lease = '{"instrument":"psu","wait_s":30.0,"who":"anna1"}'
+    assert named("leases/lease", lease) == f"leases/lease {lease}"
+    long = named("leases/lease", lease.replace("anna1", "anna" * 10))
+    assert (len(long), long[:13], long[-6:]) == (60, "leases/lease ", 'anna"}')

@@ -349,6 +349,7 @@ def test_resources_are_listed_and_chosen(app: rr.Registrar) -> None:
     assert said("resources", "lamp").splitlines()[1].split()[:2] == ["shop/thing", '{"name":"lamp","parts":[]}']
     (row,) = json.loads(said("resources", "lamp", "--json"))
     assert row["holders"] == [{"query_id": query.id, "origin": "app", "parent": ""}]
+    assert row["request"] == {"name": "lamp", "parts": []}
     assert "1 more" in rr_actors("resources", "--limit", "1").stderr
 
 

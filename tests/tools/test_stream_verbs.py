@@ -118,7 +118,7 @@ def test_streams_lists_what_is_open_and_who_reads_it(
     ran = said("streams")
 
     assert [row["name"] for row in (images, notes)] == ["images", "notes"]
-    assert (images["server"], images["request"]) == ("cameras/camera", '"front"')
+    assert (images["server"], images["request"]) == ("cameras/camera", "front")
     assert images["frames"] >= 6
     assert images["age_s"] >= 0
     (one,) = images["readers"]

@@ -12,7 +12,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 
 import msgspec
 
-from rr_actors.base.names import made_at, short_id
+from rr_actors.base.names import NAME_WIDTH, in_short, made_at, short_id
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.managers.budgets.planner import LEAST, Running
 from rr_actors.managers.budgets.requests import Share, Supply
@@ -36,7 +36,7 @@ class Holding(msgspec.Struct, frozen=True):
     @property
     def name(self) -> str:
         """What a share is for, with its priority, for people."""
-        whose = self.request.whose if isinstance(self.request, Share) else ""
+        whose = in_short(self.request.whose, NAME_WIDTH) if isinstance(self.request, Share) else ""
         name = whose or ", ".join(dict.fromkeys(self.holders)) or "nobody"
         return f"{name} ({'standby' if self.priority is None else f'priority {self.priority}'})"
 

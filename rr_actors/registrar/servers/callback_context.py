@@ -14,7 +14,7 @@ import msgspec
 
 from rr_actors.actors.messaging.ask_cycles import asker
 from rr_actors.base.errors import UsageError
-from rr_actors.base.names import named
+from rr_actors.base.names import NAME_LIMIT, named
 from rr_actors.base.values.canonical import text_of_value
 from rr_actors.registrar.core.callback_runs import running
 from rr_actors.registrar.engine.progress import checked
@@ -57,8 +57,13 @@ class Current(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The resource's name for people, its server and its request, shortened: `cameras/camera "/dev/video7"`."""
-        return named(self._place, text_of_value(self._request)) if self._registrar is not None else ""
+        """The resource's name for people, its server and its request: `cameras/camera "/dev/video7"`.
+
+        It is shortened to 500 characters. "" for a message.
+        """
+        if self._registrar is None:
+            return ""
+        return named(self._place, text_of_value(self._request), NAME_LIMIT)
 
     @property
     def _place(self) -> str:

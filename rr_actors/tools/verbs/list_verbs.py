@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -35,6 +37,7 @@ from rr_actors.tools.verbs.console_options import SHOWN, Limit, Output, RowLimit
 
 app = typer.Typer()
 
+_JSON = {"request", "response"}  # of a row
 _MATCH = "Only those with this text in their id, server, request or status."
 Registrar = Annotated[str, typer.Option(help="Only this one's.", autocompletion=completing(list_registrars))]
 _OPTIONS: dict[str, Any] = {
@@ -116,7 +119,8 @@ def _show(tables: Sequence[Table[Any]], look: Look, limit: int | None, form: str
     with client_of(state) as client:
         parts = [table.read(client, look, most) for table in tables]
     if form == "json":
-        facts = {table.name: [table.facts(row) for row in part.rows] for table, part in zip(tables, parts, strict=True)}
+        read = zip(tables, parts, strict=True)
+        facts = {table.name: [_nested(table.facts(row)) for row in part.rows] for table, part in read}
         say_json(facts if len(tables) > 1 else facts[tables[0].name])
     for table, part in zip(tables, parts, strict=True) if form != "json" else ():
         if form == "name":
@@ -130,6 +134,15 @@ def _show(tables: Sequence[Table[Any]], look: Look, limit: int | None, form: str
             say(f"no {table.name[:-1]} matches" if chosen else table.nothing, err=len(tables) == 1)
     more = sum(part.total - len(part.rows) for part in parts)
     _say_what_is_missing(more, list(dict.fromkeys(note for part in parts for note in part.notes)))
+
+
+def _nested(row: object) -> Any:
+    """Return a row for JSON: its texts that are JSON themselves are nested, those that were cut stay."""
+    found: Any = msgspec.to_builtins(row)
+    for name in _JSON & found.keys():
+        with contextlib.suppress(ValueError):
+            found[name] = json.loads(found[name])
+    return found
 
 
 def say_rows(columns: Sequence[Column[Any]], rows: Sequence[Any], form: str = "") -> None:
@@ -188,7 +201,7 @@ def _show_usages(state: Path | None, match: str, registrar: str, sort_by: str, l
         rows.sort(key=lambda row: row.usage.get(sort_by, -math.inf), reverse=True)
     total, rows = len(rows), rows[: _most(limit, form)]
     if form == "json":
-        say_json([msgspec.structs.asdict(row) for row in rows])
+        say_json([_nested(msgspec.structs.asdict(row)) for row in rows])
     elif form == "name":
         say_lines("\n".join(map(_full_name, rows)))
     elif not rows:
