@@ -77,6 +77,8 @@ class server:  # noqa: N801 - used as a decorator
         health: Health | None = None,
         provides: Labels | None = None,
         at_once: int | None = None,
+        exclusive: bool = False,
+        grace_s: float | None = None,
         cost: Cost | None = None,
         cost_from: str = "budgets",
         request_type: Any = None,
@@ -88,6 +90,7 @@ class server:  # noqa: N801 - used as a decorator
         callbacks, types = (_nothing, None, None, None), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s, health=health)
+        spec = replace(spec, exclusive=exclusive, grace_s=grace_s)
         self._spec = checked_spec(replace(spec, provides=provides, at_once=at_once))
         self._cost = None if cost is None else _Cost(self._spec, cost, check_name(cost_from, "cost_from"))
 

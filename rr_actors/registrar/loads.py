@@ -378,6 +378,7 @@ class Loads:
             self.withdraw(query)
             raise
         finally:
+            self.actor.catalog.wait_limits.pop(query.id, None)
             if starts:
                 self._starting.discard(query.id)
         return query
@@ -407,6 +408,7 @@ class Loads:
             self.withdraw(query)
             raise
         finally:
+            self.actor.catalog.wait_limits.pop(query.id, None)
             if starts:
                 self._starting.discard(query.id)
             if hearer is not None:
@@ -471,6 +473,8 @@ class Loads:
         self.calls.check_open()
         if options.own:
             check_allowed(options.priority, self.actor.config)
+        if options.wait_s is not None:
+            self.actor.catalog.wait_limits[query.id] = round(1000 * options.wait_s)
         if options.on_status is not None:
             self.views.callbacks.set(query.id, described(options.on_status, "load: on_status"), options.loop)
 

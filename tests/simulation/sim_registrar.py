@@ -6,7 +6,7 @@ from typing import Any, cast
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.core import holding, loading
+from rr_actors.registrar.core import holding, loading, notices
 from rr_actors.registrar.core.callback_runs import ATTEMPTS, is_given_up
 from rr_actors.registrar.core.decide import decide, refuse_uncommitted
 from rr_actors.registrar.model import commands as c
@@ -230,7 +230,7 @@ class SimRegistrar(SimShell):
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return loading.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
+        return notices.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
         """As RegistrarState.join, for a direct line."""
@@ -238,7 +238,7 @@ class SimRegistrar(SimShell):
         if query is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return loading.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
+        return notices.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def _joined(self, load: Load, fault: str) -> ServedQuery | None:
         """The row, on disk; None if it is to be decided as any load."""

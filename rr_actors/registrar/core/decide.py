@@ -15,12 +15,14 @@ from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
     callback_runs,
     holding,
+    lines,
     loading,
     notices,
     priorities,
     reconciliation,
     recovery,
     releasing,
+    rings,
     status_changes,
     status_delivery,
     unloading,
@@ -59,7 +61,8 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
             receive_from(decision, sender, item)
         else:
             raise TypeError(f"{catalog.name}: not a message for a registrar: {shown(item)}")
-    if catalog.touched:
+    while catalog.touched or catalog.stirred:
+        lines.arrange(decision)
         for resource_id in list(catalog.touched):
             unloading.balance(decision, resource_id)
         priorities.settle(decision)
@@ -97,7 +100,8 @@ _MESSAGES: dict[type[Any], Callable[[Decision, Any], None]] = {
     m.UnloadRefused: holding.unload_refused,
     m.NoticesHandled: notices.notices_handled,
     m.Fetch: reconciliation.fetch,
-    m.Probe: loading.probe,
+    m.Probe: rings.probe,
+    m.Awaited: rings.awaited,
     m.Gone: unloading.gone,
     m.Reprioritise: priorities.reprioritise,
     m.Reprioritised: priorities.reprioritised,
@@ -144,6 +148,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.BeginTrial: recovery.begin_trial,
     c.TrialOver: recovery.trial_over,
     c.RefusalOver: callback_runs.refusal_over,
+    c.WaitOver: lines.wait_over,
     c.LingerOver: unloading.linger_over,
     c.SetStatus: status_changes.set_status,
     c.SetResponse: status_changes.set_response,

@@ -32,10 +32,9 @@ from rr_actors.registrar.core.callback_runs import (
     run_id,
     running,
     start_load,
-    start_queued,
 )
-from rr_actors.registrar.core.loading import load, loaded
-from rr_actors.registrar.core.notices import refuse_all
+from rr_actors.registrar.core.loading import load
+from rr_actors.registrar.core.notices import loaded, refuse_all
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.core.status_changes import is_busy, limit_grace, spread, start_own
@@ -212,7 +211,7 @@ def _move_again(decision: Decision, resource: Resource) -> None:
         case Phase.LOADING:
             start_load(decision, resource)
         case Phase.QUEUED:
-            start_queued(decision, resource)
+            decision.catalog.stir(resource)
         case _:
             run_unload(decision, resource)
 
@@ -241,6 +240,7 @@ def begin_serving(decision: Decision, command: BeginServing) -> None:
         _begin_early(decision, resource_id, command.event)
     for name in catalog.servers:
         start_own(decision, name)
+    catalog.stirred.update(dict.fromkeys(catalog.queued, True))
 
 
 def begin_early(decision: Decision, item: object) -> None:
@@ -620,6 +620,8 @@ def _go_on(decision: Decision, resource_id: str) -> None:
     server = catalog.servers.get(resource.server)
     if server is not None and server.recover_timeout_s is not None:
         decision.cause(SetTimer("recover:" + resource_id, None, None))
+    if catalog.queued:
+        catalog.stir(resource)
     if condemned(decision, resource):
         begin_unload(decision, resource)
     for message in parked:

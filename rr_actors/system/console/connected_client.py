@@ -213,7 +213,7 @@ class _ClientLoads(RemoteLoads):
 
     def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
         client, limit_s = self._client, _limit(options.timeout_s)
-        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority)
+        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority, options.wait_s and _limit(options.wait_s))
         query: ClientQuery | None = None
         try:
             # If the connection ends before keep(), the system releases the query.

@@ -463,10 +463,12 @@ class Hold(Command[c.Holding], frozen=True):
     request: c.Value
     timeout_s: c.Seconds = 30.0
     priority: c.Priority = 0
+    wait_s: c.Seconds | None = None
 
     def _carry_out(self, view: View, caller: Caller) -> c.Holding:
         client = view.clients.named(self.registrar)
-        registrar, options = client.registrar, LoadOptions(on_status=client.hear, priority=self.priority, own=True)
+        registrar = client.registrar
+        options = LoadOptions(on_status=client.hear, priority=self.priority, own=True, wait_s=self.wait_s)
         query = load_bytes(registrar, self.server, self.request, "", options, timeout_s=self.timeout_s)
         response = response_bytes(query)
         if len(response) > c.RESPONSE_LIMIT_BYTES:
