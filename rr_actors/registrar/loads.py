@@ -631,7 +631,7 @@ def _rank(options: LoadOptions) -> int:
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
     """Return the failure of a load that has taken too long. Its text says what the provider seems to be doing."""
     server = f"{query.registrar}/{query.server}"
-    status, doing = _doing(actor, query.registrar, "load callback, or the unload callback before it,")
+    status, doing = _doing(actor, query.registrar, "load callback, or an unload for which it waits,")
     text = f"{server}: not loaded within {timeout_s:g} s; {query.registrar} is {doing}; the load is withdrawn"
     return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
 

@@ -98,8 +98,8 @@ class ResourceRow(msgspec.Struct, frozen=True):
         server: "registrar/server".
         request, response: as JSON, cut if it is long. What JSON does not have is shown as in Python.
         phase: "queued", "loading", "loaded", "unloading", "unload_failed", "pausing", "paused" or "resuming".
-        state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening");
-            if it could not be unloaded, the reason.
+        state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening"),
+            and while it is queued, its place in line; if it could not be unloaded, the reason.
         holders: the first 20 queries on it; `holder_count`: how many there are.
         parts: the ids of the first 20 queries that it depends on; `part_count`: how many there are.
         part_resources: the ids of the resources that those are on, of those that are loaded.
@@ -524,7 +524,7 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
     for row, others in zip(resources, neighbours, strict=True):
         state = str(row.state) if row.phase is Phase.LOADED else ""
         message = row.message
-        if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
+        if row.phase in (Phase.LOADING, Phase.QUEUED) and (progress := actor.progress.newest(row.id)) is not None:
             message = shown_progress(*progress)
         elif row.server not in actor.catalog.servers:
             message = failures.waits_for_server(actor.catalog, row)

@@ -14,6 +14,7 @@ from simulation.__main__ import main
 from simulation.process_faults import (
     AT_ONCE_FIRST,
     BRIEF_FIRST,
+    EXCLUSIVE_FIRST,
     FIRST,
     HASTY_FIRST,
     IDLE_FIRST,
@@ -96,7 +97,7 @@ def assert_kept(outcome: Outcome) -> None:
 
 FIRSTS = (
     *(IDLE_FIRST, REVOKE_FIRST, RANK_FIRST, LIVES_FIRST, PARTS_FIRST, SWAP_FIRST, SAY_FIRST, HASTY_FIRST, TELL_FIRST),
-    *(AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST),
+    *(AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST, EXCLUSIVE_FIRST),
 )
 
 

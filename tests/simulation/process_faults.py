@@ -37,7 +37,9 @@ RANK_FIRST = 2**50
 REVOKE_FIRST = 2**51
 """From here on, owners revoke resources."""
 IDLE_FIRST = 2**52
-"""From here on, servers pause what idles; fresh seeds are from here."""
+"""From here on, servers pause what idles."""
+EXCLUSIVE_FIRST = 2**53
+"""From here on, some servers are exclusive, and some loads wait in line only for a while; fresh seeds are from here."""
 PRIORITIES = (STANDBY, -3, 0, 0, 4, 9)
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 

@@ -46,6 +46,7 @@ def _unload_resolved(shell: SimShell, effect: e.UnloadResolved) -> None:
 
 
 def _load_resolved(shell: SimShell, effect: e.LoadResolved) -> None:
+    shell.catalog.wait_limits.pop(effect.held.id, None)
     if effect.failure is not None:
         shell.world.leave_line(effect.held.id)  # which is cut
     if not shell.world.has_line(effect.held.id):  # else its thread waits for the line's own answer
@@ -169,6 +170,10 @@ def _ring_broken(shell: SimShell, effect: e.RingBroken) -> None:
     shell.world.note(f"{shell.name}: {effect.why}")
 
 
+def _in_line(shell: SimShell, effect: e.InLine) -> None:
+    shell.world.note(f"{shell.name}: {effect.resource_id} is {effect.text or 'in line no more'}")
+
+
 ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.SendReply: _reply,
     e.SendRequest: _request,
@@ -185,4 +190,5 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.Died: _died,
     e.Acquitted: _acquitted,
     e.RingBroken: _ring_broken,
+    e.InLine: _in_line,
 }

@@ -100,6 +100,7 @@ class SimRegistrar(SimShell):
             decision.undo()
             raise
         decision.close()
+        self._check_alone()
         if fault == "after":
             raise Killed
         self.effects.extend(decision.effects)
@@ -107,6 +108,18 @@ class SimRegistrar(SimShell):
             self.act()
         if fault == "during":
             raise Killed
+
+    def _check_alone(self) -> None:
+        """Of a request of an exclusive server, one resource has a holder, and this has one; the others wait."""
+        catalog = self.catalog
+        for server in (server for server in catalog.servers.values() if server.exclusive):
+            had: dict[bytes, list[str]] = {}
+            for id in catalog.by_server.get(server.name, ()):
+                resource = catalog.resources[id]
+                if resource.phase not in (Phase.QUEUED, Phase.UNLOADING, Phase.UNLOAD_FAILED):  # these are released
+                    had.setdefault(resource.request, []).extend(catalog.holders.get(id, ()))
+            if crowd := [ids for ids in had.values() if len(ids) > 1]:
+                raise Violation("two holders", f"{self.name}/{server.name} is held by {crowd[0]} at the same time")
 
     def act(self) -> None:
         """Do what has been decided, in the order of the decisions."""

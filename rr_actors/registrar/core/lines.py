@@ -18,7 +18,7 @@ from rr_actors.registrar.core.notices import drop_resource, end_wait, loaded, re
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.rings import look_for_ring
 from rr_actors.registrar.core.status_changes import begin_revocation, is_revocable
-from rr_actors.registrar.core.unloading import condemned, unheld
+from rr_actors.registrar.core.unloading import begin_unload, condemned, unheld
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, RequestKey, Server
 from rr_actors.registrar.model.commands import WaitOver
@@ -27,6 +27,7 @@ from rr_actors.registrar.model.messages import NO_LIMIT, Load
 from rr_actors.registrar.model.rows import (
     LOADED,
     LOADING,
+    PAUSED,
     QUEUED,
     RESTING,
     STANDBY,
@@ -125,9 +126,11 @@ def line_of(catalog: Catalog, key: RequestKey) -> list[Resource]:
 
 
 def _in_use(catalog: Catalog, key: RequestKey) -> list[Resource]:
-    """Return the resources of a request that keep others waiting."""
-    used = catalog.used(key)
-    return [one for one in used if one.phase is not UNLOAD_FAILED or one.id in catalog.holders]
+    """Return the resources of a request that keep others waiting.
+
+    One that could not be unloaded does not: whoever has it has released it, and could do so for ever.
+    """
+    return [resource for resource in catalog.used(key) if resource.phase is not UNLOAD_FAILED]
 
 
 def _is_free(catalog: Catalog, resource: Resource) -> bool:
@@ -147,6 +150,12 @@ def _give(decision: Decision, first: Resource) -> bool:
     kept = catalog.by_request.get(first.server, {}).get(first.request)
     if kept is not None and condemned(decision, catalog.resources[kept]):
         return False
+    if kept is not None and _is_spoken_of(catalog, first):
+        if kept not in catalog.holders:
+            if catalog.resources[kept].phase in (LOADED, PAUSED):  # else the end of its callback does so
+                begin_unload(decision, catalog.resources[kept])
+            return False
+        kept = None  # its server is not exclusive
     if kept is not None:
         _hand_over(decision, first, catalog.resources[kept])
         return True
@@ -155,6 +164,12 @@ def _give(decision: Decision, first: Resource) -> bool:
     end_wait(decision, first)
     start_load(decision, resource)
     return True
+
+
+def _is_spoken_of(catalog: Catalog, first: Resource) -> bool:
+    """Return whether a status of the queued resource itself is on its way to those who wait for it."""
+    said = first.state is not State.OK or first.id in catalog.own_notices
+    return said or any(id in catalog.notices_on for id in catalog.holders.get(first.id, ()))
 
 
 def _hand_over(decision: Decision, first: Resource, resource: Resource) -> None:
@@ -180,7 +195,7 @@ def _take_from(decision: Decision, server: Server, resource: Resource, first: Re
     """Revoke a resource whose holder needs it less than the first in line does."""
     catalog = decision.catalog
     priority, had = catalog.priority_of(first.id), catalog.priority_of(resource.id)
-    if had >= priority or resource.phase is UNLOAD_FAILED or not is_revocable(catalog, resource):
+    if had >= priority or not is_revocable(catalog, resource):
         return
     if resource.id in catalog.revocations or condemned(decision, resource) or "" in catalog.early:
         return
@@ -238,4 +253,4 @@ def _busy(catalog: Catalog, key: RequestKey, own: Resource | None = None) -> fai
     used = _in_use(catalog, key)
     holders = [query for resource in used for query in catalog.queries_of(resource.id)]
     others = [resource for resource in line_of(catalog, key) if resource is not own]
-    return failures.busy(catalog, key[0], holders[0] if holders else None, len(others))
+    return failures.busy(catalog, *key, holders[0] if holders else None, len(others))

@@ -54,8 +54,8 @@ class Progress(msgspec.Struct, frozen=True):
 
 
 def shown_progress(fraction: float, text: str) -> str:
-    """Return a report as text for people: "50% opening"."""
-    return f"{fraction:.0%} {text}".rstrip()
+    """Return a report as text for people: "50% opening"; while nothing is done, the text alone."""
+    return f"{fraction:.0%} {text}".rstrip() if fraction or not text else text
 
 
 def checked(fraction: object, text: object) -> tuple[float, str]:

@@ -157,7 +157,7 @@ def load_failed(catalog: Catalog, resource: Resource, why: str, **details: float
     return Failure("LoadFailed", f"{origin}: {why}", {"server": origin, **details}, [(origin, why)])
 
 
-def busy(catalog: Catalog, server: str, has: ServedQuery | None, waiting: int) -> Failure:
+def busy(catalog: Catalog, server: str, request: bytes, has: ServedQuery | None, waiting: int) -> Failure:
     """Return the failure of a load that may not wait (longer) for an exclusive resource.
 
     Args:
@@ -169,9 +169,8 @@ def busy(catalog: Catalog, server: str, has: ServedQuery | None, waiting: int) -
     asked = "" if since is None else f" (asked for it {time.strftime('%H:%M:%S', time.localtime(since))})"
     who = f"{holder} has it{asked}" if holder else "it is being unloaded"
     others = "" if not waiting else f", and {waiting} {'waits' if waiting == 1 else 'wait'} for it"
-    text = (
-        f"{origin}: expected to have it alone within wait_s; {who}{others}: give a longer wait_s or a higher priority"
-    )
+    what = f"{origin} with {shown(shown_plain(request))}"
+    text = f"{what}: {who}{others}; give a longer wait_s, or a higher priority"
     details = {"server": origin, "holder": holder, "since": since, "waiting": waiting}
     return Failure("ResourceBusy", text, details, [(origin, f"{who}{others}")])
 
