@@ -241,6 +241,10 @@ class Declared(Generic[Request, Returned, Response]):
         """Return the id of the child whose pools its resources hold amounts of; "" if they cost nothing."""
         return "" if self._cost is None else self._cost.budgets
 
+    def _callbacks(self) -> set[str]:
+        """Return the names of the methods that are its callbacks."""
+        return {self._load.__name__, *(callback.__name__ for callback in self._others.values())}
+
     def _declaring(self) -> Declaring:
         """Return which class declares the server.
 
@@ -284,6 +288,7 @@ class Declaring(NamedTuple):
 # For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
 declaring = Declared[Any, Any, Any]._declaring  # pyright: ignore[reportPrivateUsage]
+callbacks_of = Declared[Any, Any, Any]._callbacks  # pyright: ignore[reportPrivateUsage]
 cost_from = Declared[Any, Any, Any]._cost_from  # pyright: ignore[reportPrivateUsage]
 
 

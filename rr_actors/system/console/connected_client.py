@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_EXCEPTION, wait
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import NotRunning, NotSerializable, RrError, Unavailable, UnknownQuery, UsageError, is_a
 from rr_actors.base.names import ServerId, parse_server_id
 from rr_actors.base.reporting.log import Log
@@ -40,6 +40,7 @@ from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, Remot
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.client_proxies import GRACE_S, ClientProxy, in_thread
 from rr_actors.system.console.client_queries import ClientQuery, ClientViews, SystemConnections, listen
 from rr_actors.system.console.console_client import find_console
 from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, OpenRegistrar, Release
@@ -50,7 +51,6 @@ T = TypeVar("T")
 
 logger = Log("rr_actors")
 
-_GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
 _RETRY_S = 0.05  # between two looks for a system that is awaited
 
 
@@ -111,7 +111,16 @@ class Client:
         """
         limit_s = _limit(timeout_s)
         command = AskActor(actor, _encoded(message, f"message to {actor}"), limit_s)
-        return Codec(None, "answer").show(self._connections.ask(command, limit_s + _GRACE_S).answer)
+        return Codec(None, "answer").show(self._connections.ask(command, limit_s + GRACE_S).answer)
+
+    def proxy(self, actor: str, *, timeout_s: float | None = 30.0) -> ClientProxy:
+        """Return an object whose methods are those of an actor of the system; each call returns a future.
+
+        Args:
+            actor: its id or its path, as for System.ref().
+            timeout_s: how long each call may take. None: a day.
+        """
+        return ClientProxy(self._connections, actor, _limit(timeout_s))
 
     def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
         """Have the system back itself up to a directory of its machine, as System.backup() does, with its errors."""
@@ -164,7 +173,7 @@ class _ClientCalls(RemoteCalls):
         _refuse(self.name, "force", options.get("force", False))
         limit_s = _limit(options["timeout_s"])
         query_id, server = ("", *args, "")[:2] if method == "unload_client" else ("".join(args), "")
-        self.connections.ask(Release(self.name, query_id, server, limit_s), limit_s + _GRACE_S)
+        self.connections.ask(Release(self.name, query_id, server, limit_s), limit_s + GRACE_S)
         self.views.forget(query_id, server)
 
     def all_streams(self, query: Query[Any]) -> Callable[[], bool]:
@@ -213,12 +222,13 @@ class _ClientLoads(RemoteLoads):
 
     def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
         client, limit_s = self._client, _limit(options.timeout_s)
-        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority, options.wait_s and _limit(options.wait_s))
+        wait_s = None if options.wait_s is None else _limit(options.wait_s)
+        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority, wait_s)
         query: ClientQuery | None = None
         try:
             # If the connection ends before keep(), the system releases the query.
             with client.views.loading(), client.connections.lent() as connection:
-                held = connection.ask(command, limit_s + _GRACE_S)
+                held = connection.ask(command, limit_s + GRACE_S)
                 place = held.query_id, target, request, "", client.name, self.holder
                 query = ClientQuery(*place, _shown_types, client.all_streams)
                 if options.codec is not None:
@@ -253,18 +263,6 @@ class _ClientLoads(RemoteLoads):
                 else:
                     one.add_done_callback(self.release_later)
             raise
-
-
-def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
-    """Have a new thread make a call, and set the reply. The application's executor may be full of other calls."""
-
-    def make() -> None:
-        try:
-            reply.set(call())
-        except BaseException as error:  # it is for the thread that reads the reply
-            fail(reply, error)
-
-    threading.Thread(target=make, name="rr-client", daemon=True).start()
 
 
 class ClientRegistrar(Consumer):

@@ -10,18 +10,7 @@ import msgspec
 
 from rr_actors.actors.mailbox_refs import MailboxRef
 from rr_actors.actors.messaging.mailbox_looks import MailboxInfo
-from rr_actors.base.errors import (
-    ActorUnavailable,
-    NotFound,
-    NotSerializable,
-    RrError,
-    Unavailable,
-    UnknownQuery,
-    UsageError,
-    few,
-    shown,
-    text_of,
-)
+from rr_actors.base.errors import ActorUnavailable, NotFound, NotSerializable, UnknownQuery, UsageError, few, shown
 from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id, short_ids
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.values.failure import error_of
@@ -35,6 +24,7 @@ from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.runtime.processes.process import signal_name
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
+from rr_actors.system.console import actor_calls
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_view import REGISTRAR, Command, View
@@ -516,16 +506,25 @@ class AskActor(Command[c.Replied], frozen=True):
 
     def _carry_out(self, view: View, caller: Caller) -> c.Replied:
         message = _message.decode(self.message, self.actor, "message")
-        reply = view.system.ref(self.actor).ask(message, block=False)
-        try:
-            error = reply.exception(self.timeout_s)
-        except TimeoutError as late:
-            reply.cancel()
-            text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
-            raise Unavailable(text) from late
-        if error is not None and not isinstance(error, RrError):  # raised by the actor's handler
-            raise RrError(f"{self.actor}: {text_of(error)}") from error
-        return c.Replied(encode(reply.get(), f"answer of {self.actor}"))
+        answer = actor_calls.ask(self.actor, view.system.ref(self.actor), message, self.timeout_s)
+        return c.Replied(encode(answer, f"answer of {self.actor}"))
+
+
+class CallActor(Command[c.Replied], frozen=True):
+    """Call a method of an actor of the tree, by its path or id.
+
+    Attributes:
+        given: a list of the arguments and a dict of those by keyword, plain data, as canonical bytes.
+    """
+
+    actor: c.Text
+    method: c.Text
+    given: c.Value
+    timeout_s: c.Seconds = 30.0
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Replied:
+        ref = view.system.ref(self.actor)
+        return c.Replied(actor_calls.call(self.actor, ref, self.method, self.given, self.timeout_s))
 
 
 _message = Codec(None, "message")

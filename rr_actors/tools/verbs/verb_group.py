@@ -172,6 +172,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
     },
     "Run, change and stop it": {
         _console: {
+            "call": (
+                "Call a method of an actor with plain data, and show its answer; without METHOD, show which "
+                "methods there are"
+            ),
             "kill": "Send a signal to a child's process; if the child ends, its supervisor handles that as any end",
             "terminate": "Stop a child in order",
             "restart": "Start a child again",
