@@ -211,7 +211,8 @@ def checked(
     """
     options = cast("LoadKeywords", given)  # this call's own dict
     for name in options.keys() - names.__annotations__.keys():
-        raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}")
+        hint = did_you_mean(name, names.__annotations__)
+        raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}{hint}")
     if "timeout_s" in options:
         options["timeout_s"] = time_limit(options["timeout_s"])
     if "wait_s" in options:

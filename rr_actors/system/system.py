@@ -77,7 +77,9 @@ from rr_actors.supervision.import_guard import check_children_can_import, check_
 from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of, renamed_managers
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system.backups import Backup, back_up, restore
+from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_server import Console
+from rr_actors.system.console.waiting import waited_for
 from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.recording.event_memory import EventMemory
@@ -703,6 +705,35 @@ class System:
                 raise
             raise NotFound(f"{error}; did you mean {' or '.join(map(repr, meant))}?", id=id) from error
         return ref_to(f"{supervisor.path}/{child_id}")
+
+    def wait_for(self, id: str, state: str = "", *, timeout_s: float | None = 30.0) -> str:
+        """Wait until a child or a resource is in a state, and return the state. `rr-actors wait` does the same.
+
+        Args:
+            id: a child's id or path; or a resource's name, such as 'cameras/camera "front"', or its id.
+            state: of a child "running", "starting", "restarting" or "stopped"; of a resource its phase, such as
+                "loaded" or "paused", or its state, such as "OK" or "FATAL"; or "gone". Default: the child runs, or the
+                resource is loaded.
+
+        Raises:
+            Unavailable: it was not in time; the text has the state that was seen last.
+            NotRunning: the system has ended.
+            UsageError: there is no such state, several children or resources have this name, or the system has no
+                console (SystemConfig.console).
+        """
+        self._running()
+        check_may_block("System.wait_for()")
+        if not self.config.console:
+            raise UsageError("wait_for: expected a system with a console, got SystemConfig(console=False)")
+
+        def is_so(seen: str) -> bool:
+            """Return whether a child that its supervisor calls running answers: it may not know of a kill yet."""
+            if seen == "running":
+                with contextlib.suppress(NotFound):  # a supervisor
+                    return self.ref(id).is_alive()
+            return True
+
+        return waited_for(lambda: ConsoleClient(find_console(self.state_dir)), id, state, timeout_s, is_so)
 
     def supervisor(self, path: str | None = None) -> SupervisorRef:
         """Return a supervisor by its path of ids, "root/inner" or "inner"; without a path, the root supervisor.

@@ -46,6 +46,7 @@ from rr_actors.system.console.console_client import find_console
 from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, OpenRegistrar, Release
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
 from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
+from rr_actors.system.console.waiting import waited_for
 
 T = TypeVar("T")
 
@@ -121,6 +122,10 @@ class Client:
             timeout_s: how long each call may take. None: a day.
         """
         return ClientProxy(self._connections, actor, _limit(timeout_s))
+
+    def wait_for(self, id: str, state: str = "", *, timeout_s: float | None = 30.0) -> str:
+        """Wait until a child or a resource is in a state, as System.wait_for() does, with its errors."""
+        return waited_for(self._connections.open, id, state, timeout_s)
 
     def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
         """Have the system back itself up to a directory of its machine, as System.backup() does, with its errors."""
