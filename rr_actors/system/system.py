@@ -94,6 +94,7 @@ from rr_actors.system.registrar_lookup import (
     registrar_in,
     take_over,
 )
+from rr_actors.system.service_notices import ServiceNotices
 from rr_actors.system.snapshots import (
     ask_registrars,
     describe_at,
@@ -194,6 +195,7 @@ class System:
         self._ended = Flag()
         self._end: ExitReport | None = None
         self._why_stopped = _NOT_RUNNING
+        self._service: ServiceNotices | None = None
 
     # -- life ----------------------------------------------------------------------------------------------------
 
@@ -331,6 +333,8 @@ class System:
                 await self._console.open()
             self._tree = prepare(node, SupervisorActor, self._top, weakly(self._tree_ended))
             await self._start_tree(self._tree)
+            self._service = ServiceNotices(node.dispatcher.loop)
+            self._service.started(f"system {self.name} runs in {info.state_dir}")
         except BaseException:
             console, self._console, self._tree = self._console, None, None
             try:
@@ -416,6 +420,9 @@ class System:
         console, self._console = self._console, None
         if console is not None:
             console.stopping = True
+        service, self._service = self._service, None
+        if service is not None:
+            service.stopping()
         self._winding = asyncio.ensure_future(self._wind_up(node, limit_s, steps))
         if self._hurries:
             self._hurry()
@@ -426,6 +433,8 @@ class System:
             raise
         finally:
             self._winding = None
+            if service is not None:
+                service.close()
             if console is not None:
                 await steps.take_async("closing the console", console.close())
             await steps.take_async("closing the process's part of it", node.close())
@@ -599,6 +608,8 @@ class System:
             except (RrError, OSError) as error:  # a full disk: they wait for their time limits
                 logger.warning("system %s: the end of its tree could not be marked: %s", self.name, error)
         logger.error("system %s: its root supervisor has ended: %s", self.name, why)
+        if self._service is not None:
+            self._service.ended(why)
         if self._node is not None:
             self._node.emit("ended", path=self._top, reason=report.reason, detail=report.detail)
         self._ended.set()
@@ -951,6 +962,8 @@ class System:
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
+        if event["event"] == "restarted" and self._service is not None:
+            self._service.restarted(event["path"])
         if event.pop("kept", False) or "path" in event:
             self._memory.take(event)
         if self._subscribers.listened:
