@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +16,8 @@ from pathlib import Path
 import pytest
 
 import rr_actors as rr
-from support import TEST_PATHS
+from rr_actors.base.checks import EXTRAS, missing_library
+from support import REPOSITORY, TEST_PATHS
 from support_cli import run_cli
 
 Start = Callable[..., rr.System]
@@ -166,3 +169,17 @@ def test_what_is_no_tree_says_what_was_expected(project: Path, tree: str, says: 
 
 def test_verify_takes_what_run_takes(project: Path) -> None:
     assert run_cli("verify", f"{project}/parts_beside.py:CHILDREN").returncode == 0
+
+
+def test_the_advice_for_a_missing_library_names_what_the_extra_installs() -> None:
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+    def all_of(extra: str) -> set[str]:
+        nested = {name for text in extras[extra] for name in re.findall(r"^rr-actors\[(.+)\]$", text)}
+        plain = {text for text in extras[extra] if not text.startswith("rr-actors")}
+        return plain.union(*(all_of(name) for name in nested))
+
+    assert {extra: set(names) for extra, names in EXTRAS.items()} == {extra: all_of(extra) for extra in EXTRAS}
+    error = missing_library("textual", "top", "top")
+    assert "pip install 'rich>=" in str(error)
+    assert "rr-actors[" not in str(error)

@@ -151,9 +151,12 @@ class Actions(Manager):
     _side_by_side = True
 
     def __init__(
-        self, actions: Sequence[type[Action]] = (), graphs: str | os.PathLike[str] | None = None, stop_s: float = 5.0
+        self,
+        actions: Sequence[type[Action] | str] = (),
+        graphs: str | os.PathLike[str] | None = None,
+        stop_s: float = 5.0,
     ) -> None:
-        """Take the classes of actions, and a folder with graphs in ``*.json`` files.
+        """Take the classes of actions, or their names as "module:class", and a folder with graphs in ``*.json`` files.
 
         Args:
             stop_s: seconds that actions have to end when their graph is released.
@@ -213,7 +216,7 @@ class Actions(Manager):
     def on_receive(self, message: Any) -> None:
         """Do what `rr-actors graph change` asks."""
         match message:
-            case {"change_graph": str(graph), "new": dict(), "start": str(start), "file": str(file)}:
+            case {"change_graph": str(graph), "new": dict() | str(), "start": str(start), "file": str(file)}:
                 self.change_graph(graph, message["new"], start, file)
             case _:
                 raise UsageError(f"{self.registrar.name}: expected a message to Actions, got {shown(message)}")

@@ -150,9 +150,12 @@ def _line(entry: Entry) -> str:
 def graph(
     what: Annotated[
         Literal["check", "show", "run", "change"] | None,
-        typer.Argument(help="Without it the system is drawn. With it, FILE.json is a graph of actions."),
+        typer.Argument(help="Without it the system is drawn. With it, GRAPH is a graph of actions."),
     ] = None,
-    file: Annotated[Path | None, typer.Argument(metavar="[FILE.json]")] = None,
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[GRAPH]", help="A JSON file; of run and change also a name in the manager's folder."),
+    ] = None,
     id: Annotated[str, typer.Argument(metavar="[ID]", help="Of `change`: the resource of a graph that runs.")] = "",
     format: Annotated[
         Literal["mermaid", "dot", "svg", "png"],
@@ -167,8 +170,8 @@ def graph(
 ) -> None:
     """Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz.
 
-    With `check`, `show` or `run` and FILE.json: check a graph of actions, draw it, or have the child `actions` run it.
-    With `change`, FILE.json and ID: have a graph that runs go on as the one in the file.
+    With `check`, `show` or `run` and GRAPH: check a graph of actions, draw it, or have the child `actions` run it. With
+    `change`, GRAPH and ID: have a graph that runs go on as another one.
     """
     if format == "png" and sys.stdout.isatty():
         raise UsageError("--format png: expected a file, got a terminal: rr-actors graph --format png > graph.png")
