@@ -121,7 +121,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
             ),
         },
         _recording: {
-            "logs": "Show the last log lines of a child, also of the processes that it had before",
+            "logs": (
+                "Show the last log lines of a child, also of the processes that it had before; or the output of a "
+                "program"
+            ),
             "graph": (
                 "Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz"
             ),
