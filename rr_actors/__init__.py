@@ -95,7 +95,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.supervision.core.rendering import Tree, render
         from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
         from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
-        from rr_actors.system.console.client_proxies import ClientProxy
+        from rr_actors.system.console.asking.client_proxies import ClientProxy
         from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
         from rr_actors.system.event_subscribers import (
             ChildEvent,
@@ -259,7 +259,7 @@ if not TYPE_CHECKING:
         "rr_actors.supervision.core.rendering": "Tree render",
         "rr_actors.supervision.core.specs": "Backoff ChildSpec Supervisor",
         "rr_actors.supervision.supervisor": "Child Counts SupervisorRef",
-        "rr_actors.system.console.client_proxies": "ClientProxy",
+        "rr_actors.system.console.asking.client_proxies": "ClientProxy",
         "rr_actors.system.console.connected_client": "Client ClientQuery ClientRegistrar connect",
         "rr_actors.system.event_subscribers": (
             "ChildEvent DeadLetterEvent EndedEvent Event MissedEvent ProgressEvent ResourceEvent StreamEvent"

@@ -33,7 +33,7 @@ from rr_actors.managers.program_conditions import (
     probe_agrees,
     what_is_missing,
 )
-from rr_actors.managers.program_output import OutputLog
+from rr_actors.managers.program_directory import OutputLog
 from rr_actors.registrar.declarations import costing, server
 from rr_actors.registrar.engine.server import ServerSpec, checked_spec, checked_whole
 from rr_actors.registrar.manager import Manager

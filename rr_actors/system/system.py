@@ -77,9 +77,9 @@ from rr_actors.supervision.import_guard import check_children_can_import, check_
 from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of, renamed_managers
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system.backups import Backup, back_up, restore
+from rr_actors.system.console.asking.waiting import waited_for
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_server import Console
-from rr_actors.system.console.waiting import waited_for
 from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.recording.event_memory import EventMemory

@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Programs, Ready, RunProgram
-from rr_actors.managers.program_output import OutputLog
+from rr_actors.managers.program_directory import OutputLog
 from support import TEST_PATHS, eventually
 from support_cli import run_cli
 

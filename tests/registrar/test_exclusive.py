@@ -112,7 +112,7 @@ def test_a_load_that_may_not_wait_says_who_has_it_since_when(system: rr.System, 
     with anna.load(Scopes.open_scope, "bench"):
         waits = cara.load(Scopes.open_scope, "bench", block=False)
         assert eventually(lambda: _count(system) == 2)
-        says = r"^scopes/scope with 'bench': anna has it .* 1 waits for it; "
+        says = r"^scopes/scope with 'bench': anna has it, and 1 waits for it; "
         with pytest.raises(rr.ResourceBusy, match=says) as info:
             ben.load(Scopes.open_scope, "bench", wait_s=wait_s)
         busy = info.value

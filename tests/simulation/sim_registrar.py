@@ -6,9 +6,10 @@ from typing import Any, cast
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.core import holding, loading, notices
+from rr_actors.registrar.core import holding, notices
 from rr_actors.registrar.core.callback_runs import ATTEMPTS, is_given_up
 from rr_actors.registrar.core.decide import decide, refuse_uncommitted
+from rr_actors.registrar.core.loads import loading
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.effects import Happened, SendReply

@@ -15,18 +15,16 @@ from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
     callback_runs,
     holding,
-    lines,
-    loading,
     notices,
     priorities,
     reconciliation,
     recovery,
     releasing,
-    rings,
     status_changes,
     status_delivery,
     unloading,
 )
+from rr_actors.registrar.core.loads import lines, load_rings, loading
 from rr_actors.registrar.core.notices import refuse
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import messages as m
@@ -62,7 +60,8 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
         else:
             raise TypeError(f"{catalog.name}: not a message for a registrar: {shown(item)}")
     while catalog.touched or catalog.stirred:
-        lines.arrange(decision)
+        if catalog.stirred:
+            lines.arrange(decision)
         for resource_id in list(catalog.touched):
             unloading.balance(decision, resource_id)
         priorities.settle(decision)
@@ -100,8 +99,8 @@ _MESSAGES: dict[type[Any], Callable[[Decision, Any], None]] = {
     m.UnloadRefused: holding.unload_refused,
     m.NoticesHandled: notices.notices_handled,
     m.Fetch: reconciliation.fetch,
-    m.Probe: rings.probe,
-    m.Awaited: rings.awaited,
+    m.Probe: load_rings.probe,
+    m.WaitedFor: load_rings.awaited,
     m.Gone: unloading.gone,
     m.Reprioritise: priorities.reprioritise,
     m.Reprioritised: priorities.reprioritised,

@@ -33,7 +33,7 @@ from rr_actors.registrar.core.callback_runs import (
     running,
     start_load,
 )
-from rr_actors.registrar.core.loading import load
+from rr_actors.registrar.core.loads.loading import load
 from rr_actors.registrar.core.notices import loaded, refuse_all
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts

@@ -278,7 +278,7 @@ def run_unload(decision: Decision, resource: Resource) -> None:
 
 
 def unload_ended(decision: Decision, ended: CallbackEnded) -> None:
-    """Remove the resource, release its parts, and answer all that wait. The next in line begins (core/lines.py).
+    """Remove the resource, release its parts, and answer all that wait. The next in line begins (core/loads/lines.py).
 
     If the callback raised, the resource may still be running: it is kept as unload_failed, and the Unloads that wait
     are refused.

@@ -26,7 +26,7 @@ from rr_actors.base.errors import CatalogError, RegistrarDown, RrError
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.callback_runs import is_unwanted
 from rr_actors.registrar.core.decide import Item, decide
-from rr_actors.registrar.core.loading import join
+from rr_actors.registrar.core.loads.loading import join
 from rr_actors.registrar.core.notices import loaded
 from rr_actors.registrar.core.unloading import leave
 from rr_actors.registrar.engine.commit_log import CommitLog

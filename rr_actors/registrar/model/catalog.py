@@ -163,8 +163,9 @@ class Catalog:
       `unsent`: queries whose priority has changed while the provider's link was not reconciled.
       `listed`: by provider, the epoch of its run that made the last list.
     - `deserted`: resources that were loading when their last query ended, until the engine has looked at them.
-    - `stirred`: requests for which resources are queued, until decide() has looked at the line (core/lines.py). `said`:
-      by queued resource, the place in line that its load was told. `timed`: queries with a timer for their wait there.
+    - `stirred`: requests for which resources are queued, until decide() has looked at the line (core/loads/lines.py).
+      `said`: by queued resource, the place in line that its load was told. `timed`: queries with a timer for their
+      wait there.
       `wait_limits`: by query of our own that is not answered, how many ms it may wait in line; the threads add to it.
     - `chased`: by resource, the query whose probe for rings of holds has passed it last.
     - `shut`: why this registrar loads nothing any more for others (False), or for itself (True): it is being closed.
@@ -337,7 +338,7 @@ class Catalog:
         return [self.resources[id] for id in ids]
 
     def stir(self, resource: Resource) -> None:
-        """Note that the line for this resource, if there is one, has to be looked at (core/lines.py)."""
+        """Note that the line for this resource, if there is one, has to be looked at (core/loads/lines.py)."""
         key = (resource.server, resource.request)
         if key in self.queued:
             self.stirred[key] = True

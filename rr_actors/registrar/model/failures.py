@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 from rr_actors.base.errors import LoadError, did_you_mean, shortened, shown
@@ -166,8 +165,7 @@ def busy(catalog: Catalog, server: str, request: bytes, has: ServedQuery | None,
     """
     origin = f"{catalog.name}/{server}"
     holder, since = ("", None) if has is None else (has.origin, _asked_at(has.id))
-    asked = "" if since is None else f" (asked for it {time.strftime('%H:%M:%S', time.localtime(since))})"
-    who = f"{holder} has it{asked}" if holder else "it is being unloaded"
+    who = f"{holder} has it" if holder else "it is being unloaded"
     others = "" if not waiting else f", and {waiting} {'waits' if waiting == 1 else 'wait'} for it"
     what = f"{origin} with {shown(shown_plain(request))}"
     text = f"{what}: {who}{others}; give a longer wait_s, or a higher priority"

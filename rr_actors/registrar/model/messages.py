@@ -5,7 +5,7 @@ peer's bytes can make no other objects. Request and response bytes inside are ca
 (base/values/canonical.py).
 
 Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone, Reprioritise. Provider to consumer:
-Loaded, LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed, Reprioritised, Awaited. The
+Loaded, LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed, Reprioritised, WaitedFor. The
 sender of a request sends it again, with the same id, until it is answered. So every message may arrive twice
 (docs/consistency.md says what the second one does). A Fetch with `resume` opens a link, and comes once on each.
 """
@@ -201,7 +201,7 @@ class Reprioritised(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=
     priority: Int64
 
 
-class Awaited(msgspec.Struct, frozen=True, array_like=True, tag=18):
+class WaitedFor(msgspec.Struct, frozen=True, array_like=True, tag=18):
     """Does the whole of this query, which the receiver holds, wait for `waiter`? As Probe, for an exclusive resource.
 
     Others wait for that until the whole releases it.
@@ -236,5 +236,5 @@ Message = (
     | Progressed
     | Reprioritise
     | Reprioritised
-    | Awaited
+    | WaitedFor
 )

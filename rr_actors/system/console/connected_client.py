@@ -40,13 +40,13 @@ from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, Remot
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.client_proxies import GRACE_S, ClientProxy, in_thread
+from rr_actors.system.console.asking.client_proxies import GRACE_S, ClientProxy, in_thread
+from rr_actors.system.console.asking.waiting import waited_for
 from rr_actors.system.console.client_queries import ClientQuery, ClientViews, SystemConnections, listen
 from rr_actors.system.console.console_client import find_console
 from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, OpenRegistrar, Release
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
 from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
-from rr_actors.system.console.waiting import waited_for
 
 T = TypeVar("T")
 

@@ -24,8 +24,8 @@ from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.runtime.processes.process import signal_name
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
-from rr_actors.system.console import actor_calls
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking import actor_calls
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_view import REGISTRAR, Command, View
 

@@ -12,8 +12,8 @@ from rr_actors.base.errors import NotSerializable, UsageError, shown
 from rr_actors.registrar.declarations import Declaring
 from rr_actors.registrar.pages import LOAD_ORDERS, RESOURCE_ORDERS, STREAM_ORDERS, Page, Wanted, What
 from rr_actors.registrar.registrar import has_all_streams
-from rr_actors.system.console import actor_calls
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking import actor_calls
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_view import Verb, View, room_for
 from rr_actors.system.recording.event_memory import Event

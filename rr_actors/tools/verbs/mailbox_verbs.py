@@ -12,9 +12,9 @@ import typer
 from rr_actors.base.errors import UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
 from rr_actors.system.console.console_commands import PauseActor, ResumeActor, StepActor
 from rr_actors.system.console.console_questions import ListHistory, LookAtMailbox
-from rr_actors.system.console.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_json, say_lines, shown_again
 from rr_actors.tools.explanations import explain, mailbox_lines

@@ -17,7 +17,6 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.core import lines
 from rr_actors.registrar.core.callback_runs import (
     acquit,
     end_limit,
@@ -30,10 +29,11 @@ from rr_actors.registrar.core.callback_runs import (
     running,
     start_load,
 )
+from rr_actors.registrar.core.loads import lines
+from rr_actors.registrar.core.loads.load_rings import look_for_ring, ring_of_holds
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, loaded, park, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts
-from rr_actors.registrar.core.rings import look_for_ring, ring_of_holds
 from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, balance, retire, settle
@@ -80,7 +80,7 @@ def load(decision: Decision, message: Load) -> None:
         decision.cause(refuse(decision, message.origin, message.query_id, failures.unknown_server(catalog, server)))
         return
     resource_id = catalog.joinable(server, message.request)
-    if lines.is_taken(catalog, message):
+    if catalog.servers[server].exclusive and lines.is_taken(catalog, message):
         _wait_in_line(decision, message)
     elif resource_id is None:
         _load_first(decision, message)

@@ -11,10 +11,9 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import msgspec
-import pykka
-from pykka.messages import ProxyCall
 
 from rr_actors.actors.actor import Actor
+from rr_actors.actors.messaging.futures import Reply
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.errors import (
     NotFound,
@@ -32,7 +31,7 @@ from rr_actors.registrar.manager import Manager
 from rr_actors.system.console import console_messages as c
 
 _message = Codec(None, "message")
-_BASES = frozenset((*Manager.__mro__, *Actor.__mro__, *pykka.ThreadingActor.__mro__))
+_BASES = frozenset((*Manager.__mro__, *Actor.__mro__))
 
 
 def ask(actor: str, ref: ActorRef[Any], message: object, timeout_s: float) -> Any:
@@ -42,7 +41,10 @@ def ask(actor: str, ref: ActorRef[Any], message: object, timeout_s: float) -> An
         Unavailable: it has not answered in time.
         RrError: the actor could not be asked, or its handler raised.
     """
-    reply = ref.ask(message, block=False)
+    return _heard(actor, ref.ask(message, block=False), timeout_s)
+
+
+def _heard(actor: str, reply: Reply[Any], timeout_s: float) -> Any:
     try:
         error = reply.exception(timeout_s)
     except TimeoutError as late:
@@ -121,7 +123,8 @@ def call(actor: str, ref: ActorRef[Any], method: str, given: bytes, timeout_s: f
         inspect.signature(methods[method]).bind(None, *args, **kwargs)
     except TypeError as error:
         raise UsageError(f"{actor}: {method}{_parameters(methods[method])}: {error}") from None
-    answer = ask(actor, ref, ProxyCall(attr_path=(method,), args=tuple(args), kwargs=kwargs), timeout_s)
+    reply: Reply[Any] = getattr(ref.proxy(), method)(*args, **kwargs)
+    answer = _heard(actor, reply, timeout_s)
     return encode(plain(answer, f"answer of {actor}.{method}"), f"answer of {actor}.{method}")
 
 

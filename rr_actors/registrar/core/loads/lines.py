@@ -14,9 +14,9 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import limit_load, start_load
+from rr_actors.registrar.core.loads.load_rings import look_for_ring
 from rr_actors.registrar.core.notices import drop_resource, end_wait, loaded, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
-from rr_actors.registrar.core.rings import look_for_ring
 from rr_actors.registrar.core.status_changes import begin_revocation, is_revocable
 from rr_actors.registrar.core.unloading import begin_unload, condemned, unheld
 from rr_actors.registrar.model import failures
@@ -47,9 +47,7 @@ _TOLD = 10
 
 def is_taken(catalog: Catalog, message: Load) -> bool:
     """Return whether a Load has to wait in line: somebody has the exclusive resource, or waits for it already."""
-    server, key = catalog.servers.get(message.server), (message.server, message.request)
-    if server is None or not server.exclusive:
-        return False
+    key = (message.server, message.request)
     return key in catalog.queued or any(not _is_free(catalog, resource) for resource in _in_use(catalog, key))
 
 
@@ -205,7 +203,7 @@ def _take_from(decision: Decision, server: Server, resource: Resource, first: Re
 
 
 def look_again(decision: Decision, origin: str) -> None:
-    """Look for rings through what this registrar holds, as an Awaited may have been lost with its last link."""
+    """Look for rings through what this registrar holds, as a WaitedFor may have been lost with its last link."""
     catalog = decision.catalog
     for query in [catalog.queries[id] for id in catalog.by_origin.get(origin, ())]:
         resource = catalog.resources[query.resource_id]

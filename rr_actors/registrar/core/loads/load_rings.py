@@ -11,7 +11,7 @@ from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import SendReply
-from rr_actors.registrar.model.messages import Awaited, Load, Probe
+from rr_actors.registrar.model.messages import Load, Probe, WaitedFor
 from rr_actors.registrar.model.rows import LOADED, PENDING, QUEUED, RESTING, UNLOADING, Resource
 
 
@@ -106,14 +106,14 @@ def _chase_holders(decision: Decision, resource: Resource, message: Probe) -> No
             continue
         chase(decision, used, message)
         for query in catalog.queries_of(used.id):
-            on = Awaited(query.id, message.waiter, message.blocked, message.ring)
+            on = WaitedFor(query.id, message.waiter, message.blocked, message.ring)
             if query.parent and query.origin == catalog.name:
                 awaited(decision, on)
             elif query.parent:
                 decision.cause(SendReply(query.origin, on))
 
 
-def awaited(decision: Decision, message: Awaited) -> None:
+def awaited(decision: Decision, message: WaitedFor) -> None:
     """Pass a probe on to the whole of a query, as others wait until that releases the query's exclusive resource."""
     catalog = decision.catalog
     held = catalog.held.get(message.query_id) or catalog.in_flight.get(message.query_id)
