@@ -40,6 +40,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             ActorUnavailable,
             AlreadyPresent,
             AlreadyStarted,
+            AskFailed,
             CatalogDamaged,
             CatalogError,
             CatalogLocked,
@@ -91,6 +92,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.registrar.servers.callback_context import Current, current
         from rr_actors.streams.publisher import Publisher
         from rr_actors.streams.stream import Stream, StreamFrame, StreamInfo
+        from rr_actors.streams.stream_file import RecordedStream
         from rr_actors.streams.stream_reader import StreamReader
         from rr_actors.supervision.core.rendering import Tree, render
         from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
@@ -108,6 +110,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             StreamEvent,
         )
         from rr_actors.system.recording.recordings import Recording, read_recording
+        from rr_actors.system.recording.stream_recordings import StreamRecording, read_stream, record_stream
         from rr_actors.system.recording.traces import Trace
         from rr_actors.system.system import System
 
@@ -124,6 +127,7 @@ __all__ = [
     "ActorUnavailable",
     "AlreadyPresent",
     "AlreadyStarted",
+    "AskFailed",
     "Backoff",
     "CatalogDamaged",
     "CatalogError",
@@ -179,6 +183,7 @@ __all__ = [
     "Publisher",
     "Queries",
     "Query",
+    "RecordedStream",
     "Recording",
     "Registrar",
     "RegistrarConfig",
@@ -197,6 +202,7 @@ __all__ = [
     "StreamFrame",
     "StreamInfo",
     "StreamReader",
+    "StreamRecording",
     "Subscription",
     "SupervisionError",
     "Supervisor",
@@ -218,6 +224,8 @@ __all__ = [
     "current",
     "monitor",
     "read_recording",
+    "read_stream",
+    "record_stream",
     "ref",
     "render",
     "run_graph",
@@ -245,6 +253,7 @@ if not TYPE_CHECKING:
         "rr_actors.base.values.codecs": "codec",
         "rr_actors.streams.publisher": "Publisher",
         "rr_actors.streams.stream": "Stream StreamFrame StreamInfo",
+        "rr_actors.streams.stream_file": "RecordedStream",
         "rr_actors.streams.stream_reader": "StreamReader",
         "rr_actors.managers": "Action GraphResult run_graph",
         "rr_actors.registrar.declarations": "Declared server",
@@ -265,6 +274,7 @@ if not TYPE_CHECKING:
             "ChildEvent DeadLetterEvent EndedEvent Event MissedEvent ProgressEvent ResourceEvent StreamEvent"
         ),
         "rr_actors.system.recording.recordings": "Recording read_recording",
+        "rr_actors.system.recording.stream_recordings": "StreamRecording read_stream record_stream",
         "rr_actors.system.recording.traces": "Trace",
         "rr_actors.system.system": "System",
     }

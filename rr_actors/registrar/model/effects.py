@@ -153,6 +153,7 @@ Happening = Literal[
     "status",
     "priority",
     "revoked",
+    "reloading",
     "paused",
     "pause_failed",
     "resumed",

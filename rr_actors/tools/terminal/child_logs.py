@@ -9,8 +9,8 @@ from contextlib import suppress
 from rr_actors.base.errors import NotFound
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.hosting.forwarded_logs import LogLine
+from rr_actors.system.console.asking.actor_calls import CallActor
 from rr_actors.system.console.console_client import ConsoleClient
-from rr_actors.system.console.console_commands import CallActor
 from rr_actors.system.console.console_messages import PAGE_LIMIT, ChildLog
 from rr_actors.system.console.console_questions import Find, ListChildren, ListHistory, ListLog
 from rr_actors.system.recording.event_memory import Event

@@ -18,6 +18,7 @@ from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
+from rr_actors.system.console.asking.actor_calls import CallActor
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.recording.event_memory import Event, events_of, is_of_child, left_events
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
@@ -312,7 +313,7 @@ def call(
         return
     data = encode([[_argument(text) for text in given or ()], {}], f"arguments of {actor}.{method}")
     with client_of(state, timeout_s + _ANSWER_S) as client:
-        answer = client.ask(commands.CallActor(actor, method, data, timeout_s)).answer
+        answer = client.ask(CallActor(actor, method, data, timeout_s)).answer
     say_json(Codec(None, "answer").show(answer))
 
 
@@ -362,6 +363,18 @@ def revoke(
 ) -> None:
     """Take a resource away from its holders in its owner's name: what depends on it ends first, or replaces it."""
     carry_out(state, commands.Revoke(id, why, grace_s, dry_run), as_json, grace_s + _UNLOAD_S)
+
+
+@app.command(epilog="Example: rr-actors reload 'cameras/camera \"/dev/video0\"'")
+def reload(
+    id: Annotated[str, typer.Argument(help=f"The resource's id, {_PART}.", autocompletion=completing(list_resources))],
+    timeout_s: Timeout = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Unload a resource and load it again for the same request; its holders keep it, and hear the new response."""
+    carry_out(state, commands.Reload(id, timeout_s, dry_run), as_json, timeout_s)
 
 
 @app.command(epilog="Example: rr-actors kill cameras --signal SIGSTOP")

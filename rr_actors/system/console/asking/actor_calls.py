@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from types import FunctionType
 from typing import Any, cast
 
 import msgspec
 
 from rr_actors.actors.actor import Actor
+from rr_actors.actors.messaging.ask_cycles import asking_as
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.actors.refs import ActorRef
+from rr_actors.actors.refs import ActorRef, Timeout
 from rr_actors.base.errors import (
+    AskFailed,
     NotFound,
     NotSerializable,
     RrError,
@@ -23,37 +26,20 @@ from rr_actors.base.errors import (
     UsageError,
     did_you_mean,
     is_a,
+    name_of_class,
     text_of,
 )
+from rr_actors.base.reporting.tracebacks import raised_elsewhere
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.declarations import Declared, callbacks_of
 from rr_actors.registrar.manager import Manager
+from rr_actors.runtime.callback_errors import traceback_of
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.console_view import Command, View
 
 _message = Codec(None, "message")
 _BASES = frozenset((*Manager.__mro__, *Actor.__mro__))
-
-
-def ask(actor: str, ref: ActorRef[Any], message: object, timeout_s: float) -> Any:
-    """Ask an actor for a client, and return its answer.
-
-    Raises:
-        Unavailable: it has not answered in time.
-        RrError: the actor could not be asked, or its handler raised.
-    """
-    return _heard(actor, ref.ask(message, block=False), timeout_s)
-
-
-def _heard(actor: str, reply: Reply[Any], timeout_s: float) -> Any:
-    try:
-        error = reply.exception(timeout_s)
-    except TimeoutError as late:
-        reply.cancel()
-        text = f"{actor}: it has not answered within {timeout_s:g} s; a later answer reaches nobody"
-        raise Unavailable(text) from late
-    if error is not None and not isinstance(error, RrError):  # raised by the actor's handler
-        raise RrError(f"{actor}: {text_of(error)}") from error
-    return reply.get()
 
 
 def methods_of(cls: type[Any]) -> dict[str, Callable[..., Any]]:
@@ -66,7 +52,7 @@ def methods_of(cls: type[Any]) -> dict[str, Callable[..., Any]]:
         for name, value in vars(base).items():
             if is_a(value, Declared):
                 callbacks |= callbacks_of(cast("Declared[Any, Any, Any]", value))
-            if name.startswith(("_", "on_")) or not is_a(value, type(ask)):
+            if name.startswith(("_", "on_")) or not is_a(value, FunctionType):
                 found.pop(name, None)
             else:
                 found[name] = value
@@ -102,8 +88,8 @@ class _Source(str):
         return str(self)
 
 
-def call(actor: str, ref: ActorRef[Any], method: str, given: bytes, timeout_s: float) -> bytes:
-    """Call a method of an actor, and return the canonical bytes of its answer.
+def begin(actor: str, ref: ActorRef[Any], method: str, given: bytes) -> Reply[Any]:
+    """Call a method of an actor, and return the future of its answer.
 
     Args:
         given: the canonical bytes of a list of the arguments and a dict of those by keyword.
@@ -111,7 +97,6 @@ def call(actor: str, ref: ActorRef[Any], method: str, given: bytes, timeout_s: f
     Raises:
         NotFound: the actor has no such method. `.id`, `.known`
         UsageError: the method does not take these arguments.
-        NotSerializable: the answer is no plain data, and nothing that becomes plain data.
     """
     methods = methods_of(ref.actor_class)
     if method not in methods:
@@ -123,9 +108,7 @@ def call(actor: str, ref: ActorRef[Any], method: str, given: bytes, timeout_s: f
         inspect.signature(methods[method]).bind(None, *args, **kwargs)
     except TypeError as error:
         raise UsageError(f"{actor}: {method}{_parameters(methods[method])}: {error}") from None
-    reply: Reply[Any] = getattr(ref.proxy(), method)(*args, **kwargs)
-    answer = _heard(actor, reply, timeout_s)
-    return encode(plain(answer, f"answer of {actor}.{method}"), f"answer of {actor}.{method}")
+    return getattr(ref.proxy(), method)(*args, **kwargs)
 
 
 def _arguments(actor: str, given: bytes) -> tuple[list[Any], dict[str, Any]]:
@@ -136,13 +119,52 @@ def _arguments(actor: str, given: bytes) -> tuple[list[Any], dict[str, Any]]:
             raise UsageError(f"{actor}: arguments: expected a list and a dict by keyword")
 
 
-def plain(value: object, what: str) -> Any:
-    """Return a value as plain data: a dataclass or Struct as a dict, an enum as its value, a set as a list.
+def plain_bytes(value: object, what: str) -> bytes:
+    """Return the canonical bytes of a value as plain data: a dataclass or Struct as a dict, an enum as its value.
 
     Raises:
-        NotSerializable: it has a part that none of these is.
+        NotSerializable: it has a part that is none of these.
     """
     try:
-        return msgspec.to_builtins(value, builtin_types=(bytes,))
+        plain: Any = msgspec.to_builtins(value, builtin_types=(bytes,))
     except (TypeError, ValueError, RecursionError) as error:
         raise NotSerializable(f"{what}: expected plain data, or dataclasses of it: {error}", path="") from error
+    return encode(plain, what)
+
+
+class CallActor(Command[c.Replied], frozen=True):
+    """Call a method of an actor of the tree, by its path or id.
+
+    Attributes:
+        given: a list of the arguments and a dict of those by keyword, plain data, as canonical bytes.
+    """
+
+    actor: c.Text
+    method: c.Text
+    given: c.Value
+    timeout_s: c.Seconds = 30.0
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Replied:
+        reply = None
+        try:
+            with asking_as(view.clients.asking(caller, "")):
+                reply = begin(self.actor, view.system.ref(self.actor), self.method, self.given)
+            answer = reply.get(timeout=self.timeout_s)
+        except Timeout as late:
+            if reply is not None:
+                reply.cancel()
+            text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
+            raise Unavailable(text) from late
+        except Exception as error:
+            raise as_a_client_hears(self.actor, error) from error
+        return c.Replied(plain_bytes(answer, f"answer of {self.actor}.{self.method}"))
+
+
+def as_a_client_hears(actor: str, error: Exception) -> RrError:
+    """Return the error for the client: one of this package stays of its class, and another is described."""
+    raised = {"actor": actor, "traceback": raised_elsewhere(error) or traceback_of(error)}
+    if isinstance(error, RrError):
+        if raised["traceback"]:  # by the handler, not on the way to it
+            error.details = raised | error.details
+        return error
+    return AskFailed(f"{actor}: {text_of(error)}", error=name_of_class(type(error)), **raised)

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.system.console.asking.actor_calls import CallActor
 from rr_actors.system.console.client_queries import SystemConnections
-from rr_actors.system.console.console_commands import CallActor
 from rr_actors.system.console.console_questions import ListMethods
 
 T = TypeVar("T")
