@@ -158,7 +158,11 @@ def test_a_holder_that_does_not_release_it_loses_it_after_the_grace(rr_system: S
     system = rr_system([rr.ChildSpec(Scopes, id="scopes", placement="thread")])
     whole, ben = system.open_registrar("whole"), system.open_registrar("ben")
     keeps = Gate()
-    serve(whole, "bench", lambda name: whole.load(Scopes.open_brief, name).response, status=lambda *_: keeps())
+
+    def load(name: str) -> str:
+        return whole.load(Scopes.open_brief, name).response
+
+    serve(whole, "bench", load, status=lambda *_: keeps())
     held = whole.load("whole/bench", "bench")
     with ben.load(Scopes.open_brief, "bench", priority=1, timeout_s=LIMIT_S) as mine:
         keeps.wait_arrived()  # it has heard that, and does not release it

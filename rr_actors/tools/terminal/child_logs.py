@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 
 from rr_actors.base.errors import NotFound
-from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.base.values.canonical import Codec
 from rr_actors.hosting.forwarded_logs import LogLine
-from rr_actors.system.console.asking.actor_calls import CallActor
+from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import PAGE_LIMIT, ChildLog
 from rr_actors.system.console.console_questions import Find, ListChildren, ListHistory, ListLog
@@ -99,7 +99,7 @@ def output_of(client: ConsoleClient, program: str, count: int) -> list[str] | No
     if len(found) != 1:
         return None
     registrar, id = found[0].server.partition("/")[0], found[0].id
-    given = encode([[id, count], {}], f"arguments of {registrar}.output")
+    given = given_bytes(registrar, "output", (id, count))
     with suppress(NotFound):  # another manager than Programs
         return _answer.show(client.ask(CallActor(registrar, "output", given)).answer)
     return None

@@ -14,11 +14,11 @@ import typer
 
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotRunning, UsageError, shown
-from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.base.values.canonical import Codec
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
-from rr_actors.system.console.asking.actor_calls import CallActor
+from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.recording.event_memory import Event, events_of, is_of_child, left_events
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
@@ -311,7 +311,7 @@ def call(
             say(row.signature)
             say_lines("\n".join(f"    {line}".rstrip() for line in row.help.splitlines()))
         return
-    data = encode([[_argument(text) for text in given or ()], {}], f"arguments of {actor}.{method}")
+    data = given_bytes(actor, method, [_argument(text) for text in given or ()])
     with client_of(state, timeout_s + _ANSWER_S) as client:
         answer = client.ask(CallActor(actor, method, data, timeout_s)).answer
     say_json(Codec(None, "answer").show(answer))

@@ -7,7 +7,7 @@ adds to Actor or Manager: no callbacks of servers, no hooks, nothing private.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from types import FunctionType
 from typing import Any, cast
 
@@ -50,12 +50,13 @@ def methods_of(cls: type[Any]) -> dict[str, Callable[..., Any]]:
         if base in _BASES:
             continue
         for name, value in vars(base).items():
-            if is_a(value, Declared):
-                callbacks |= callbacks_of(cast("Declared[Any, Any, Any]", value))
-            if name.startswith(("_", "on_")) or not is_a(value, FunctionType):
+            attribute = cast("object", value)
+            if is_a(attribute, Declared):
+                callbacks |= callbacks_of(cast("Declared[Any, Any, Any]", attribute))
+            if name.startswith(("_", "on_")) or not is_a(attribute, FunctionType):
                 found.pop(name, None)
             else:
-                found[name] = value
+                found[name] = attribute
     return {name: found[name] for name in sorted(found) if name not in callbacks}
 
 
@@ -111,12 +112,21 @@ def begin(actor: str, ref: ActorRef[Any], method: str, given: bytes) -> Reply[An
     return getattr(ref.proxy(), method)(*args, **kwargs)
 
 
+def given_bytes(actor: str, method: str, args: Sequence[Any], kwargs: Mapping[str, Any] | None = None) -> bytes:
+    """Return the canonical bytes of the arguments of a call, as CallActor has them.
+
+    Raises:
+        NotSerializable: an argument is no plain data.
+    """
+    given: list[Any] = [list(args), dict(kwargs or {})]
+    return encode(given, f"arguments of {actor}.{method}")
+
+
 def _arguments(actor: str, given: bytes) -> tuple[list[Any], dict[str, Any]]:
-    match _message.decode(given, actor, "arguments"):
-        case [list() as args, dict() as kwargs]:
-            return cast("list[Any]", args), cast("dict[str, Any]", kwargs)
-        case _:
-            raise UsageError(f"{actor}: arguments: expected a list and a dict by keyword")
+    decoded: Any = _message.decode(given, actor, "arguments")
+    if is_a(decoded, list) and [type(part) for part in cast("list[Any]", decoded)] == [list, dict]:
+        return decoded[0], decoded[1]
+    raise UsageError(f"{actor}: arguments: expected a list and a dict by keyword")
 
 
 def plain_bytes(value: object, what: str) -> bytes:

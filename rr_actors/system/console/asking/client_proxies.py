@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.base.values.canonical import Codec, encode
-from rr_actors.system.console.asking.actor_calls import CallActor
+from rr_actors.base.values.canonical import Codec
+from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
 from rr_actors.system.console.client_queries import SystemConnections
 from rr_actors.system.console.console_questions import ListMethods
 
@@ -62,7 +62,7 @@ class ClientProxy:
         return call
 
     def _call(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        given = encode([list(args), kwargs], f"arguments of {self._actor}.{method}")
+        given = given_bytes(self._actor, method, args, kwargs)
         command = CallActor(self._actor, method, given, self._limit_s)
         return _answer.show(self._connections.ask(command, self._limit_s + GRACE_S).answer)
 
