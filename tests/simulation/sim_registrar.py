@@ -6,12 +6,12 @@ from typing import Any, cast
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.core import holding, notices
+from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.callback_runs import ATTEMPTS, is_given_up
 from rr_actors.registrar.core.decide import decide, refuse_uncommitted
 from rr_actors.registrar.core.loads import loading
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Decision
+from rr_actors.registrar.model.catalog import Decision, loaded
 from rr_actors.registrar.model.effects import Happened, SendReply
 from rr_actors.registrar.model.messages import Load, Loaded, Message, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import (
@@ -244,7 +244,7 @@ class SimRegistrar(SimShell):
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return notices.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
+        return loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
         """As RegistrarState.join, for a direct line."""
@@ -252,7 +252,7 @@ class SimRegistrar(SimShell):
         if query is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return notices.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
+        return loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def _joined(self, load: Load, fault: str) -> ServedQuery | None:
         """The row, on disk; None if it is to be decided as any load."""

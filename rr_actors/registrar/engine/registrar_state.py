@@ -27,12 +27,11 @@ from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.callback_runs import is_unwanted
 from rr_actors.registrar.core.decide import Item, decide
 from rr_actors.registrar.core.loads.loading import join
-from rr_actors.registrar.core.notices import loaded
 from rr_actors.registrar.core.unloading import leave
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import digests
-from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision
+from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, loaded
 from rr_actors.registrar.model.messages import NO_LIMIT, Load, Loaded, Unload, Unloaded
 from rr_actors.registrar.model.rows import LOADING, OK, PENDING, Drop, Held, Phase, Put, Resource
 from rr_actors.registrar.model.store import Store

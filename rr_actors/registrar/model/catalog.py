@@ -15,7 +15,7 @@ import msgspec
 
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.effects import Connect, Effect, SendRequest
-from rr_actors.registrar.model.messages import Message
+from rr_actors.registrar.model.messages import Loaded, Message
 from rr_actors.registrar.model.rows import (
     HELD,
     HIGHEST,
@@ -524,6 +524,13 @@ class Catalog:
         elif new is not None:
             add(self.notices_to, new.origin, new.id)
             add(self.notices_on, new.query_id, new.id)
+
+
+def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:
+    """Return the answer to a Load whose resource is loaded."""
+    server = catalog.servers.get(resource.server)
+    types = 0 if server is None else server.types_checksum
+    return Loaded(query_id, resource.id, resource.response or b"", types, resource.state)
 
 
 def after_epoch(epoch: int) -> int:

@@ -15,12 +15,12 @@ from msgspec.structs import replace
 
 from rr_actors.registrar.core.callback_runs import limit_load, start_load
 from rr_actors.registrar.core.loads.load_rings import look_for_ring
-from rr_actors.registrar.core.notices import drop_resource, end_wait, loaded, refuse, refuse_all
+from rr_actors.registrar.core.notices import drop_resource, end_wait, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.status_changes import begin_revocation, is_revocable
 from rr_actors.registrar.core.unloading import begin_unload, condemned, unheld
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog, Decision, RequestKey, Server
+from rr_actors.registrar.model.catalog import Catalog, Decision, RequestKey, Server, loaded
 from rr_actors.registrar.model.commands import WaitOver
 from rr_actors.registrar.model.effects import InLine, SendReply, SetTimer
 from rr_actors.registrar.model.messages import NO_LIMIT, Load

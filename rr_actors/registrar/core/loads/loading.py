@@ -34,7 +34,7 @@ from rr_actors.registrar.core.callback_runs import (
 )
 from rr_actors.registrar.core.loads import lines
 from rr_actors.registrar.core.loads.load_rings import look_for_ring, ring_of_holds
-from rr_actors.registrar.core.notices import drop_notices, drop_resource, loaded, park, refuse, refuse_all
+from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.core.status_changes import is_busy, spread
@@ -50,7 +50,7 @@ from rr_actors.registrar.core.unloading import (
     stop_waiting,
 )
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog, Decision, Server
+from rr_actors.registrar.model.catalog import Catalog, Decision, Server, loaded
 from rr_actors.registrar.model.commands import CallbackEnded, CallbackOverdue, Reload
 from rr_actors.registrar.model.effects import AnswerCall, Effect, Happened, SendReply, SetTimer, StartCallback
 from rr_actors.registrar.model.messages import Load, LoadRefused

@@ -50,13 +50,13 @@ def methods_of(cls: type[Any]) -> dict[str, Callable[..., Any]]:
         if base in _BASES:
             continue
         for name, value in vars(base).items():
-            attribute = cast("object", value)
+            attribute: Any = value
             if is_a(attribute, Declared):
-                callbacks |= callbacks_of(cast("Declared[Any, Any, Any]", attribute))
-            if name.startswith(("_", "on_")) or not is_a(attribute, FunctionType):
+                callbacks |= callbacks_of(cast("Declared[Any, Any, Any]", value))
+            if name.startswith(("_", "on_")) or type(value) is not FunctionType:
                 found.pop(name, None)
             else:
-                found[name] = attribute
+                found[name] = value
     return {name: found[name] for name in sorted(found) if name not in callbacks}
 
 
@@ -125,7 +125,8 @@ def given_bytes(actor: str, method: str, args: Sequence[Any], kwargs: Mapping[st
 def _arguments(actor: str, given: bytes) -> tuple[list[Any], dict[str, Any]]:
     decoded: Any = _message.decode(given, actor, "arguments")
     if is_a(decoded, list) and [type(part) for part in cast("list[Any]", decoded)] == [list, dict]:
-        return decoded[0], decoded[1]
+        args, kwargs = cast("tuple[list[Any], dict[str, Any]]", decoded)
+        return args, kwargs
     raise UsageError(f"{actor}: arguments: expected a list and a dict by keyword")
 
 
