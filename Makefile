@@ -6,7 +6,7 @@
 #   make test-all  those that take longer, too: faults at every operation, fixed worlds of the simulation, breakages
 #   make lint   ruff, pyright, import-linter
 #   make docs   the docs as a site, in build/docs/index.html, with the reference of all public names; without the network
-#   make names  docs/names.md, from the code
+#   make names  docs/names.md, and the texts of docs/reference, from the code
 #   make figures  how large and how tangled the package is, each count with its aim (ARGS=--list: where)
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
 #   make breakages  the product broken on purpose in twenty places and more, each noticed by chaos within a minute
@@ -58,6 +58,7 @@ docs: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.installed-docs)
 
 names: $(STAMP)
 	$(BIN)/python docs/_site/names.py
+	$(BIN)/python docs/_site/reference.py
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) $(SECOND_RUN) -m "not slow" $(ARGS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,8 @@ from rr_actors.managers.components import read_registry
 from rr_actors.managers.planning.reliability import FALL, Reliabilities
 from rr_actors.managers.robots import read_robots
 from rr_actors.storage.child_records import ChildRecord, decode, encode
+from rr_actors.streams.stream import Stream, StreamFrame
+from rr_actors.streams.stream_file import RecordedStream, StreamHeader, StreamWriter
 from rr_actors.supervision.core.specs import Supervisor
 
 
@@ -145,6 +148,38 @@ def _children() -> list[bytes]:
     whole = [encode(ChildRecord("pool", id, 7, b"arguments")) for id in ("a", "b")]
     return [part for file in whole for part in (file, file[18:])]
 
+
+def _recorded(frames: int) -> bytes:
+    """Return the file of a recorded stream."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "frames")
+        writer = StreamWriter(file, StreamHeader("s", "0" * 32, "a/b", b"\xa1r", None, 1.0), 2**20)
+        for i in range(frames):
+            writer.write(StreamFrame(bytearray(5000) if i == 1 else i, i + 1, float(i), 0, Stream("0" * 32, "s")))
+        writer.close()
+        return file.read_bytes()
+
+
+def _prepare_recorded(directory: Path) -> Feed:
+    file = directory / "frames"
+
+    def feed(data: bytes) -> None:
+        """A ConfigError names the file; or there are whole frames within it. No pickle is opened for that."""
+        file.unlink(missing_ok=True)  # the one before may still be mapped
+        file.write_bytes(data)
+        try:
+            recorded = RecordedStream(file)
+        except ConfigError as error:
+            assert str(file) in str(error)
+            assert error.file == str(file)
+        else:
+            assert len(recorded) == len(recorded.times) <= len(data) // 40
+            assert recorded.missed >= 0
+
+    return feed
+
+
+RECORDED = Target("a recorded stream", _prepare_recorded, lambda: [_recorded(n) for n in (0, 1, 3)], longest=8192)
 
 CHILD = Target("the record of a child", _prepare_child, _children)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fuzz.catalogs import CATALOG
 from fuzz.consoles import CONSOLE
-from fuzz.files import CHILD, READERS, RELIABILITY
+from fuzz.files import CHILD, READERS, RECORDED, RELIABILITY
 from fuzz.journals import JOURNAL
 from fuzz.peers import PEER
 from fuzz.requests import REQUESTS
@@ -21,6 +21,7 @@ TARGETS: dict[str, Target] = {
     **READERS,
     "reliability.json": RELIABILITY,
     "child": CHILD,
+    "recorded": RECORDED,
     "catalog": CATALOG,
     "journal": JOURNAL,
 }

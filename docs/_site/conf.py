@@ -1,8 +1,9 @@
 """Build the docs as a site with Sphinx: `make docs`. docs/decisions/0029-docs-site.md says why with Sphinx.
 
 The pages are also read in the repository, so they are plain Markdown with links to files. README.md and others beside
-docs become pages of the site. A link to a file that is no page, such as a test, becomes text with the file's path. A
-line "::: NAME" becomes what the docstrings say of that name, and "::: FILE.md" the text of that file.
+docs become pages of the site. A link to a file that is no page, such as a test, becomes text with the file's path. The
+heading of a public name, with the text below it (reference.py), becomes what Sphinx makes of its docstrings. A line
+"::: FILE.md" becomes the text of that file.
 """
 
 from __future__ import annotations
@@ -11,9 +12,13 @@ import enum
 import importlib
 import inspect
 import re
+import sys
 from pathlib import Path
 from typing import Any, is_typeddict
 
+sys.path.insert(0, str(Path(__file__).parent))
+
+from reference import SHOWN
 from sphinx.application import Sphinx
 
 from rr_actors import Declared
@@ -21,7 +26,7 @@ from rr_actors import Declared
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(?:#([^)\s]*))?\)")
-SHOWN = re.compile(r"^::: (\S+)$", re.MULTILINE)
+FILE = re.compile(r"^::: (\S+\.md)$", re.MULTILINE)
 PAGES = {
     "README.md": "index",
     "CHANGELOG.md": "changelog",
@@ -62,13 +67,16 @@ CONTENTS = "\n\n```{toctree}\n:hidden:\n:glob:\n*\n```\n"
 """What a README needs to be the head of the pages beside it."""
 
 
+def text_of_file(match: re.Match[str]) -> str:
+    """Return the text of a file beside docs, with links as the site has them."""
+    text = (ROOT / match.group(1)).read_text().replace("](docs/", "](")
+    for name, page in PAGES.items():
+        text = text.replace(f"]({name})", f"]({page}.md)")
+    return text
+
+
 def described(match: re.Match[str]) -> str:
-    """Return the file beside docs, or the directive for the docstrings of the name."""
-    if (file := ROOT / match.group(1)).suffix == ".md":
-        text = file.read_text().replace("](docs/", "](")
-        for name, page in PAGES.items():
-            text = text.replace(f"]({name})", f"]({page}.md)")
-        return text
+    """Return the directive for the docstrings of a name."""
     module, _, name = match.group(1).rpartition(".")
     value = getattr(importlib.import_module(module), name)
     if isinstance(value, type):
@@ -83,7 +91,7 @@ def described(match: re.Match[str]) -> str:
     else:
         text = inspect.getdoc(value) if type(value).__module__.startswith("rr_actors") else ""
         lines = [f".. py:data:: {module}.{name}", "", f"   {text}"]
-    return "\n".join(["```{eval-rst}", *lines, "```"])
+    return "\n".join(["```{eval-rst}", *lines, "```", ""])
 
 
 def read(app: Sphinx, page: str, source: list[str]) -> None:
@@ -100,7 +108,9 @@ def read(app: Sphinx, page: str, source: list[str]) -> None:
             return f"[{text}]({'../' * page.count('/')}{PAGES[name]}.md)"
         return f'<span title="{name}{f": {part}" if part else ""}">{text}</span>'
 
-    source[0] = LINK.sub(led, SHOWN.sub(described, source[0])) + (CONTENTS if page.endswith("/README") else "")
+    source[0] = LINK.sub(led, SHOWN.sub(described, FILE.sub(text_of_file, source[0]))) + (
+        CONTENTS if page.endswith("/README") else ""
+    )
 
 
 def skip(app: Sphinx, what: str, name: str, value: Any, skipped: bool, options: Any) -> bool | None:

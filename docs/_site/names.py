@@ -75,7 +75,7 @@ def pages() -> dict[str, str]:
     """Return the page of the reference that has each name."""
     found: dict[str, str] = {}
     for page in sorted(REFERENCE.glob("*.md")):
-        for name in re.findall(r"^::: rr_actors\.(\w+)$", page.read_text(), re.MULTILINE):
+        for name in re.findall(r"^### `rr_actors\.(\w+)`$", page.read_text(), re.MULTILINE):
             assert name not in found, f"{name} is in {found[name]} and in {page.name}"
             found[name] = page.name
     return found

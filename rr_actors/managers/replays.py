@@ -186,7 +186,7 @@ class _Replay:
             publisher.publish(None)  # it counts
             return
         try:
-            publisher.publish(self._streams[name].frame(i).value, timeout_s=1.0)
+            publisher.publish(self._streams[name].frame(i).value)
         except Exception as error:  # of the value's own code
             if name not in self._unread:
                 self._unread.add(name)

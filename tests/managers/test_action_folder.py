@@ -110,6 +110,15 @@ def test_a_graph_that_runs_goes_on_with_the_classes_it_began_with_also_after_a_c
     assert eventually(lambda: running.response["graph_state"] == "FINISHED", what=str(running.response))
 
 
+def test_a_crash_goes_on_also_where_no_file_was_right_yet(start: Start, tmp_path: Path, folder: Path) -> None:
+    (folder / "tell.py").unlink()
+    place = Place(start, tmp_path)
+    (folder / "tell.py").write_text("1 / 0")
+    wait_respawned(place.system, "actions", kill(place.system, "actions"))
+    (folder / "tell.py").write_text(tell("one"))
+    assert place.said() == "one"
+
+
 def test_an_action_that_begins_later_in_a_graph_is_that_of_its_begin(
     start: Start, tmp_path: Path, folder: Path
 ) -> None:
@@ -132,6 +141,7 @@ WRONG: list[tuple[str, str]] = [
     ("", "expected a Python file with a class of actions, got none"),
     (f"{HEAD}class Base(rr.Action):\n    pass\n", "expected a Python file with a class of actions, got none"),
     (tell("x", isolate=False).replace("isolate = False", "timeout_s = 3"), "line 8: expected a class of actions that"),
+    (tell("x").replace("said: str", "said: Str"), "line 8: expected a class of actions that can run, got NameError: "),
     (tell("x", "Given"), "line 8: expected actions with different names, got 'Given' again"),
     (tell("x", "Other"), "line 8: expected actions with different names, got 'Other' again, as in "),
     ("\0", "expected a Python file with a class of actions, got "),

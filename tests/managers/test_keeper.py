@@ -405,6 +405,9 @@ def test_what_cannot_be_read_changes_nothing_and_is_a_warning(make: Make, runtim
     place.load = 2.0
     assert eventually(lambda: (kept := place.kept("a")).wanted == kept.ready == 2)
     query = place.app.load("keeper/kept", "a", response_type=Kept)
+    assert (
+        run_cli("keep", "diff").stdout == "all is as it is wanted\n"
+    )  # imported before tracebacks are made: gh-106905
     place.load = "no meter"
     assert query.wait_status("WARNING", timeout_s=60).message.startswith("2 of 2 ready: no reading: load: ")
     assert query.response.why == "no reading"

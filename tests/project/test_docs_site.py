@@ -22,7 +22,7 @@ PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.parent.name != "dec
 HELPING = [REPOSITORY / "CONTRIBUTING.md", REPOSITORY / "SECURITY.md"]
 REFERENCE = sorted((DOCS / "reference").glob("*.md"))
 SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-SHOWN = re.compile(r"^::: rr_actors\.(\w+)$", re.MULTILINE)
+SHOWN = re.compile(r"^### `rr_actors\.(\w+)`$", re.MULTILINE)
 
 
 def test_every_public_name_is_in_the_reference_once() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import runpy
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -44,6 +45,13 @@ CLASSES = sorted((name for name in rr.__all__ if isinstance(getattr(rr, name), t
 
 def test_the_page_is_what_the_code_says() -> None:
     assert PAGE.read_text() == MAKER["made"](), "run: make names"
+
+
+@pytest.mark.parametrize("page", sorted((PAGE.parent / "reference").glob("*.md")), ids=lambda page: page.name)
+def test_a_page_of_the_reference_has_the_docstrings(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(REPOSITORY / "docs" / "_site")
+    made = runpy.run_path(str(REPOSITORY / "docs" / "_site" / "reference.py"))["made"]
+    assert page.read_text() == made(page), "run: make names"
 
 
 def test_the_package_shows_what_it_exports_and_nothing_else() -> None:

@@ -61,18 +61,18 @@ class ActionFolder:
             ConfigError: a file is wrong, or the folder cannot be read.
         """
         self._folder, self._taken = folder, taken
-        self._stamps: dict[str, _Stamp] = {}
+        self._stamps: dict[str, _Stamp] | None = None
         self._texts: dict[str, str] = {}
         self._by_file: dict[str, Kinds] = {}
         self.faults: dict[str, ConfigError] = {}
         self._record = None if beginning is None else KeptRecord(beginning.directory / "actions.json", _Record)
         self._run = "" if beginning is None else beginning.run
-        if self._record is not None and beginning is not None and not beginning.by_hand:
-            self._go_on(self._record.now)
-        if not self._texts:
-            self.look()
-            for fault in self.faults.values():
-                raise fault
+        if self._record is not None and beginning is not None and not beginning.by_hand and self._has_gone_on():
+            self._take()
+            return
+        self.look()
+        for fault in self.faults.values():
+            raise fault
         self._take()
 
     def look(self) -> bool:
@@ -84,14 +84,15 @@ class ActionFolder:
             stamps = self._stamps_now()
         except ConfigError as error:
             is_news = self.faults.keys() != {str(self._folder)}
-            self._stamps, self.faults = {}, {str(self._folder): error}
+            self._stamps, self.faults = None, {str(self._folder): error}
             return is_news
         if stamps == self._stamps:
             return False
         for file in {*self._texts, *self.faults} - set(stamps):
             for known in (self._by_file, self._texts, self.faults):
                 known.pop(file, None)
-        for file in [file for file, stamp in stamps.items() if self._stamps.get(file) != stamp]:
+        before = self._stamps or {}
+        for file in [file for file, stamp in stamps.items() if before.get(file) != stamp]:
             self._read(file)
         for file in sorted(self.faults):  # a class may have moved from one file to another
             self._read(file)
@@ -148,6 +149,21 @@ class ActionFolder:
         except (Exception, SystemExit) as error:  # it may raise anything
             del sys.modules[module.__name__]
             raise _at_line(file, _line_of(error, file), _PYTHON, text_of(error)) from error
+        try:
+            found = self._checked(file, module, tree, others)
+        except ConfigError:
+            del sys.modules[module.__name__]
+            raise
+        if any(kind.isolate for kind in found.values()):  # their processes cannot import the module
+            pickling.send_by_value(module)
+        return found
+
+    def _checked(self, file: str, module: ModuleType, tree: ast.Module, others: Kinds) -> Kinds:
+        """Return the classes of actions of a file, by name.
+
+        Raises:
+            ConfigError: there are none, or one is wrong, or has the name of another.
+        """
         lines = {node.name: node.lineno for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
         found: dict[str, type[Action]] = {}
         for kind in _actions_of(module):
@@ -155,16 +171,15 @@ class ActionFolder:
             try:
                 check_isolation(kind)
                 signature_of_class(kind)
-            except UsageError as error:
-                raise _at_line(file, line, "a class of actions that can run", str(error)) from error
+            except Exception as error:  # to read the types of its fields runs the file's code
+                said = str(error) if isinstance(error, UsageError) else text_of(error)
+                raise _at_line(file, line, "a class of actions that can run", said) from error
             if name_of(kind) in others or name_of(kind) in found:
                 expected = "actions with different names"
                 raise _at_line(file, line, expected, f"{name_of(kind)!r} again{_where(others.get(name_of(kind)))}")
             found[name_of(kind)] = kind
         if not found:
             raise wrong(file, "", _PYTHON, None, said="none")
-        if any(kind.isolate for kind in found.values()):  # their processes cannot import the module
-            pickling.send_by_value(module)
         return found
 
     def _take(self) -> None:
@@ -176,17 +191,21 @@ class ActionFolder:
                 self._record.now = now
                 self._record.save()
 
-    def _go_on(self, before: _Record) -> None:
-        """Run the texts that held before a crash; the first look after that finds what has changed since."""
-        if before.run != self._run:
-            return
-        for file, text in before.texts.items():
+    def _has_gone_on(self) -> bool:
+        """Run the texts that held before a crash; the first look after that finds what has changed since.
+
+        Return False if this run of the system has not read the files yet.
+        """
+        if self._record is None or self._record.now.run != self._run:
+            return False
+        for file, text in self._record.now.texts.items():
             try:
                 self._by_file[file] = self._kinds_in(file, text)
             except ConfigError as error:  # the code that it uses is another one by now
                 logger.warning("%s; its text before the crash does not hold any more", error)
             else:
                 self._texts[file] = text
+        return True
 
 
 def _merged(some: Iterable[Kinds]) -> dict[str, type[Action]]:

@@ -74,15 +74,18 @@ class Scaler:
 
         What scales since now, or is not in the record, goes on with the number that is held.
         """
-        ranges = self._ranges = {keep.name: keep.range_ for keep in keeps if keep.range_ is not None}
-        for known in (self._scales, self._troubles, self._due_at):
-            for name in [name for name in known if name not in ranges]:
-                del known[name]
+        before, ranges = self._ranges, {keep.name: keep.range_ for keep in keeps if keep.range_ is not None}
+        self._ranges = ranges
+        for name in [name for name in before if before[name] != ranges.get(name)]:
+            self._troubles.pop(name, None)  # another file says what is read, or that nothing is
+            self._due_at.pop(name, None)
+        for name in [name for name in self._scales if name not in ranges]:
+            del self._scales[name]
         kept = {} if self._record is None else self._record.now.scales
         for name, range_ in ranges.items():
             if name not in self._scales:
-                before = kept[name] if name in kept else KeptScale(held.get(name, 0))
-                self._scales[name] = scaling.begun(range_, before.wanted, before.why, now)
+                known = kept[name] if name in kept else KeptScale(held.get(name, 0))
+                self._scales[name] = scaling.begun(range_, known.wanted, known.why, now)
             self._take(name, scaling.within(range_, self._scales[name]))
         self._keep()
         return {name: scale.wanted for name, scale in self._scales.items()}
