@@ -26,8 +26,8 @@ from benchmarks.measure import interleaved
 from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Answer, Ask, Echo, running, unload_all
 from benchmarks.yardsticks import pipe_echo
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.core import loading
 from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.core.loads import loading
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.messages import Load, Loaded, Message

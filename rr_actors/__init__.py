@@ -66,6 +66,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             NotRunning,
             NotSerializable,
             RegistrarDown,
+            ResourceBusy,
             ResourceLost,
             RestartIntensityExceeded,
             RrError,
@@ -96,6 +97,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.supervision.core.rendering import Tree, render
         from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
         from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
+        from rr_actors.system.console.asking.client_proxies import ClientProxy
         from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
         from rr_actors.system.event_subscribers import (
             ChildEvent,
@@ -138,6 +140,7 @@ __all__ = [
     "ChildSpec",
     "CircularDependency",
     "Client",
+    "ClientProxy",
     "ClientQuery",
     "ClientRegistrar",
     "ConfigError",
@@ -185,6 +188,7 @@ __all__ = [
     "Registrar",
     "RegistrarConfig",
     "RegistrarDown",
+    "ResourceBusy",
     "ResourceEvent",
     "ResourceInfo",
     "ResourceLost",
@@ -264,6 +268,7 @@ if not TYPE_CHECKING:
         "rr_actors.supervision.core.rendering": "Tree render",
         "rr_actors.supervision.core.specs": "Backoff ChildSpec Supervisor",
         "rr_actors.supervision.supervisor": "Child Counts SupervisorRef",
+        "rr_actors.system.console.asking.client_proxies": "ClientProxy",
         "rr_actors.system.console.connected_client": "Client ClientQuery ClientRegistrar connect",
         "rr_actors.system.event_subscribers": (
             "ChildEvent DeadLetterEvent EndedEvent Event MissedEvent ProgressEvent ResourceEvent StreamEvent"

@@ -13,7 +13,6 @@ from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
     callback_runs,
     holding,
-    loading,
     notices,
     priorities,
     reconciliation,
@@ -25,6 +24,7 @@ from rr_actors.registrar.core import (
 )
 from rr_actors.registrar.core import decide as deciding
 from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.core.loads import load_rings, loading
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved
@@ -254,7 +254,7 @@ def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
         decision.effects.pop()
 
     patch(holding, "withdraw", withdraw)
-    patch(loading, "withdraw", withdraw)
+    patch(load_rings, "withdraw", withdraw)
     return SimRegistrar
 
 
@@ -382,7 +382,7 @@ def releases_later(patch: Patch) -> type[SimRegistrar]:
 
 def no_probes(patch: Patch) -> type[SimRegistrar]:
     """Rings are not looked for."""
-    patch(loading, "_look_for_ring", lambda *args: None)
+    patch(loading, "look_for_ring", lambda *args: None)
     return SimRegistrar
 
 

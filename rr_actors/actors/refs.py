@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from types import EllipsisType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
@@ -33,6 +34,8 @@ else:
     from typing import TypeVar
 
     A = TypeVar("A", bound=pykka.Actor)
+
+_LOOK_S = 0.005  # between two questions to an actor that is to run
 
 StopReason = Literal["normal", "shutdown"]
 
@@ -167,6 +170,22 @@ class ActorRef(pykka.ActorRef[A]):
     def is_alive(self) -> bool:
         """Return whether the actor is alive. This asks its process, if it is another one."""
         return not self.actor_stopped.is_set()
+
+    def wait_running(self, timeout_s: float | None = 30.0) -> None:
+        """Wait until the actor runs, and answers: after a kill, until its supervisor has started it again.
+
+        Raises:
+            ActorUnavailable: it does not run in time. `.id`
+            UsageError: waiting is refused here, or `timeout_s` is no number of seconds.
+        """
+        limit_s = time_limit(timeout_s)
+        event_loop.check_may_block(f"waiting for {self._target.name}")
+        deadline = deadline_of(limit_s)
+        while not self.is_alive():
+            if left_until(deadline) == 0:
+                text = f"{self._target.name}: expected to run within {timeout_s:g} s, and does not"
+                raise ActorUnavailable(text, id=self._target.name)
+            time.sleep(_LOOK_S)
 
     @property
     def pid(self) -> int | None:

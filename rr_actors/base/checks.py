@@ -7,6 +7,7 @@ import functools
 import inspect
 import math
 import os
+import shlex
 from collections.abc import Callable, Generator, Mapping, Sequence
 from types import FunctionType, MethodType
 from typing import Any, NamedTuple, TypeGuard, cast
@@ -208,9 +209,24 @@ def needing(what: str, extra: str, instead: str = "") -> Generator[None]:
         raise missing_library(library, what, extra, instead) from error
 
 
+EXTRAS = {
+    "progress": ("rich>=13.7",),
+    "cli": ("rich>=13.7", "typer>=0.20"),
+    "top": ("rich>=13.7", "typer>=0.20", "textual>=8.2"),
+    "web": ("rich>=13.7", "typer>=0.20", "nicegui>=3.5"),
+    "otel": ("opentelemetry-sdk>=1.27",),
+    "temoto": ("rich>=13.7", "typer>=0.20", "pyyaml>=6.0"),
+}
+"""What the extras of this package install, as in pyproject.toml."""
+
+
 def missing_library(library: str, what: str, extra: str, instead: str = "") -> UsageError:
-    """Return the error for a library that is not installed; the other arguments are those of needing()."""
-    install = f"pip install 'rr-actors[{extra}]' (in a checkout: '.[{extra}]'){instead}"
+    """Return the error for a library that is not installed; the other arguments are those of needing().
+
+    It names the libraries themselves, and not this package's extra: the package is on no index.
+    """
+    wanted = shlex.join(EXTRAS[extra])
+    install = f"pip install {wanted} (in a checkout of rr_actors: pip install '.[{extra}]'){instead}"
     text = f"{what} needs the library {library}, which is not installed. Install it with: {install}"
     return UsageError(text, library=library, extra=extra)
 

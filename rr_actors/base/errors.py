@@ -6,7 +6,8 @@
     ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
     │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
     │                       NotFound ChildRunning ChildRestarting NotForDynamic TooManyChildren
-    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring), OverCapacity, GraphError;  LoadTimeout
+    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring), OverCapacity, ResourceBusy, GraphError;
+    │                       LoadTimeout
     ├─ UnloadFailed(.trace)
     ├─ ResourceLost
     ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull NotRunning
@@ -341,6 +342,18 @@ class OverCapacity(LoadFailed):
     asked: float
     free: float
     holders: tuple[str, ...] = ()
+
+
+class ResourceBusy(LoadFailed):
+    """Somebody else holds the exclusive resource, and the load may not wait (longer) for it: `wait_s` is over.
+
+    `.holder`: the registrar that has it, "" while nobody does; `.since`: when that one asked for it, in seconds since
+    1970, or None; `.waiting`: how many others waited for it. `.server`
+    """
+
+    holder: str
+    since: float | None = None
+    waiting: int = 0
 
 
 class GraphError(LoadFailed, UsageError, ValueError):

@@ -102,6 +102,7 @@ class Order:
     stop_signal: int = signal.SIGTERM
     grace_s: float = 5.0  # at most LONGEST_S
     limits: dict[str, float] = field(default_factory=dict[str, float])
+    inherit: bool = False  # its output goes to this process's, too
 
 
 class ExternalPrograms:
@@ -275,9 +276,9 @@ class ExternalPrograms:
         """Return the file to which the output of a program is written while it runs."""
         return self._home(key).path / OUTPUT
 
-    def last_output(self, key: str) -> tuple[str, ...]:
+    def last_output(self, key: str, lines: int = TAIL_LINES) -> tuple[str, ...]:
         """Return the last lines of a program's output."""
-        return self._home(key).output(TAIL_LINES)
+        return self._home(key).output(lines)
 
     def close(self, *, final: bool = False) -> None:
         """Stop watching the programs. They run on, and can be attached to again.
@@ -314,7 +315,7 @@ class ExternalPrograms:
                 os.environ,
                 file_actions=[
                     (os.POSIX_SPAWN_DUP2, order_end, 0),
-                    (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
+                    *(() if order.inherit else ((os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),)),
                     (os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0),
                 ],
                 setsid=True,

@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec.structs import replace
 
-from rr_actors.base.errors import CatalogError, InvalidRequest, RrError, shown
+from rr_actors.base.errors import CatalogError, InvalidRequest, NotFound, RrError, UsageError, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running, with_output
@@ -33,6 +33,7 @@ from rr_actors.managers.program_conditions import (
     probe_agrees,
     what_is_missing,
 )
+from rr_actors.managers.program_directory import OutputLog
 from rr_actors.registrar.declarations import costing, server
 from rr_actors.registrar.engine.server import ServerSpec, checked_spec, checked_whole
 from rr_actors.registrar.manager import Manager
@@ -130,6 +131,7 @@ class Programs(Manager):
         linger_s: float = 0.0,
         paused_s: float | None = None,
         cost_from: str = "budgets",
+        output: Literal["file", "log", "inherit"] = "file",
     ) -> None:
         """Keep a directory for each program below `directory` (default: "programs" beside the registrar's catalog).
 
@@ -139,10 +141,19 @@ class Programs(Manager):
                 program keeps its memory and takes no CPU: its control group is frozen, with all that it started.
                 Where none can be made, each of its processes is stopped by SIGSTOP.
             cost_from: the child of the system that runs Budgets, for the requests with a `cost`, as for @rr.server.
+            output: where the output of the programs goes. It is always in a file, of at most 512 KiB for each program:
+                output() and ``rr-actors logs`` show its last lines. "log": each line is a log line of this manager,
+                too. "inherit": it goes to the standard output of this process, too, as a journal or a container
+                collects it; what nobody reads in time is left out there.
 
         Raises:
             InvalidName: `cost_from` is no name.
+            UsageError: `output` is none of these.
         """
+        if output not in ("file", "log", "inherit"):
+            raise UsageError(f"Programs: output: expected 'file', 'log' or 'inherit', got {shown(output)}")
+        self._inherits = output == "inherit"
+        self._output_log = OutputLog() if output == "log" else None
         self._directory = directory
         self._probes = dict(probes or {})
         self._cost_from = check_name(cost_from, "cost_from")
@@ -156,17 +167,39 @@ class Programs(Manager):
         """Stop watching the programs. They run until their holders release them; a last stop ends those that start."""
         self._is_stopped.set()
         self._external.close(final=self._final)
+        if self._output_log is not None:
+            self._output_log.close()
+
+    def output(self, program: str, lines: int = 20) -> list[str]:
+        """Return the last lines of a program's output, whether it runs or has ended unasked.
+
+        Args:
+            program: the id of its resource.
+
+        Raises:
+            NotFound: there is no such program. `.id`, `.known`
+        """
+        known = tuple(info.id for info in self.registrar.resources())
+        if program not in known:
+            text = f"no program {shown(program)}: expected one of {', '.join(known) or 'none'}"
+            raise NotFound(text, id=program, known=known)
+        return list(self._external.last_output(program, max(1, lines)))
 
     @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _adapted()
     def run_program(self, request: RunProgram) -> Program:
         """Start a program, or adopt one that an interrupted load has started."""
         me = current()
-        order, missing = _order(request), self._missing(request.ready, repeated=me.attempt > 1)
+        order, missing = _order(request, self._inherits), self._missing(request.ready, repeated=me.attempt > 1)
         timeout_s = request.ready.timeout_s
         check = self._check(request)
         stop = me.stopping.is_set
         start = functools.partial(self._external.start, missing=missing, timeout_s=timeout_s, is_unwanted=stop)
-        running = start(me.resource_id, order, attempt=me.attempt)
+        self._log_output(request, from_start=me.attempt == 1)
+        try:
+            running = start(me.resource_id, order, attempt=me.attempt)
+        except BaseException:
+            self._log_no_more(me.resource_id)
+            raise
         self._begin_checks(check)
         return Program(*running)
 
@@ -175,6 +208,7 @@ class Programs(Manager):
         """End the program and all its descendants."""
         self._checks.pop(current().resource_id, None)
         self._external.stop(current().resource_id)
+        self._log_no_more(current().resource_id)
         if self._directory is None:
             with contextlib.suppress(OSError):  # others run
                 self._beside.rmdir()
@@ -183,6 +217,7 @@ class Programs(Manager):
     def find_program(self, request: RunProgram, response: Program) -> Program:
         """Watch the program again if it still runs."""
         running = self._external.attach(current().resource_id)
+        self._log_output(request, from_start=False)
         self._begin_checks(self._check(request))
         return Program(*running)
 
@@ -260,6 +295,16 @@ class Programs(Manager):
                 logger.info("%s: %s", resource_id, error)
             return
 
+    def _log_output(self, request: RunProgram, *, from_start: bool) -> None:
+        if self._output_log is not None:
+            id = current().resource_id
+            name = f"{Path(request.command).name} {request.instance}".rstrip()
+            self._output_log.follow(id, name, self._external.output_file(id), from_start=from_start)
+
+    def _log_no_more(self, resource_id: str) -> None:
+        if self._output_log is not None:
+            self._output_log.leave(resource_id)
+
     def _check(self, request: RunProgram) -> ProgramCheck | None:
         if request.health is None:
             return None
@@ -287,7 +332,7 @@ class Programs(Manager):
         return lambda running: what_is_missing(conditions, running) or probe(running)
 
 
-def _order(request: RunProgram) -> Order:
+def _order(request: RunProgram, inherit: bool) -> Order:
     return Order(
         request.command,
         list(request.arguments),
@@ -297,6 +342,7 @@ def _order(request: RunProgram) -> Order:
         _signal_number(request.stop_signal),
         min(request.grace_s, LONGEST_S),
         {what: amount for what, amount in request.cost.items() if what in CONTROLLERS},
+        inherit,
     )
 
 

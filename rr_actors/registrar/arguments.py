@@ -163,6 +163,7 @@ class GroupKeywords(TypedDict, total=False):
     timeout_s: float | None
     parent: Parent | None
     priority: int | None
+    wait_s: float | None
 
 
 class LoadKeywords(GroupKeywords, total=False):
@@ -186,6 +187,7 @@ class LoadOptions(msgspec.Struct, frozen=True):
     progress: ProgressWanted = False
     priority: int | None = 0
     own: bool = False
+    wait_s: float | None = None
     codec: Codec | None = None
     loop: CallersLoop | None = None
 
@@ -209,9 +211,12 @@ def checked(
     """
     options = cast("LoadKeywords", given)  # this call's own dict
     for name in options.keys() - names.__annotations__.keys():
-        raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}")
+        hint = did_you_mean(name, names.__annotations__)
+        raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}{hint}")
     if "timeout_s" in options:
         options["timeout_s"] = time_limit(options["timeout_s"])
+    if "wait_s" in options:
+        options["wait_s"] = _checked_wait(options["wait_s"], called)
     codec = None if response_type is None else codec_for(response_type)
     on_status = options.get("on_status")
     status_callback(on_status, called.removesuffix("_async"))
@@ -222,6 +227,21 @@ def checked(
     if "priority" in options:
         options["priority"] = checked_priority(options["priority"], called)
     return LoadOptions(**options, own="priority" in options, codec=codec, loop=loop)
+
+
+def _checked_wait(value: object, called: str) -> float | None:
+    """Return how long a load may wait in line; None: as long as the load may take.
+
+    Raises:
+        UsageError: it is neither None nor a number of 0 or more.
+    """
+    if value is None:
+        return None
+    if is_a(value, (int, float)) and not is_a(value, bool):
+        seconds = exact_number(cast("float", value))
+        if seconds >= 0:  # NaN is not
+            return float(min(seconds, threading.TIMEOUT_MAX))
+    raise UsageError(f"{called}: wait_s: expected seconds, 0 or more, or None, got {shown(value)}")
 
 
 def callers_loop(callback: StatusCallback | None) -> CallersLoop | None:

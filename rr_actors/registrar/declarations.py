@@ -77,6 +77,8 @@ class server:  # noqa: N801 - used as a decorator
         health: Health | None = None,
         provides: Labels | None = None,
         at_once: int | None = None,
+        exclusive: bool = False,
+        grace_s: float | None = None,
         cost: Cost | None = None,
         cost_from: str = "budgets",
         request_type: Any = None,
@@ -88,6 +90,7 @@ class server:  # noqa: N801 - used as a decorator
         callbacks, types = (_nothing, None, None, None), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s, health=health)
+        spec = replace(spec, exclusive=exclusive, grace_s=grace_s)
         self._spec = checked_spec(replace(spec, provides=provides, at_once=at_once))
         self._cost = None if cost is None else _Cost(self._spec, cost, check_name(cost_from, "cost_from"))
 
@@ -238,6 +241,10 @@ class Declared(Generic[Request, Returned, Response]):
         """Return the id of the child whose pools its resources hold amounts of; "" if they cost nothing."""
         return "" if self._cost is None else self._cost.budgets
 
+    def _callbacks(self) -> set[str]:
+        """Return the names of the methods that are its callbacks."""
+        return {self._load.__name__, *(callback.__name__ for callback in self._others.values())}
+
     def _declaring(self) -> Declaring:
         """Return which class declares the server.
 
@@ -281,6 +288,7 @@ class Declaring(NamedTuple):
 # For the package's own modules. As private methods they stay out of an editor's list of names.
 spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
 declaring = Declared[Any, Any, Any]._declaring  # pyright: ignore[reportPrivateUsage]
+callbacks_of = Declared[Any, Any, Any]._callbacks  # pyright: ignore[reportPrivateUsage]
 cost_from = Declared[Any, Any, Any]._cost_from  # pyright: ignore[reportPrivateUsage]
 
 

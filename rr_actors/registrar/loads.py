@@ -429,6 +429,7 @@ class Loads:
             self.withdraw(query)
             raise
         finally:
+            self.actor.catalog.wait_limits.pop(query.id, None)
             if starts:
                 self._starting.discard(query.id)
         return query
@@ -458,6 +459,7 @@ class Loads:
             self.withdraw(query)
             raise
         finally:
+            self.actor.catalog.wait_limits.pop(query.id, None)
             if starts:
                 self._starting.discard(query.id)
             if hearer is not None:
@@ -520,6 +522,8 @@ class Loads:
         self.calls.check_open()
         if options.own:
             check_allowed(options.priority, self.actor.config)
+        if options.wait_s is not None:
+            self.actor.catalog.wait_limits[query.id] = round(1000 * options.wait_s)
         if options.on_status is not None:
             self.views.callbacks.set(query.id, described(options.on_status, "load: on_status"), options.loop)
 
@@ -732,7 +736,7 @@ def _rank(options: LoadOptions) -> int:
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
     """Return the failure of a load that has taken too long. Its text says what the provider seems to be doing."""
     server = f"{query.registrar}/{query.server}"
-    status, doing = _doing(actor, query.registrar, "load callback, or the unload callback before it,")
+    status, doing = _doing(actor, query.registrar, "load callback, or an unload for which it waits,")
     text = f"{server}: not loaded within {timeout_s:g} s; {query.registrar} is {doing}; the load is withdrawn"
     return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
 

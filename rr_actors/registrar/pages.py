@@ -20,7 +20,7 @@ import msgspec
 from rr_actors.base.names import named
 from rr_actors.base.values.canonical import json_of, shown_plain, text_of_value
 from rr_actors.registrar.core.callback_runs import run_id
-from rr_actors.registrar.core.loading import is_reloaded
+from rr_actors.registrar.core.loads.loading import is_reloaded
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model import failures
@@ -104,8 +104,8 @@ class ResourceRow(msgspec.Struct, frozen=True):
         request, response: as JSON, cut if it is long. What JSON does not have is shown as in Python.
         phase: "queued", "loading", "loaded", "reloading", "unloading", "unload_failed", "pausing", "paused" or
             "resuming".
-        state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening");
-            if it could not be unloaded, the reason.
+        state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening"),
+            and while it is queued, its place in line; if it could not be unloaded, the reason.
         holders: the first 20 queries on it; `holder_count`: how many there are.
         parts: the ids of the first 20 queries that it depends on; `part_count`: how many there are.
         part_resources: the ids of the resources that those are on, of those that are loaded.
@@ -550,7 +550,7 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
     for row, (phase, others) in zip(resources, neighbours, strict=True):
         state = str(row.state) if row.phase is Phase.LOADED else ""
         message = row.message
-        if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
+        if row.phase in (Phase.LOADING, Phase.QUEUED) and (progress := actor.progress.newest(row.id)) is not None:
             message = shown_progress(*progress)
         elif row.server not in actor.catalog.servers:
             message = failures.waits_for_server(actor.catalog, row)

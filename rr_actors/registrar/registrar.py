@@ -299,8 +299,10 @@ class Consumer(abc.ABC):
             parent: rr.current() of the callback, if another thread makes the call for it.
             priority: how urgently the resource is needed, from -1000 to 1000; None: on standby. A dependency for which
                 none is given inherits the priority of the resource that needs it (docs/planning.md).
+            wait_s: seconds that the load may wait in line for an exclusive resource. With 0 it fails at once while
+                somebody has it. None: as long as the whole load may take.
             progress: a callable that hears each rr.Progress that the load callback reports, while this load waits. Or
-                True: draw a bar, if the error output is a terminal (needs `rr-actors[progress]`). The thread that waits
+                True: draw a bar, if the error output is a terminal (needs the extra `progress`). The thread that waits
                 calls it: the calling thread, with load_async() the task's event loop, with ``block=False`` a worker.
             block: False returns a Pykka future of the query at once.
 
@@ -312,6 +314,7 @@ class Consumer(abc.ABC):
                 places.
             CircularDependency: the request would wait for itself. `.ring` has the servers around the ring; the text
                 names the request that closes it.
+            ResourceBusy: somebody else has the exclusive resource, and `wait_s` is over. `.holder`, `.since`
             LoadTimeout: the provider did not answer in time.
             UnknownServer, UnknownRegistrar, InvalidName: there is no such server.
             InvalidRequest, NotSerializable: the request has another type, or cannot travel.
@@ -378,7 +381,7 @@ class Consumer(abc.ABC):
 
         Args:
             requests: one ("registrar/server", request) for each load.
-            on_status, parent, priority: as for load(), for each load.
+            on_status, parent, priority, wait_s: as for load(), for each load.
             timeout_s: seconds that each load may take. None: no limit.
 
         Returns:
@@ -612,6 +615,8 @@ class Registrar(Consumer):
         probe: Callable[..., Any] | None = None,
         provides: Mapping[str, Mapping[str, object]] | None = None,
         at_once: int | None = None,
+        exclusive: bool = False,
+        grace_s: float | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
@@ -655,6 +660,11 @@ class Registrar(Consumer):
             at_once: how many callbacks of the server run at a time; others wait, in their order. A callback that waits
                 for a load, an unload or a reply lets another in meanwhile. Default: None, as many as there are. Give 1
                 where a driver is not safe for threads. A serial manager has 1 for all its servers.
+            exclusive: each resource has one holder at a time. The other loads of its request wait in line: the most
+                urgent first, then the one that came first. Default: False, they share it. Give True for what two
+                users must not use at the same time, such as an instrument.
+            grace_s: how long the holder of an exclusive resource has to release it when a load with a higher priority
+                waits. It hears FATAL, with ``status.reason == "revoked"``. Default: None, 5 seconds.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -666,7 +676,7 @@ class Registrar(Consumer):
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, usage=usage, idle=idle, paused_s=paused_s)
         spec = replace(spec, pause=pause, resume=resume, health=health, probe=probe)
-        spec = replace(spec, provides=provides, at_once=at_once)
+        spec = replace(spec, provides=provides, at_once=at_once, exclusive=exclusive, grace_s=grace_s)
         self._register_spec(checked_whole(checked_spec(spec)))
 
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:

@@ -77,6 +77,8 @@ from rr_actors.supervision.import_guard import check_children_can_import, check_
 from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of, renamed_managers
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system.backups import Backup, back_up, restore
+from rr_actors.system.console.asking.waiting import waited_for
+from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
@@ -92,6 +94,7 @@ from rr_actors.system.registrar_lookup import (
     registrar_in,
     take_over,
 )
+from rr_actors.system.service_notices import ServiceNotices
 from rr_actors.system.snapshots import (
     ask_registrars,
     describe_at,
@@ -192,6 +195,7 @@ class System:
         self._ended = Flag()
         self._end: ExitReport | None = None
         self._why_stopped = _NOT_RUNNING
+        self._service: ServiceNotices | None = None
 
     # -- life ----------------------------------------------------------------------------------------------------
 
@@ -329,6 +333,8 @@ class System:
                 await self._console.open()
             self._tree = prepare(node, SupervisorActor, self._top, weakly(self._tree_ended))
             await self._start_tree(self._tree)
+            self._service = ServiceNotices(node.dispatcher.loop)
+            self._service.started(f"system {self.name} runs in {info.state_dir}")
         except BaseException:
             console, self._console, self._tree = self._console, None, None
             try:
@@ -414,6 +420,9 @@ class System:
         console, self._console = self._console, None
         if console is not None:
             console.stopping = True
+        service, self._service = self._service, None
+        if service is not None:
+            service.stopping()
         self._winding = asyncio.ensure_future(self._wind_up(node, limit_s, steps))
         if self._hurries:
             self._hurry()
@@ -424,6 +433,8 @@ class System:
             raise
         finally:
             self._winding = None
+            if service is not None:
+                service.close()
             if console is not None:
                 await steps.take_async("closing the console", console.close())
             await steps.take_async("closing the process's part of it", node.close())
@@ -597,6 +608,8 @@ class System:
             except (RrError, OSError) as error:  # a full disk: they wait for their time limits
                 logger.warning("system %s: the end of its tree could not be marked: %s", self.name, error)
         logger.error("system %s: its root supervisor has ended: %s", self.name, why)
+        if self._service is not None:
+            self._service.ended(why)
         if self._node is not None:
             self._node.emit("ended", path=self._top, reason=report.reason, detail=report.detail)
         self._ended.set()
@@ -703,6 +716,35 @@ class System:
                 raise
             raise NotFound(f"{error}; did you mean {' or '.join(map(repr, meant))}?", id=id) from error
         return ref_to(f"{supervisor.path}/{child_id}")
+
+    def wait_for(self, id: str, state: str = "", *, timeout_s: float | None = 30.0) -> str:
+        """Wait until a child or a resource is in a state, and return the state. `rr-actors wait` does the same.
+
+        Args:
+            id: a child's id or path; or a resource's name, such as 'cameras/camera "front"', or its id.
+            state: of a child "running", "starting", "restarting" or "stopped"; of a resource its phase, such as
+                "loaded" or "paused", or its state, such as "OK" or "FATAL"; or "gone". Default: the child runs, or the
+                resource is loaded.
+
+        Raises:
+            Unavailable: it was not in time; the text has the state that was seen last.
+            NotRunning: the system has ended.
+            UsageError: there is no such state, several children or resources have this name, or the system has no
+                console (SystemConfig.console).
+        """
+        self._running()
+        check_may_block("System.wait_for()")
+        if not self.config.console:
+            raise UsageError("wait_for: expected a system with a console, got SystemConfig(console=False)")
+
+        def is_so(seen: str) -> bool:
+            """Return whether a child that its supervisor calls running answers: it may not know of a kill yet."""
+            if seen == "running":
+                with contextlib.suppress(NotFound):  # a supervisor
+                    return self.ref(id).is_alive()
+            return True
+
+        return waited_for(lambda: ConsoleClient(find_console(self.state_dir)), id, state, timeout_s, is_so)
 
     def supervisor(self, path: str | None = None) -> SupervisorRef:
         """Return a supervisor by its path of ids, "root/inner" or "inner"; without a path, the root supervisor.
@@ -920,6 +962,8 @@ class System:
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
+        if event["event"] == "restarted" and self._service is not None:
+            self._service.restarted(event["path"])
         if event.pop("kept", False) or "path" in event:
             self._memory.take(event)
         if self._subscribers.listened:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -40,16 +41,30 @@ def explain(client: ConsoleClient, id: str) -> list[str]:
     if not found.queries and not found.resources:
         hint = "; ".join(found.notes) or "rr-actors resources lists those that there are"
         raise UnknownQuery(f"{shown(id)}: no query and no resource has this id ({hint})", query_id=id)
-    if len(found.queries) + len(found.resources) > _MOST:
+    line = _line_of(found)
+    resources = [row for row in found.resources if row not in line]
+    if len(found.queries) + len(resources) > _MOST:
         ids = short_ids(row.id for row in (*found.resources, *found.queries))
         several = few(f"{ids[row.id]} ({row.name})" for row in (*found.resources, *found.queries))
         raise UsageError(f"{shown(id)}: several ids have this in them: {several}; give more of the id")
     lines: list[str] = []
     for query in found.queries:
         lines += _of_query(client, query)
-    for resource in found.resources:
+    for resource in resources:
         lines += _of_resource(client, resource)
+    for waiting in line:
+        holder = waiting.holders[0]
+        said = f" ({waiting.message})" if waiting.message else ""
+        lines.append(f"{holder.origin} waits for it{_since(holder.query_id)}{_priority(holder.priority)}{said}.")
     return [*lines, *(f"Not asked: {note}" for note in found.notes)]
+
+
+def _line_of(found: Found) -> list[ResourceRow]:
+    """Return the rows of the loads that wait for another of these resources, the most urgent and oldest first."""
+    line = [row for row in found.resources if row.phase == "queued" and row.holders]
+    if found.queries or len(line) == len(found.resources):  # the id names a load that waits
+        return []
+    return sorted(line, key=lambda row: (math.inf if row.priority is None else -row.priority, row.id))
 
 
 def since(id: str) -> float | None:
@@ -192,7 +207,8 @@ def _named(resource: ResourceRow) -> str:
 def _phase(resource: ResourceRow) -> str:
     match resource.phase:
         case "queued":
-            return "waits until an earlier resource of the same request is unloaded."
+            place = f": {resource.message}" if resource.message else ""
+            return f"waits until an earlier resource of the same request is unloaded{place}."
         case "loading":
             again = f", attempt {resource.attempt}" if resource.attempt > 1 else ""
             far = f", {resource.message} so far" if resource.message else ""

@@ -175,7 +175,7 @@ def test_all_that_happens_for_want_of_room_is_told_by_name(house: House) -> None
         rows = json.loads(run_cli("loads", "--json", "--state", house.system.state_dir).stdout)["waiting"]
         return next((row["said"] for row in rows if f'device [\\"{what}' in row["request"]), "")
 
-    room = "0% waits for room in pool 'watts': asked"
+    room = "waits for room in pool 'watts': asked"
     held = f'{room} 50, free 40 of 100; held by devices/device ["heater",60,0.0] (priority 1)'
     assert eventually(lambda: because("oven") == held)
     behind = f'{room} 60, free 40 of 100; behind devices/device ["oven",50,60] (priority 1)'

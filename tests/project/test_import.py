@@ -37,12 +37,13 @@ SELDOM = {
 }  # fmt: skip
 """What only some programs need, or only the command line, the managers for external programs, a file to be read."""
 
-MOST_MODULES = 362
+MOST_MODULES = 371
 """Each takes a quarter of a millisecond. Ten are the console's, which each system has by default; one is the web
 page's, four draw pictures for notebooks, ten are the two ends of streams, six are a registrar's servers with their
 room, two are the backup's, one notes the messages between actors, four look at mailboxes and pause them, two make
-children processes of multiprocessing, with its `util`, and one remembers what happened. One is `_tokenize`, of Python
-3.12 and later. 128 of them come with asyncio, sqlite3, msgspec, pykka and cloudpickle."""
+children processes of multiprocessing, with its `util`, and one remembers what happened. Two are for loads that wait in
+line, with their room, three for what is asked from outside, with theirs, and one is for systemd. One is `_tokenize`, of
+Python 3.12 and later. 128 of them come with asyncio, sqlite3, msgspec, pykka and cloudpickle."""
 
 BARE_MODULES = 12
 """Of the import alone: what decides which module a name is in, and leaves the garbage collector alone meanwhile."""
@@ -50,7 +51,7 @@ BARE_MODULES = 12
 HELP_MODULES = 126
 """Of `rr-actors --help`, and a TAB for a verb: typer's, msgspec's, and a few of the base."""
 
-PS_MODULES = 409
+PS_MODULES = 412
 """Of `rr-actors ps`, and a TAB for one of its options: these and the console's, which are nearly all of a system."""
 
 USED = "import rr_actors as rr; rr.System; rr.Manager; rr.Supervisor; rr.Actor; rr.connect"

@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.core import loading, unloading
+from rr_actors.registrar.core import unloading
 from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.core.loads import loading
 from rr_actors.registrar.engine import registrar_state
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Decision, Server

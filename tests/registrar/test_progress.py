@@ -562,7 +562,9 @@ def test_without_rich_the_error_says_what_to_install(
     serve(provider, "camera")
     monkeypatch.setitem(sys.modules, "rich.console", None)
     monkeypatch.delitem(sys.modules, "rr_actors.registrar.progress_bar", raising=False)
-    with pytest.raises(rr.UsageError, match=r"pip install 'rr-actors\[progress\]'"):
+    with pytest.raises(
+        rr.UsageError, match=r"pip install 'rich>=[\d.]+' \(in a checkout of rr_actors: pip install '\.\[progress\]'\)"
+    ):
         app.load("provider/camera", "front", progress=True)
 
 

@@ -14,6 +14,7 @@ from simulation.__main__ import main
 from simulation.process_faults import (
     AT_ONCE_FIRST,
     BRIEF_FIRST,
+    EXCLUSIVE_FIRST,
     FIRST,
     HASTY_FIRST,
     IDLE_FIRST,
@@ -108,7 +109,7 @@ FIRSTS = (
         HASTY_FIRST,
         TELL_FIRST,
     ),
-    *(AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST),
+    *(AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST, EXCLUSIVE_FIRST),
 )
 
 

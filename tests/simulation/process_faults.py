@@ -39,7 +39,9 @@ REVOKE_FIRST = 2**51
 IDLE_FIRST = 2**52
 """From here on, servers pause what idles."""
 RELOAD_FIRST = 2**53
-"""From here on, owners reload resources; fresh seeds are from here."""
+"""From here on, owners reload resources."""
+EXCLUSIVE_FIRST = 2**54
+"""From here on, some servers are exclusive, and some loads wait in line only for a while; fresh seeds are from here."""
 PRIORITIES = (STANDBY, -3, 0, 0, 4, 9)
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 

@@ -31,11 +31,13 @@ def come_to_rest(world: World) -> None:
         if registrar.state not in ("away", "absent"):
             world.up(registrar.name)
     finish(world)
+    take_turns(world)
     while away := [r.name for r in world.live() if r.state != "up"]:
         check_disks(world)  # some of them were closed only now
         for name in away:
             world.up(name)
         finish(world)
+        take_turns(world)
     check_disks(world)
     check(world, links_are_new=False)
     cut_all(world)
@@ -62,6 +64,39 @@ def finish(world: World) -> None:
                 left -= 1
         if left < 0:
             raise Violation("no rest", f"still busy after {_LIMIT} steps: {keys[:5]}")
+
+
+def take_turns(world: World) -> None:
+    """Whoever has an exclusive resource for which others wait releases it, until nobody waits."""
+    for _ in range(_LIMIT):
+        if not any(_ends(world, query, set()) for query in _in_the_way(world)):
+            return
+        finish(world)
+
+
+def _in_the_way(world: World) -> list[ServedQuery]:
+    """The queries on exclusive resources for which others wait."""
+    found: list[ServedQuery] = []
+    for registrar in world.live():
+        catalog = registrar.catalog
+        for key in catalog.queued:
+            if registrar.state == "up" and (server := catalog.servers.get(key[0])) is not None and server.exclusive:
+                found += [query for resource in catalog.used(key) for query in catalog.queries_of(resource.id)]
+    return found
+
+
+def _ends(world: World, query: ServedQuery, seen: set[str]) -> bool:
+    """Have a person release this query, or what it is for. Return whether somebody has."""
+    if query.id in seen:
+        return False
+    seen.add(query.id)
+    if not query.parent:
+        return world.apply(("unload", query.origin, query.id))
+    origin = world.registrars[query.origin]
+    wholes = origin.catalog.queries_of(query.parent)
+    if not wholes and "linger:" + query.parent in origin.timers:
+        return world.apply(("timer", origin.name, "linger:" + query.parent))
+    return any(_ends(world, whole, seen) for whole in wholes)
 
 
 def _can(world: World, key: Key) -> bool:
@@ -177,7 +212,7 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
 
 
 INDEXES = (
-    *("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
+    *("by_request", "unloading", "queued", "lost", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
     *("parts", "outbound", "unsettled", "moving", "resting", "own_notices", "ranked"),
 )
 

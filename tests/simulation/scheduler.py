@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from rr_actors.registrar.model.catalog import Server
 from simulation.pending_steps import Key
-from simulation.process_faults import FIRST, HASTY_FIRST, IDLE_FIRST, Rough
+from simulation.process_faults import EXCLUSIVE_FIRST, FIRST, HASTY_FIRST, IDLE_FIRST, Rough
 from simulation.world import Step, World
 
 REQUESTS = (b"p", b"q")
@@ -42,6 +42,14 @@ def _with_pauses(rng: random.Random, plain: dict[str, tuple[Server, ...]]) -> di
     }
 
 
+def _with_exclusive(rng: random.Random, plain: dict[str, tuple[Server, ...]]) -> dict[str, tuple[Server, ...]]:
+    some = rng.random()
+    return {
+        name: tuple(replace(s, exclusive=True, grace_ms=1000) if rng.random() < some else s for s in servers)
+        for name, servers in plain.items()
+    }
+
+
 class Chance:
     """Draws the steps of one run. How often what happens differs from run to run: rare mixes are found sooner."""
 
@@ -50,6 +58,10 @@ class Chance:
         self.layout = layout(self.rng)
         if seed >= IDLE_FIRST:
             self.layout = _with_pauses(random.Random(f"idle {seed}"), self.layout)
+        self._waits: random.Random | None = None
+        if seed >= EXCLUSIVE_FIRST:
+            self._waits = random.Random(f"exclusive {seed}")
+            self.layout = _with_exclusive(self._waits, self.layout)
         self.names = list(self.layout)
         self.providers = [name for name, servers in self.layout.items() if servers]
         draw = self.rng.random
@@ -188,5 +200,8 @@ class Chance:
         server = self.rng.choice(servers).name if self.rng.random() < 0.98 else "none"
         self.asked += 1
         direct = self.direct > 0 and self.rng.random() < self.direct
-        step = ("load", f"q{self.asked}", name, provider, server, self.rng.choice(REQUESTS), direct)
-        return step if self.rough is None else self.rough.with_priority(step)
+        step: Step = ("load", f"q{self.asked}", name, provider, server, self.rng.choice(REQUESTS), direct)
+        step = step if self.rough is None else self.rough.with_priority(step)
+        if self._waits is not None and self._waits.random() < 0.2:
+            step = (*(*step, 0)[:8], self._waits.choice((0, 1000)))
+        return step

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from rr_actors.registrar.core.loading import is_reloaded
+from rr_actors.registrar.core.loads.loading import is_reloaded
 from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.core.status_delivery import is_listened
 from rr_actors.registrar.model import commands as c
@@ -48,6 +48,7 @@ def _unload_resolved(shell: SimShell, effect: e.UnloadResolved) -> None:
 
 
 def _load_resolved(shell: SimShell, effect: e.LoadResolved) -> None:
+    shell.catalog.wait_limits.pop(effect.held.id, None)
     if effect.failure is not None:
         shell.world.leave_line(effect.held.id)  # which is cut
     if not shell.world.has_line(effect.held.id):  # else its thread waits for the line's own answer
@@ -180,6 +181,10 @@ def _ring_broken(shell: SimShell, effect: e.RingBroken) -> None:
     shell.world.note(f"{shell.name}: {effect.why}")
 
 
+def _in_line(shell: SimShell, effect: e.InLine) -> None:
+    shell.world.note(f"{shell.name}: {effect.resource_id} is {effect.text or 'in line no more'}")
+
+
 ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.SendReply: _reply,
     e.SendRequest: _request,
@@ -196,4 +201,5 @@ ACT: dict[type, Callable[[SimShell, Any], None]] = {
     e.Died: _died,
     e.Acquitted: _acquitted,
     e.RingBroken: _ring_broken,
+    e.InLine: _in_line,
 }

@@ -310,7 +310,10 @@ class SimShell:
         others = [self.catalog.resources[id] for id in ids]
         if self.catalog.resources[resource.id].state is State.FATAL:  # it was, before it began
             return {r.id for r in others}
-        return {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
+        apart = {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
+        if self.catalog.servers[resource.server].exclusive:  # whoever holds it is to release it first
+            apart -= {r.id for r in others if r.phase is not Phase.UNLOAD_FAILED and r.id in self.catalog.holders}
+        return apart
 
     def ask(self, ask: c.AskProvider, run: Run | None) -> None:
         """Load by the loop, for a callback or for somebody outside."""

@@ -6,11 +6,12 @@ from typing import Any, cast
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
-from rr_actors.registrar.core import holding, loading
+from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.callback_runs import ATTEMPTS, is_given_up
 from rr_actors.registrar.core.decide import decide, refuse_uncommitted
+from rr_actors.registrar.core.loads import loading
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Decision
+from rr_actors.registrar.model.catalog import Decision, loaded
 from rr_actors.registrar.model.effects import Happened, SendReply
 from rr_actors.registrar.model.messages import Load, Loaded, Message, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import (
@@ -100,6 +101,7 @@ class SimRegistrar(SimShell):
             decision.undo()
             raise
         decision.close()
+        self._check_alone()
         if fault == "after":
             raise Killed
         self.effects.extend(decision.effects)
@@ -107,6 +109,18 @@ class SimRegistrar(SimShell):
             self.act()
         if fault == "during":
             raise Killed
+
+    def _check_alone(self) -> None:
+        """Of a request of an exclusive server, one resource has a holder, and this has one; the others wait."""
+        catalog = self.catalog
+        for server in (server for server in catalog.servers.values() if server.exclusive):
+            had: dict[bytes, list[str]] = {}
+            for id in catalog.by_server.get(server.name, ()):
+                resource = catalog.resources[id]
+                if resource.phase not in (Phase.QUEUED, Phase.UNLOADING, Phase.UNLOAD_FAILED):  # these are released
+                    had.setdefault(resource.request, []).extend(catalog.holders.get(id, ()))
+            if crowd := [ids for ids in had.values() if len(ids) > 1]:
+                raise Violation("two holders", f"{self.name}/{server.name} is held by {crowd[0]} at the same time")
 
     def act(self) -> None:
         """Do what has been decided, in the order of the decisions."""
@@ -230,7 +244,7 @@ class SimRegistrar(SimShell):
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return loading.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
+        return loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
         """As RegistrarState.join, for a direct line."""
@@ -238,7 +252,7 @@ class SimRegistrar(SimShell):
         if query is None:
             return None
         self.catalog.set("queries", query.id, query)
-        return loading.loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
+        return loaded(self.catalog, query.id, self.catalog.resources[query.resource_id])
 
     def _joined(self, load: Load, fault: str) -> ServedQuery | None:
         """The row, on disk; None if it is to be decided as any load."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Unload, Unloaded, UnloadRefused
+from rr_actors.registrar.model.messages import NO_LIMIT, Load, Loaded, LoadRefused, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import Hold, Phase, State
 from simulation.network import DOWN
 from simulation.network_faults import Trouble
@@ -31,12 +31,15 @@ class People(Trouble):
         request: bytes,
         direct: bool = False,
         priority: int = 0,
+        wait_ms: int = NO_LIMIT,
     ) -> bool:
         """Somebody asks for something."""
         registrar = self.registrars[name]
         if registrar.state not in ("up", "starting") or query_id in self.ledger.fate:
             return False
         self.asker[query_id] = name
+        if wait_ms != NO_LIMIT:
+            registrar.catalog.wait_limits[query_id] = wait_ms
         ask = c.AskProvider(query_id, provider, server, request, "", registrar.next_seq(), priority, own=True)
         if not (direct and self.ask_directly(registrar, ask, None)):
             registrar.ask(ask, None)

@@ -152,3 +152,19 @@ def test_a_graph_that_runs_goes_on_as_the_one_in_a_file(start: Start, state_dir:
 
 def run_of(response: dict[str, Any]) -> dict[str, str]:
     return {f"{one['name']}_0": one["state"] for one in response["actions"]}
+
+
+def test_a_graph_of_the_managers_folder_is_run_by_its_name(start: Start, state_dir: Path, file: Path) -> None:
+    names = [f"{__name__}:{kind.__name__}" for kind in (Look, Tell)]  # as in a TOML file
+    actions = rr.ChildSpec(Actions, id="actions", args=(names, str(file.parent)), placement="thread")
+    start(actions)
+    inputs = ("--inputs", '{"where": "hall"}', "--state", state_dir)
+    assert "a cup in the hall" in said("run", "look_and_tell", *inputs)
+    with pytest.raises(rr.GraphError, match="expected a graph: one of look_and_tell, got 'look'"):
+        said("run", "look", *inputs)
+
+
+@pytest.mark.parametrize("name", ["Look", f"{__name__}:Nothing", "no_such_module:Look", ":Look"])
+def test_an_action_by_a_name_that_is_none_is_refused(name: str) -> None:
+    with pytest.raises(rr.UsageError, match=f"expected subclasses of rr.Action, or their names .*, got '{name}'"):
+        Actions([name])

@@ -242,7 +242,7 @@ def test_a_missing_extra_is_an_error_of_one_line_that_says_what_to_install(tmp_p
 
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     ran = subprocess.run([sys.executable, "-m", "rr_actors", "tree"], capture_output=True, text=True, env=environment)
-    assert_one_line_error(ran, "pip install 'rr-actors[cli]'")
+    assert_one_line_error(ran, "pip install '.[cli]'")
 
 
 def test_an_unknown_command_is_refused() -> None:

@@ -192,7 +192,7 @@ def test_what_a_load_callback_has_reported_stands_beside_the_load_that_waits(
     shop.open_registrar("provider").register_server("oven", load)
     loading = app.load("provider/oven", "big", block=False)
     joining = app.load("provider/oven", "big", block=False)
-    said = "0% <b>behind</b> the pump"
+    said = "<b>behind</b> the pump"
     assert eventually(lambda: said in run_cli("loads", "--registrar", "app", "--state", state_dir).stdout)
 
     async def play() -> None:

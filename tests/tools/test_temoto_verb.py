@@ -57,4 +57,4 @@ def test_without_pyyaml_the_error_says_what_to_install(file: Path, monkeypatch: 
 
     assert isinstance(ran.exception, rr.UsageError)
     assert "needs the library yaml" in str(ran.exception)
-    assert "pip install 'rr-actors[temoto]'" in str(ran.exception)
+    assert "pip install '.[temoto]'" in str(ran.exception)

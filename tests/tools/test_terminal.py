@@ -610,7 +610,7 @@ def test_without_the_extra_the_command_says_what_to_install(tmp_path: Path, shop
     )
 
     assert ran.returncode == 2
-    assert "pip install 'rr-actors[top]'" in ran.stderr
+    assert "pip install '.[top]'" in ran.stderr
     assert len(ran.stderr.splitlines()) == 1
 
 

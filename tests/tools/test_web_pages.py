@@ -901,7 +901,7 @@ def test_without_a_library_of_the_extra_the_command_says_what_to_install(library
 
     assert ran.returncode == 2
     assert f"web needs the library {library}" in ran.stderr
-    assert "pip install 'rr-actors[web]'" in ran.stderr
+    assert "pip install '.[web]'" in ran.stderr
     assert len(ran.stderr.splitlines()) == 1
 
 
@@ -914,7 +914,7 @@ def test_without_a_library_of_the_extra_the_method_says_what_to_install(
     monkeypatch.setattr(
         importlib.machinery.PathFinder, "find_spec", lambda name: None if name == library else find(name)
     )
-    with pytest.raises(rr.UsageError, match=rf"serve_web needs the library {library}.*pip install 'rr-actors\[web\]'"):
+    with pytest.raises(rr.UsageError, match=rf"serve_web needs the library {library}.*pip install '\.\[web\]'"):
         system.serve_web()
 
 

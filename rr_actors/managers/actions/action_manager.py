@@ -152,12 +152,12 @@ class Actions(Manager):
 
     def __init__(
         self,
-        actions: Sequence[type[Action]] = (),
+        actions: Sequence[type[Action] | str] = (),
         graphs: str | os.PathLike[str] | None = None,
         stop_s: float = 5.0,
         action_folder: str | os.PathLike[str] | None = None,
     ) -> None:
-        """Take the classes of actions, and a folder with graphs in ``*.json`` files.
+        """Take the classes of actions, or their names as "module:class", and a folder with graphs in ``*.json`` files.
 
         Args:
             stop_s: seconds that actions have to end when their graph is released.
@@ -221,7 +221,7 @@ class Actions(Manager):
     def on_receive(self, message: Any) -> None:
         """Do what `rr-actors graph change` asks."""
         match message:
-            case {"change_graph": str(graph), "new": dict(), "start": str(start), "file": str(file)}:
+            case {"change_graph": str(graph), "new": dict() | str(), "start": str(start), "file": str(file)}:
                 self.change_graph(graph, message["new"], start, file)
             case _:
                 raise UsageError(f"{self.registrar.name}: expected a message to Actions, got {shown(message)}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
 import inspect
 import os
 import threading
@@ -9,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from rr_actors.base.errors import ConfigError, GraphError, UsageError, shown
+from rr_actors.base.errors import ConfigError, GraphError, UsageError, is_a, shown, text_of
 from rr_actors.managers.actions.action import Action, check_isolation, name_of, signature_of_class
 from rr_actors.managers.actions.action_folder import ActionFolder, Kinds
 from rr_actors.managers.actions.graph_checks import Signature, completed, signature_of
@@ -104,7 +106,7 @@ class GraphLibrary:
 
     def __init__(
         self,
-        actions: Sequence[type[Action]],
+        actions: Sequence[type[Action] | str],
         graphs: str | os.PathLike[str] | None = None,
         action_folder: str | os.PathLike[str] | None = None,
         beginning: Beginning | None = None,
@@ -171,9 +173,22 @@ def is_action(given: object) -> bool:
     return isinstance(given, type) and issubclass(given, Action)
 
 
-def _by_name(actions: Sequence[type[Action]]) -> dict[str, type[Action]]:
+def _imported(name: str) -> object:
+    """Return what "module:class" names."""
+    expected = "subclasses of rr.Action, or their names as 'module:class'"
+    module, colon, path = name.partition(":")
+    if not (module and colon and path):
+        raise UsageError(f"Actions: actions: expected {expected}, got {shown(name)}")
+    try:
+        return functools.reduce(getattr, path.split("."), cast("object", importlib.import_module(module)))
+    except (Exception, SystemExit) as error:  # importing runs the module: it may raise anything
+        raise UsageError(f"Actions: actions: expected {expected}, got {shown(name)}: {text_of(error)}") from error
+
+
+def _by_name(actions: Sequence[type[Action] | str]) -> dict[str, type[Action]]:
     found: dict[str, type[Action]] = {}
-    for kind in actions:
+    for given in actions:
+        kind = cast("type[Action]", _imported(given) if is_a(given, str) else given)
         if not is_action(kind):
             raise UsageError(f"Actions: actions: expected subclasses of rr.Action, got {shown(cast('object', kind))}")
         if inspect.isabstract(kind):

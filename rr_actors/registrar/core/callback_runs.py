@@ -78,14 +78,6 @@ def start_unload(decision: Decision, resource: Resource) -> None:
     decision.cause(StartCallback("unload", resource))
 
 
-def start_queued(decision: Decision, resource: Resource) -> None:
-    """Load a QUEUED resource, if no resource of the same request is being unloaded any more."""
-    if (resource.server, resource.request) not in decision.catalog.unloading:
-        resource = replace(resource, phase=LOADING)
-        decision.put(resource)
-        start_load(decision, resource)
-
-
 def running(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> Resource | None:
     """Return the resource if `run` is the present run of its callback in `phase`; else None."""
     resource = catalog.resources.get(resource_id)

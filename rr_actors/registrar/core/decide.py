@@ -15,7 +15,6 @@ from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
     callback_runs,
     holding,
-    loading,
     notices,
     priorities,
     reconciliation,
@@ -25,6 +24,7 @@ from rr_actors.registrar.core import (
     status_delivery,
     unloading,
 )
+from rr_actors.registrar.core.loads import lines, load_rings, loading
 from rr_actors.registrar.core.notices import refuse
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import messages as m
@@ -59,7 +59,9 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
             receive_from(decision, sender, item)
         else:
             raise TypeError(f"{catalog.name}: not a message for a registrar: {shown(item)}")
-    if catalog.touched:
+    while catalog.touched or catalog.stirred:
+        if catalog.stirred:
+            lines.arrange(decision)
         for resource_id in list(catalog.touched):
             unloading.balance(decision, resource_id)
         priorities.settle(decision)
@@ -97,7 +99,8 @@ _MESSAGES: dict[type[Any], Callable[[Decision, Any], None]] = {
     m.UnloadRefused: holding.unload_refused,
     m.NoticesHandled: notices.notices_handled,
     m.Fetch: reconciliation.fetch,
-    m.Probe: loading.probe,
+    m.Probe: load_rings.probe,
+    m.WaitedFor: load_rings.awaited,
     m.Gone: unloading.gone,
     m.Reprioritise: priorities.reprioritise,
     m.Reprioritised: priorities.reprioritised,
@@ -145,6 +148,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.BeginTrial: recovery.begin_trial,
     c.TrialOver: recovery.trial_over,
     c.RefusalOver: callback_runs.refusal_over,
+    c.WaitOver: lines.wait_over,
     c.LingerOver: unloading.linger_over,
     c.SetStatus: status_changes.set_status,
     c.SetResponse: status_changes.set_response,

@@ -19,6 +19,7 @@ from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved
 from rr_actors.registrar.model.commands import AskProvider, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, RingBroken, UnloadResolved
 from rr_actors.registrar.model.messages import (
+    NO_LIMIT,
     Load,
     Loaded,
     LoadRefused,
@@ -141,8 +142,10 @@ def pending(ask: AskProvider, attempt: int = 0, priority: int = 0) -> Held:
 
 def load_of(decision: Decision, held: Held) -> Load:
     """Return the Load that asks for a query; it is the same the first time and every time."""
-    place = (held.id, held.server, held.request, decision.catalog.name, held.parent)
-    return Load(*place, held.attempt, held.seq, held.priority, held.own)
+    catalog = decision.catalog
+    place = (held.id, held.server, held.request, catalog.name, held.parent)
+    wait_ms = catalog.wait_limits.get(held.id, NO_LIMIT)
+    return Load(*place, held.attempt, held.seq, held.priority, held.own, wait_ms)
 
 
 def loaded(decision: Decision, provider: str, message: Loaded) -> None:

@@ -16,7 +16,7 @@ from rr_actors.registrar.core.holding import end_direct
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.effects import FellBehind, LoadResolved, SendReply, SetTimer
+from rr_actors.registrar.model.effects import FellBehind, InLine, LoadResolved, SendReply, SetTimer
 from rr_actors.registrar.model.messages import Load, LoadRefused, Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Hold, Notice, Resource, ServedQuery, State, is_own
 
@@ -122,10 +122,17 @@ def drop_resource(decision: Decision, resource: Resource) -> None:
         if not is_own(start.notice):
             dealt_with(decision, ("resource", resource.id, start.notice.event))
     forget_runs(decision, resource.id)
+    end_wait(decision, resource)
     if decision.catalog.chased:
         decision.forget(decision.catalog.chased, resource.id)
     end_revocation(decision, resource.id)
     decision.drop(resource)
+
+
+def end_wait(decision: Decision, resource: Resource) -> None:
+    """Note that a load does not wait in line for this resource any more."""
+    if decision.catalog.said and decision.forget(decision.catalog.said, resource.id):
+        decision.cause(InLine(resource.id, ""))
 
 
 def end_revocation(decision: Decision, resource_id: str) -> None:
@@ -168,6 +175,8 @@ def drop_query(decision: Decision, query: ServedQuery) -> None:
     """Remove a query that its holder has released, and the notices about it that the holder has not heard."""
     decision.forget(decision.catalog.waiting, query.id)
     decision.forget(decision.catalog.unanswered, query.id)
+    if decision.catalog.timed and decision.forget(decision.catalog.timed, query.id):
+        decision.cause(SetTimer("line:" + query.id, None, None))
     if query.resource_id in decision.catalog.ranked:
         touch(decision, query.resource_id)
     decision.drop(query)

@@ -8,7 +8,8 @@ from operator import attrgetter
 from msgspec.structs import replace
 
 from rr_actors.registrar.core.holding import asked_anew, end_release, load_of, loaded, lose
-from rr_actors.registrar.core.loading import is_to_run
+from rr_actors.registrar.core.loads.lines import look_again
+from rr_actors.registrar.core.loads.loading import is_to_run
 from rr_actors.registrar.core.notices import drop_notice, drop_parked, send_notices_to
 from rr_actors.registrar.core.priorities import follow, tell, tell_unsent
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, released
@@ -261,6 +262,8 @@ def fetch(decision: Decision, message: Fetch) -> None:
                 decision.forget(catalog.unanswered, id)
         decision.note(catalog.consumers, message.origin, True)
         send_notices_to(decision, message.origin)
+        if catalog.queued:
+            look_again(decision, message.origin)
 
 
 def consumer_lost(decision: Decision, command: ConsumerLost) -> None:

@@ -37,10 +37,9 @@ from rr_actors.registrar.core.callback_runs import (
     refuse_for_a_while,
     run_id,
     start_load,
-    start_queued,
     waits_for_start,
 )
-from rr_actors.registrar.core.loading import (
+from rr_actors.registrar.core.loads.loading import (
     end_reload,
     end_unload_first,
     is_reloaded,
@@ -224,7 +223,7 @@ def _move_again(decision: Decision, resource: Resource) -> None:
         case Phase.LOADING:
             start_load(decision, resource)
         case Phase.QUEUED:
-            start_queued(decision, resource)
+            decision.catalog.stir(resource)
         case _:
             run_unload(decision, resource)
 
@@ -242,6 +241,7 @@ def begin_serving(decision: Decision, command: BeginServing) -> None:
         _begin_early(decision, resource_id, command.event)
     for name in catalog.servers:
         start_own(decision, name)
+    catalog.stirred.update(dict.fromkeys(catalog.queued, True))
 
 
 def begin_early(decision: Decision, item: object) -> None:
@@ -568,6 +568,8 @@ def _go_on(decision: Decision, resource_id: str) -> None:
     server = catalog.servers.get(resource.server)
     if server is not None and server.recover_timeout_s is not None:
         decision.cause(SetTimer("recover:" + resource_id, None, None))
+    if catalog.queued:
+        catalog.stir(resource)
     if condemned(decision, resource):
         begin_unload(decision, resource)
     _decide_parked(decision, parked)

@@ -100,20 +100,22 @@ def revoke(decision: Decision, command: Revoke) -> None:
         decision.cause(AnswerCall(command.ticket, failures.unknown_target(catalog, command.target)))
     elif resource.id in catalog.revocations:
         decision.cause(AnswerCall(command.ticket, failures.not_revoked(resource, "is revoked already")))
-    elif not _is_revocable(catalog, resource):
+    elif not is_revocable(catalog, resource):
         phase = "recovering" if resource.id in catalog.recovering else resource.phase
         decision.cause(AnswerCall(command.ticket, failures.not_revoked(resource, f"is {phase}")))
     else:
         decision.note(catalog.owners, resource.id, (*catalog.owners.get(resource.id, ()), command.ticket))
-        _revoke(decision, resource, Revocation(resource.id, command.event, command.why, command.grace_ms))
+        begin_revocation(decision, resource, Revocation(resource.id, command.event, command.why, command.grace_ms))
 
 
-def _is_revocable(catalog: Catalog, resource: Resource) -> bool:
+def is_revocable(catalog: Catalog, resource: Resource) -> bool:
+    """Return whether a resource is loaded, so that its holders can be asked to release it."""
     loaded = resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED, *RESTING)
     return loaded and resource.id not in catalog.recovering
 
 
-def _revoke(decision: Decision, resource: Resource, revocation: Revocation, source: str = "") -> None:
+def begin_revocation(decision: Decision, resource: Resource, revocation: Revocation, source: str = "") -> None:
+    """Ask the holders of a resource to release it; `source`: the server where that began, if it is another."""
     decision.put(revocation)
     limit_grace(decision, revocation)
     decision.cause(Happened("revoked", resource, revocation.why, kept=True))
@@ -145,9 +147,10 @@ def pass_revocation_on(decision: Decision, resource: Resource, notice: Notice, *
     if handled:
         for held in revoked:
             let_go(decision, held)
-    elif _is_revocable(catalog, resource):
+    elif is_revocable(catalog, resource):
         event = f"{notice.event.partition(':')[0]}:{resource.id}"
-        _revoke(decision, resource, Revocation(resource.id, event, notice.message, notice.grace_ms), notice.source)
+        revocation = Revocation(resource.id, event, notice.message, notice.grace_ms)
+        begin_revocation(decision, resource, revocation, notice.source)
 
 
 def let_go(decision: Decision, held: Held) -> None:

@@ -12,7 +12,6 @@ from rr_actors.registrar.core.callback_runs import (
     note_begun,
     note_ended,
     running,
-    start_queued,
     start_unload,
 )
 from rr_actors.registrar.core.notices import (
@@ -282,7 +281,7 @@ def run_unload(decision: Decision, resource: Resource) -> None:
 
 
 def unload_ended(decision: Decision, ended: CallbackEnded) -> None:
-    """Remove the resource, release its parts, answer all that wait, and start a queued load of the same request.
+    """Remove the resource, release its parts, and answer all that wait. The next in line begins (core/loads/lines.py).
 
     If the callback raised, the resource may still be running: it is kept as unload_failed, and the Unloads that wait
     are refused.
@@ -305,7 +304,6 @@ def remove(decision: Decision, resource: Resource) -> None:
     drop_resource(decision, resource)
     decision.cause(Happened("unloaded", resource, ""))
     release_parts(decision, resource.id, after)
-    _next_in_queue(decision, resource)
     settle(decision, resource.server)
 
 
@@ -320,15 +318,7 @@ def _keep(decision: Decision, resource: Resource, failure: Failure) -> None:
             decision.cause(SendReply(query.origin, UnloadRefused(query.id, failure)))
         send_notices(decision, query)  # the holder passed them over while it was releasing the query
     decision.effects += answers_to_owners(decision, resource, failure)
-    _next_in_queue(decision, resource)
     settle(decision, resource.server, failure)
-
-
-def _next_in_queue(decision: Decision, gone: Resource) -> None:
-    catalog = decision.catalog
-    if catalog.queued:
-        for id in list(catalog.queued.get((gone.server, gone.request), ())):
-            start_queued(decision, catalog.resources[id])
 
 
 def answers_to_owners(decision: Decision, resource: Resource, failure: Failure | None) -> list[AnswerCall]:

@@ -58,6 +58,7 @@ class EffectRunner:
             e.Died: self._died,
             e.Acquitted: self._acquitted,
             e.RingBroken: self._ring_broken,
+            e.InLine: self._in_line,
         }
 
     def do(self, effects: Sequence[Effect]) -> None:
@@ -152,6 +153,7 @@ class EffectRunner:
 
     def _load_resolved(self, effect: e.LoadResolved) -> None:
         held = effect.held
+        self._registrar.catalog.wait_limits.pop(held.id, None)
         if effect.failure is not None:
             self._forget(held.id)
         waiter = self._registrar.loads.pop(held.id, None)
@@ -230,6 +232,12 @@ class EffectRunner:
         node.accused.discard(self._registrar.name)
         if not node.accused:
             node.on_acquitted()
+
+    def _in_line(self, effect: e.InLine) -> None:
+        if effect.text:
+            self._registrar.progress.report(effect.resource_id, 0.0, effect.text)
+        else:
+            self._registrar.progress.forget(effect.resource_id)
 
     def _ring_broken(self, effect: e.RingBroken) -> None:
         logger.error("%s: %s", self._registrar.name, effect.why)

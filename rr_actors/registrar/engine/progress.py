@@ -1,6 +1,7 @@
 """Progress: how far a load has come.
 
-A load's callback reports how far it has come, and the consumers that wait for the load hear it.
+A load's callback reports how far it has come, and the consumers that wait for the load hear it. While a load waits in
+line for an exclusive resource, they hear its place.
 
 Best effort: reports are not in the catalog and are not sent again, and no callback waits for them. A report is kept,
 and the event loop sends the newest one, ten times a second at most. The last report of a load leaves before the answer.
@@ -53,8 +54,8 @@ class Progress(msgspec.Struct, frozen=True):
 
 
 def shown_progress(fraction: float, text: str) -> str:
-    """Return a report as text for people: "50% opening"."""
-    return f"{fraction:.0%} {text}".rstrip()
+    """Return a report as text for people: "50% opening"; while nothing is done, the text alone."""
+    return f"{fraction:.0%} {text}".rstrip() if fraction or not text else text
 
 
 def checked(fraction: object, text: object) -> tuple[float, str]:
@@ -165,6 +166,10 @@ class ProgressReports:
         if reports is not None and reports.unsent and not self._registrar.closed:
             self._send(resource_id, reports)
 
+    def forget(self, resource_id: str) -> None:
+        """Drop the reports of a load that waits in line no longer."""
+        self.loads.pop(resource_id, None)
+
     @any_thread
     def forget_sent(self, resource_id: str) -> bool:
         """Drop the reports of a callback that has returned. Return False if one has to be sent before the answer."""
@@ -219,7 +224,8 @@ class ProgressReports:
         with registrar.lock:
             catalog = registrar.whole()
             resource = catalog.resources.get(resource_id)
-            if resource is None or not (resource.phase is Phase.LOADING or resource_id in catalog.recovering):
+            loads = resource is not None and resource.phase in (Phase.LOADING, Phase.QUEUED)
+            if resource is None or not (loads or resource_id in catalog.recovering):
                 return False
             waiting = _waiting(catalog, resource_id)
             fraction, text = reports.unsent.pop()

@@ -26,13 +26,13 @@ from rr_actors.base.errors import CatalogError, RegistrarDown, RrError
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.callback_runs import is_unwanted
 from rr_actors.registrar.core.decide import Item, decide
-from rr_actors.registrar.core.loading import join, loaded
+from rr_actors.registrar.core.loads.loading import join
 from rr_actors.registrar.core.unloading import leave
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import digests
-from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision
-from rr_actors.registrar.model.messages import Load, Loaded, Unload, Unloaded
+from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, loaded
+from rr_actors.registrar.model.messages import NO_LIMIT, Load, Loaded, Unload, Unloaded
 from rr_actors.registrar.model.rows import LOADING, OK, PENDING, Drop, Held, Phase, Put, Resource
 from rr_actors.registrar.model.store import Store
 from rr_actors.runtime.thread_rules import with_lock
@@ -307,7 +307,8 @@ class RegistrarState(TurnActor):
                 self.loads[id] = ended
                 asked = Held(id, registrar, server, request, None, "", parent, attempt, seq, PENDING, OK, priority, own)
                 self.catalog.in_flight[id] = asked
-        return Load(id, server, request, self.name, parent, attempt, seq, priority, own)
+        wait_ms = self.catalog.wait_limits.get(id, NO_LIMIT)
+        return Load(id, server, request, self.name, parent, attempt, seq, priority, own, wait_ms)
 
     def hold(self, answer: Loaded | c.Got) -> bool:
         """Add the row of a query that a thread has loaded. Return False if the answer has to be decided, as Got."""

@@ -17,6 +17,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.fields import annotated_types, by_fields, field_names, hints_of
 from rr_actors.registrar.model.health import Health, HealthOf
 from rr_actors.registrar.model.roles import ROLES, Role
+from rr_actors.runtime.time_limits import LONGEST_GRACE_S
 from rr_actors.runtime.workers import is_async
 from rr_actors.wire.name_service import LABELS_BYTES
 
@@ -26,6 +27,8 @@ Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
 RECOVER_S = 30.0
 """How long a recover callback may take, if its server says nothing else."""
+GRACE_S = 5.0
+"""How long the holder of an exclusive resource has to release it to a more urgent one."""
 
 Labels = Mapping[str, Mapping[str, str | int | float | bool]]
 """What the resources of a server provide, by kind: `{"range": {"rate_hz": 30}}`."""
@@ -55,6 +58,8 @@ class ServerSpec(msgspec.Struct, frozen=True):
     probe: Callback | None = None
     provides: Labels | None = None
     at_once: int | None = None  # None: as many as ask
+    exclusive: bool = False
+    grace_s: float | None = None  # None: GRACE_S
 
     @property
     def labels(self) -> str:
@@ -103,6 +108,7 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
             _invalid(name, "health", "an rr.Health or None", spec.health)
         if spec.at_once is not None and (type(spec.at_once) is not int or spec.at_once < 1):
             _invalid(name, "at_once", "a whole number of at least 1, or None", spec.at_once)
+        _check_exclusive(name, spec)
         for field in ("load_timeout_s", "recover_timeout_s"):
             limit_s = getattr(spec, field)
             if limit_s is not None and not (is_number(limit_s) and limit_s > 0):
@@ -136,6 +142,17 @@ def _checked_labels(name: str, provides: object) -> Labels | None:
     if (size := len(msgspec.json.encode(found))) > LABELS_BYTES:
         _invalid(name, "provides", f"at most {LABELS_BYTES} bytes as JSON", size)
     return cast("Labels", found)
+
+
+def _check_exclusive(name: str, spec: ServerSpec) -> None:
+    if type(spec.exclusive) is not bool:
+        _invalid(name, "exclusive", "a bool", spec.exclusive)
+    if spec.grace_s is None:
+        return
+    if not is_number(spec.grace_s) or not 0 <= spec.grace_s <= LONGEST_GRACE_S:
+        _invalid(name, "grace_s", f"seconds from 0 to {LONGEST_GRACE_S:g}, or None", spec.grace_s)
+    if not spec.exclusive:
+        _invalid(name, "grace_s", "None, as the server is not exclusive", spec.grace_s)
 
 
 def _check_idle(name: str, spec: ServerSpec) -> None:

@@ -48,6 +48,7 @@ from rr_actors.registrar.model.messages import (
     Reprioritised,
     Unloaded,
     UnloadRefused,
+    WaitedFor,
 )
 from rr_actors.registrar.model.rows import Put, ServerType
 from rr_actors.runtime.processes.lifeline import is_ending
@@ -67,7 +68,7 @@ _STARTING_RETRY_S = 0.01  # the longest wait after a provider is up; to look int
 _STOPPED_RETRY_S = 0.25
 _WRITE_AGAIN_S = 0.25
 
-_ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused, Reprioritised})
+_ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused, Reprioritised, WaitedFor})
 _A_PROVIDERS = _ANSWERS | {Fetched, Noticed}  # and the side messages (ProviderLink)
 
 Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]

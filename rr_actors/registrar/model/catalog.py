@@ -15,7 +15,7 @@ import msgspec
 
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.effects import Connect, Effect, SendRequest
-from rr_actors.registrar.model.messages import Message
+from rr_actors.registrar.model.messages import Loaded, Message
 from rr_actors.registrar.model.rows import (
     HELD,
     HIGHEST,
@@ -50,7 +50,7 @@ from rr_actors.registrar.model.rows import (
     is_own,
 )
 
-_JOINABLE = (LOADED, LOADING, QUEUED, *RESTING)
+_JOINABLE = (LOADED, LOADING, *RESTING)
 _MOVING = (LOADING, QUEUED, UNLOADING)
 
 _seq, _origin, _server, _resource_id = map(attrgetter, ("seq", "origin", "server", "resource_id"))
@@ -80,6 +80,8 @@ class Server(msgspec.Struct, frozen=True):
     recover_timeout_s: float | None = None
     pauses: bool = False
     paused_s: float | None = None
+    exclusive: bool = False
+    grace_ms: int = 0  # for the holder of an exclusive resource that a more urgent load takes away
 
 
 class Closing(msgspec.Struct, frozen=True):
@@ -162,6 +164,10 @@ class Catalog:
       `unsent`: queries whose priority has changed while the provider's link was not reconciled.
       `listed`: by provider, the epoch of its run that made the last list.
     - `deserted`: resources that were loading when their last query ended, until the engine has looked at them.
+    - `stirred`: requests for which resources are queued, until decide() has looked at the line (core/loads/lines.py).
+      `said`: by queued resource, the place in line that its load was told. `timed`: queries with a timer for their
+      wait there.
+      `wait_limits`: by query of our own that is not answered, how many ms it may wait in line; the threads add to it.
     - `chased`: by resource, the query whose probe for rings of holds has passed it last.
     - `shut`: why this registrar loads nothing any more for others (False), or for itself (True): it is being closed.
 
@@ -192,6 +198,7 @@ class Catalog:
         self.server_types: dict[str, ServerType] = self.tables["server_types"]
         self.callback_runs: dict[str, CallbackRun] = self.tables["callback_runs"]
         self.revocations: dict[str, Revocation] = self.tables["revocations"]
+        self.stirred: dict[RequestKey, bool] = {}
         self._fill_indexes()
         self._index: dict[Table, Callable[[Any, Any], None]] = {
             "resources": self._index_resource,
@@ -246,6 +253,9 @@ class Catalog:
         self.refusing: dict[str, bool] = {}
         self.consumers: dict[str, bool] = {}
         self.deserted: set[str] = set()
+        self.said: dict[str, str] = {}
+        self.timed: dict[str, bool] = {}
+        self.wait_limits: dict[str, int] = {}
         self.unfinished: Undo | None = None  # how to undo the decision that is being applied; None between decisions
         # this Catalog asked for all queries with a greater number, and knows all about them
         self.since = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
@@ -255,13 +265,14 @@ class Catalog:
         self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> resource to join
         self.unloading: dict[RequestKey, Ids] = {}  # also those that are revoked: the next of that request waits
         self.queued: dict[RequestKey, Ids] = {}
+        self.lost: dict[RequestKey, Ids] = {}  # FATAL, or unload_failed: no other load joins these
         self.resting: dict[str, bool] = {}  # resources that are pausing, paused, or resuming
         self.moving: dict[str, bool] = {}  # resources that are loading, queued, or being unloaded
         loaded, fatal, by_request = LOADED, State.FATAL, self.by_request
         for row in self.resources.values():
-            if row.phase is not loaded:
+            if row.phase is not loaded or row.state is fatal:
                 self._index_phase(None, row)
-            elif row.state is not fatal:
+            else:
                 by_request[row.server][row.request] = row.id
         for revocation in self.revocations.values():
             self._index_revocation(None, revocation)
@@ -315,7 +326,24 @@ class Catalog:
     def joinable(self, server: str, request: bytes) -> str | None:
         """Return the id of the one resource that an identical request joins; None if there is none."""
         requests = self.by_request.get(server)
-        return None if requests is None else requests.get(request)
+        id = None if requests is None else requests.get(request)
+        if id is None and self.queued:
+            queued = self.queued.get((server, request), ())
+            id = next((id for id in queued if self.resources[id].state is not State.FATAL), None)
+        return id
+
+    def used(self, key: RequestKey) -> list[Resource]:
+        """Return the resources of a request that are there, and not only QUEUED."""
+        found = self.by_request.get(key[0], {}).get(key[1])
+        apart = (*self.unloading.get(key, ()), *self.lost.get(key, ()))
+        ids = dict.fromkeys(apart if found is None else (found, *apart))
+        return [self.resources[id] for id in ids]
+
+    def stir(self, resource: Resource) -> None:
+        """Note that the line for this resource, if there is one, has to be looked at (core/loads/lines.py)."""
+        key = (resource.server, resource.request)
+        if key in self.queued:
+            self.stirred[key] = True
 
     def find(self, target: str) -> Resource | None:
         """Return the resource with this id, or the resource of the query with this id."""
@@ -400,6 +428,8 @@ class Catalog:
 
     def _index_resource(self, old: Resource | None, new: Resource | None) -> None:
         self._index_phase(old, new)
+        if self.queued and (row := new or old) is not None:
+            self.stir(row)
         if old is None and new is not None:
             add(self.by_server, new.server, new.id)
         elif new is None and old is not None:
@@ -412,17 +442,20 @@ class Catalog:
                 return  # the common change: requests find the resource as before
         if old is not None:
             key = (old.server, old.request)
-            if self.joinable(*key) == old.id:
+            if self.by_request[old.server].get(old.request) == old.id:
                 del self.by_request[old.server][old.request]
-                if not self.by_request[old.server]:
-                    del self.by_request[old.server]
+            if not self.by_request[old.server]:
+                del self.by_request[old.server]
             if old.phase in RESTING:
                 self.resting.pop(old.id, None)
             if old.phase is UNLOADING:
                 discard(self.unloading, key, old.id)
             elif old.phase is QUEUED:
                 discard(self.queued, key, old.id)
+            if _is_lost(old):
+                discard(self.lost, key, old.id)
         if new is not None:
+            key = (new.server, new.request)
             if new.phase in _MOVING:
                 self.moving[new.id] = True
             if new.phase in RESTING:
@@ -430,14 +463,17 @@ class Catalog:
             if new.phase in _JOINABLE and new.state is not State.FATAL:
                 self.by_request[new.server][new.request] = new.id
             elif new.phase is UNLOADING:
-                add(self.unloading, (new.server, new.request), new.id)
+                add(self.unloading, key, new.id)
             if new.phase is QUEUED:
-                add(self.queued, (new.server, new.request), new.id)
+                add(self.queued, key, new.id)
+            elif _is_lost(new):
+                add(self.lost, key, new.id)
 
     def _index_revocation(self, old: Revocation | None, new: Revocation | None) -> None:
         row = new or old
         if row is not None and (resource := self.resources.get(row.id)) is not None:
             (discard if new is None else add)(self.unloading, (resource.server, resource.request), resource.id)
+            self.stir(resource)
 
     def _index_query(self, old: ServedQuery | None, new: ServedQuery | None) -> None:
         if old is not None:
@@ -454,6 +490,10 @@ class Catalog:
             add(self.by_origin, new.origin, new.id)
             if new.priority:
                 add(self.ranked, new.resource_id, new.id)
+        if self.queued:
+            for query in filter(None, (old, new)):
+                if (resource := self.resources.get(query.resource_id)) is not None:
+                    self.stir(resource)
 
     def _index_held(self, old: Held | None, new: Held | None) -> None:
         if new is not None and new.hold is not HELD:
@@ -486,12 +526,23 @@ class Catalog:
             add(self.notices_on, new.query_id, new.id)
 
 
+def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:
+    """Return the answer to a Load whose resource is loaded."""
+    server = catalog.servers.get(resource.server)
+    types = 0 if server is None else server.types_checksum
+    return Loaded(query_id, resource.id, resource.response or b"", types, resource.state)
+
+
 def after_epoch(epoch: int) -> int:
     """Return a number that is greater than the running numbers of this epoch, and not greater than those of the next.
 
     A running number has its epoch in its upper bits.
     """
     return (epoch + 1) << _EPOCH_BITS
+
+
+def _is_lost(resource: Resource) -> bool:
+    return (resource.state is State.FATAL and resource.phase is not QUEUED) or resource.phase is UNLOAD_FAILED
 
 
 def _stands_there(old: Held, new: Held) -> bool:

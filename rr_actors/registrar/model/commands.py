@@ -154,6 +154,12 @@ class RefusalOver(Command, frozen=True):
     run_id: str
 
 
+class WaitOver(Command, frozen=True):
+    """The time is over for which a load may wait in line (Load.wait_ms)."""
+
+    query_id: str
+
+
 class LingerOver(Command, frozen=True):
     """The time is over for which an idle resource is kept running, or an unheld one is kept."""
 

@@ -135,6 +135,16 @@ class RingBroken(Effect, frozen=True):
     why: str
 
 
+class InLine(Effect, frozen=True):
+    """Tell the load that waits for a QUEUED resource its place in line; "": it waits no longer.
+
+    Nothing derives it again: the next change of the line says the places anew.
+    """
+
+    resource_id: str
+    text: str
+
+
 Happening = Literal[
     "loaded",
     "load_failed",

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rr_actors.base.errors import LoadError, did_you_mean, shortened, shown
+from rr_actors.base.names import made_at
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import Held, Hold, Resource
+from rr_actors.registrar.model.rows import Held, Hold, Resource, ServedQuery
 
 
 def unknown_server(catalog: Catalog, server: str) -> Failure:
@@ -161,6 +162,30 @@ def load_failed(catalog: Catalog, resource: Resource, why: str, **details: float
     """Return the failure of a load of this resource for a reason that its callback has not raised."""
     origin = catalog.origin_of(resource)
     return Failure("LoadFailed", f"{origin}: {why}", {"server": origin, **details}, [(origin, why)])
+
+
+def busy(catalog: Catalog, server: str, request: bytes, has: ServedQuery | None, waiting: int) -> Failure:
+    """Return the failure of a load that may not wait (longer) for an exclusive resource.
+
+    Args:
+        has: the query that has it; None while nobody does.
+        waiting: how many others wait.
+    """
+    origin = f"{catalog.name}/{server}"
+    holder, since = ("", None) if has is None else (has.origin, _asked_at(has.id))
+    who = f"{holder} has it" if holder else "it is being unloaded"
+    others = "" if not waiting else f", and {waiting} {'waits' if waiting == 1 else 'wait'} for it"
+    what = f"{origin} with {shown(shown_plain(request))}"
+    text = f"{what}: {who}{others}; give a longer wait_s, or a higher priority"
+    details = {"server": origin, "holder": holder, "since": since, "waiting": waiting}
+    return Failure("ResourceBusy", text, details, [(origin, f"{who}{others}")])
+
+
+def _asked_at(query_id: str) -> float | None:
+    try:
+        return made_at(query_id)
+    except ValueError:  # an id that this package has not made
+        return None
 
 
 def left_behind(catalog: Catalog, resources: Sequence[Resource]) -> Failure:

@@ -5,9 +5,9 @@ peer's bytes can make no other objects. Request and response bytes inside are ca
 (base/values/canonical.py).
 
 Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone, Reprioritise. Provider to consumer:
-Loaded, LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed, Reprioritised. The sender of a
-request sends it again, with the same id, until it is answered. So every message may arrive twice (docs/consistency.md
-says what the second one does). A Fetch with `resume` opens a link, and comes once on each.
+Loaded, LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed, Reprioritised, WaitedFor. The
+sender of a request sends it again, with the same id, until it is answered. So every message may arrive twice
+(docs/consistency.md says what the second one does). A Fetch with `resume` opens a link, and comes once on each.
 """
 
 from __future__ import annotations
@@ -17,9 +17,15 @@ import msgspec
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.rows import Int64, Notice, State
 
+NO_LIMIT = -1
+"""Load.wait_ms of a load that gives no limit of its own."""
+
 
 class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
-    """Give `origin` a query with this id on the resource for this request; load that if it is not loaded."""
+    """Give `origin` a query with this id on the resource for this request; load that if it is not loaded.
+
+    `wait_ms`: how long it may wait in line for an exclusive resource; NO_LIMIT: as long as its caller waits.
+    """
 
     query_id: str
     server: str
@@ -30,6 +36,7 @@ class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
     seq: Int64
     priority: Int64 = 0
     own: bool = False
+    wait_ms: Int64 = NO_LIMIT
 
 
 class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
@@ -194,6 +201,18 @@ class Reprioritised(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=
     priority: Int64
 
 
+class WaitedFor(msgspec.Struct, frozen=True, array_like=True, tag=18):
+    """Does the whole of this query, which the receiver holds, wait for `waiter`? As Probe, for an exclusive resource.
+
+    Others wait for that until the whole releases it.
+    """
+
+    query_id: str
+    waiter: str
+    blocked: str
+    ring: list[str]
+
+
 def retired(name: str) -> str:
     """Return the origin of a link on which the registrar `name` is said to be gone; no registrar's name has a colon."""
     return f"{name}:retired"
@@ -217,4 +236,5 @@ Message = (
     | Progressed
     | Reprioritise
     | Reprioritised
+    | WaitedFor
 )

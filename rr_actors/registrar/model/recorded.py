@@ -78,7 +78,7 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
             notice = message.notice
             text = f"{notice.state} {notice.message}".rstrip()
             return Entry(*where, notice.query_id, notice.resource_id, detail=readable(shortened(text)))
-        case m.Probe():
+        case m.Probe() | m.WaitedFor():
             return Entry(*where, message.query_id, detail=shortened(" > ".join(message.ring)))
         case m.Reprioritise() | m.Reprioritised():
             return Entry(*where, message.query_id, detail=shown_priority(message.priority))

@@ -84,8 +84,9 @@ class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
     Its id is that of the query that made it; after a restart it is longer (Catalog.new_resource_id). `attempt` counts
     the runs of its load callback: it tells which parts an earlier, interrupted run has loaded. `tries` counts the runs
-    of its unload callback; it is NOT_BEGUN while the present attempt of the load has not begun. `state` and `message`
-    are those of its last status.
+    of its unload callback; it is NOT_BEGUN while the present attempt of the load has not begun. While an exclusive
+    resource is QUEUED, `tries` is its number in the line (core/loads/lines.py). `state` and `message` are those of its
+    last status.
     """
 
     id: str

@@ -29,7 +29,7 @@ from rr_actors.base.values.type_shapes import digest_of
 from rr_actors.registrar.core.callback_runs import deaths_of
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
-from rr_actors.registrar.engine.server import Callback, ServerSpec, checked_callback
+from rr_actors.registrar.engine.server import GRACE_S, Callback, ServerSpec, checked_callback
 from rr_actors.registrar.engine.status import StatusMessage, status_of
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
@@ -136,7 +136,9 @@ class ServerActor(TurnActor):
         limits = spec.linger_s, spec.load_timeout_s, spec.recovery or "keep"
         checksum = zlib.crc32(types)
         idle = spec.idle == "pause", spec.paused_s
-        self.facts = Server(spec.name, *limits, *has, types, checksum, spec.recover_timeout_s, *idle)
+        grace_ms = round(1000 * (GRACE_S if spec.grace_s is None else spec.grace_s))
+        times = spec.recover_timeout_s, *idle
+        self.facts = Server(spec.name, *limits, *has, types, checksum, *times, spec.exclusive, grace_ms)
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
         if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):

@@ -14,6 +14,7 @@ from rr_actors.base.errors import (
     GraphError,
     LoadFailed,
     OverCapacity,
+    ResourceBusy,
     Unavailable,
     readable,
     shortened,
@@ -88,7 +89,7 @@ def load_failure(error: BaseException, origin: str) -> Failure:
         return error.details.failure
     error = _alone(error)
     described = failure_of(error, origin)
-    if isinstance(error, (CircularDependency, GraphError, OverCapacity)):
+    if isinstance(error, (CircularDependency, GraphError, OverCapacity, ResourceBusy)):
         return described
     if isinstance(error, LoadFailed):
         text, lines = described.message, error.traceback

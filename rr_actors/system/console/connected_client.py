@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_EXCEPTION, wait
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import (
     InvalidRequest,
     NotRunning,
@@ -49,6 +49,8 @@ from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, Remot
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking.client_proxies import GRACE_S, ClientProxy, in_thread
+from rr_actors.system.console.asking.waiting import waited_for
 from rr_actors.system.console.client_queries import (
     ClientQuery,
     ClientViews,
@@ -67,7 +69,6 @@ T = TypeVar("T")
 
 logger = Log("rr_actors")
 
-_GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
 _RETRY_S = 0.05  # between two looks for a system that is awaited
 
 
@@ -136,6 +137,19 @@ class Client:
         """
         return _asked(self._connections, actor, message, timeout_s)
 
+    def proxy(self, actor: str, *, timeout_s: float | None = 30.0) -> ClientProxy:
+        """Return an object whose methods are those of an actor of the system; each call returns a future.
+
+        Args:
+            actor: its id or its path, as for System.ref().
+            timeout_s: how long each call may take. None: a day.
+        """
+        return ClientProxy(self._connections, actor, _limit(timeout_s))
+
+    def wait_for(self, id: str, state: str = "", *, timeout_s: float | None = 30.0) -> str:
+        """Wait until a child or a resource is in a state, as System.wait_for() does, with its errors."""
+        return waited_for(self._connections.open, id, state, timeout_s)
+
     def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
         """Have the system back itself up to a directory of its machine, as System.backup() does, with its errors."""
         limit_s = _limit(timeout_s)
@@ -191,7 +205,7 @@ class _ClientCalls(RemoteCalls):
         if not self.views.is_away(query_id):  # else the system has released it as it ended
             self.check_here()
             held_as = self.views.held_as(query_id)
-            self.connections.ask(Release(self.name, held_as, server, limit_s), limit_s + _GRACE_S)
+            self.connections.ask(Release(self.name, held_as, server, limit_s), limit_s + GRACE_S)
         self.views.forget(query_id, server)
 
     def all_streams(self, query: Query[Any]) -> Callable[[], bool]:
@@ -242,12 +256,13 @@ class _ClientLoads(RemoteLoads):
     def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
         client, limit_s = self._client, _limit(options.timeout_s)
         client.check_here()
-        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority)
+        wait_s = None if options.wait_s is None else _limit(options.wait_s)
+        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority, wait_s)
         query: ClientQuery | None = None
         try:
             # If the connection ends before keep(), the system releases the query.
             with client.views.loading(), client.connections.lent() as connection:
-                held = connection.ask(command, limit_s + _GRACE_S)
+                held = connection.ask(command, limit_s + GRACE_S)
                 place = held.query_id, target, request, "", client.name, self.holder, _shown_types, client.all_streams
                 query = ClientQuery(place, bytes(request), options)
                 if options.codec is not None:
@@ -274,7 +289,7 @@ class _ClientLoads(RemoteLoads):
         command = Hold(client.name, query.server_id, request, limit_s, options.priority)
         with client.views.loading(), client.connections.lent() as connection:
             if client.views.is_away(query.id):
-                held = connection.ask(command, limit_s + _GRACE_S)
+                held = connection.ask(command, limit_s + GRACE_S)
                 if client.views.hold_again(query, held):
                     connection.keep()
 
@@ -297,18 +312,6 @@ class _ClientLoads(RemoteLoads):
                 else:
                     one.add_done_callback(self.release_later)
             raise
-
-
-def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
-    """Have a new thread make a call, and set the reply. The application's executor may be full of other calls."""
-
-    def make() -> None:
-        try:
-            reply.set(call())
-        except BaseException as error:  # it is for the thread that reads the reply
-            fail(reply, error)
-
-    threading.Thread(target=make, name="rr-client", daemon=True).start()
 
 
 class ClientRegistrar(Consumer):
@@ -524,7 +527,7 @@ def _asked(connections: SystemConnections, actor: str, message: Any, timeout_s: 
         plain = "numbers, strings, bytes, lists, dicts and the like"
         raise NotSerializable(f"{what}: expected {plain}, got {got}; {text}", path=what) from error
     command = AskActor(actor, data, limit_s, asker)
-    return Codec(None, "answer").show(connections.ask(command, limit_s + _GRACE_S).answer)
+    return Codec(None, "answer").show(connections.ask(command, limit_s + GRACE_S).answer)
 
 
 def _limit(timeout_s: float | None) -> float:

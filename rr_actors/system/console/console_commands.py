@@ -14,20 +14,15 @@ from rr_actors.actors.messaging.mailbox_looks import MailboxInfo
 from rr_actors.actors.refs import Timeout
 from rr_actors.base.errors import (
     ActorUnavailable,
-    AskFailed,
     NotFound,
     NotSerializable,
-    RrError,
     Unavailable,
     UnknownQuery,
     UsageError,
     few,
-    name_of_class,
     shown,
-    text_of,
 )
 from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id, short_ids
-from rr_actors.base.reporting.tracebacks import raised_elsewhere
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.values.failure import error_of
 from rr_actors.registrar.arguments import LoadOptions
@@ -36,12 +31,12 @@ from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.registrar.queries import Status, response_bytes
 from rr_actors.registrar.registrar import load_bytes
-from rr_actors.runtime.callback_errors import traceback_of
 from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.runtime.processes.process import signal_name
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking import actor_calls
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_view import REGISTRAR, Command, View
 
@@ -506,10 +501,12 @@ class Hold(Command[c.Holding], frozen=True):
     request: c.Value
     timeout_s: c.Seconds = 30.0
     priority: c.Priority = 0
+    wait_s: c.Seconds | None = None
 
     def _carry_out(self, view: View, caller: Caller) -> c.Holding:
         client = view.clients.named(self.registrar)
-        registrar, options = client.registrar, LoadOptions(on_status=client.hear, priority=self.priority, own=True)
+        registrar = client.registrar
+        options = LoadOptions(on_status=client.hear, priority=self.priority, own=True, wait_s=self.wait_s)
         query = load_bytes(registrar, self.server, self.request, "", options, timeout_s=self.timeout_s)
         response = response_bytes(query)
         if len(response) > c.RESPONSE_LIMIT_BYTES:
@@ -570,17 +567,8 @@ class AskActor(Command[c.Replied], frozen=True):
             text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
             raise Unavailable(text) from late
         except Exception as error:
-            raise self._failed(error) from error
+            raise actor_calls.as_a_client_hears(self.actor, error) from error
         return c.Replied(encode(answer, f"answer of {self.actor}"))
-
-    def _failed(self, error: Exception) -> RrError:
-        """Return the error for the client: one of this package stays of its class, and another is described."""
-        raised = {"actor": self.actor, "traceback": raised_elsewhere(error) or traceback_of(error)}
-        if isinstance(error, RrError):
-            if raised["traceback"]:  # by the handler, not on the way to it
-                error.details = raised | error.details
-            return error
-        return AskFailed(f"{self.actor}: {text_of(error)}", error=name_of_class(type(error)), **raised)
 
 
 ANY = Codec(None, "message")

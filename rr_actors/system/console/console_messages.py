@@ -354,9 +354,23 @@ class Statuses(Message, frozen=True):
 
 
 class Replied(Message, frozen=True):
-    """The answer to AskActor: the actor's answer, plain data, as canonical bytes."""
+    """The answer to AskActor and CallActor: the actor's answer, plain data, as canonical bytes."""
 
     answer: bytes
+
+
+class MethodRow(msgspec.Struct, frozen=True):
+    """A method of an actor that may be called from outside: its name, also with its parameters, and its docstring."""
+
+    name: str
+    signature: str
+    help: str
+
+
+class Methods(Message, frozen=True):
+    """The answer to ListMethods."""
+
+    rows: list[MethodRow]
 
 
 class Refused(Message, frozen=True):

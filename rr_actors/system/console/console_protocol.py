@@ -9,6 +9,7 @@ import msgspec
 
 from rr_actors.system.console import console_commands, console_questions
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking import actor_calls
 from rr_actors.system.console.console_view import Verb
 
 _A = TypeVar("_A")
@@ -30,7 +31,11 @@ def _is_verb(kind: type) -> bool:
     return issubclass(kind, Verb) and kind is not Verb and "_carry_out" in kind.__dict__
 
 
-_DECLARED: list[Any] = [*vars(console_questions).values(), *vars(console_commands).values()]
+_DECLARED: list[Any] = [
+    *vars(console_questions).values(),
+    *vars(console_commands).values(),
+    *vars(actor_calls).values(),
+]
 _VERBS: list[type[Verb[c.Message]]] = [one for one in _DECLARED if isinstance(one, type) and _is_verb(one)]
 REQUESTS = (c.Hello, c.Follow, c.BeginRecording, c.Keep, *_VERBS)
 ANSWERS = (c.Welcome, c.Refused, c.Following, c.Events, c.Entries, c.Missed, *dict.fromkeys(map(answer_of, _VERBS)))

@@ -13,6 +13,7 @@ from rr_actors.registrar.declarations import Declaring
 from rr_actors.registrar.pages import LOAD_ORDERS, RESOURCE_ORDERS, STREAM_ORDERS, Page, Wanted, What
 from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking import actor_calls
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_view import Look, Verb, View, room_for
 from rr_actors.system.recording.event_memory import Event
@@ -171,6 +172,15 @@ class HasAllStreams(Verb[c.AllStreams], frozen=True):
 
     def _carry_out(self, view: View, caller: Caller) -> c.AllStreams:
         return c.AllStreams(has_all_streams(view.clients.named(self.registrar).registrar, self.query_id))
+
+
+class ListMethods(Verb[c.Methods], frozen=True):
+    """The methods of an actor that CallActor may call, by its path or id."""
+
+    actor: c.Text
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Methods:
+        return c.Methods(actor_calls.described(view.system.ref(self.actor).actor_class))
 
 
 class ReadResponse(Verb[c.Response], frozen=True):

@@ -1,4 +1,4 @@
-"""What `rr-actors graph check`, `show`, `run` and `change` do with a graph of actions that is in a JSON file."""
+"""What `rr-actors graph check`, `show`, `run` and `change` do with a graph of actions: a JSON file, or one by name."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ def _mermaid(graph: ActionGraph) -> Iterator[str]:
 def run(file: Path, state: Path | None, inputs: str, timeout_s: float) -> None:
     """Have the child `actions` of a running system run a graph to its end, and say how it has ended.
 
-    The exit code is 1 if the result is not on_true.
+    `file`: a JSON file, or the name of a graph of the manager's folder. The exit code is 1 if the result is not
+    on_true.
 
     Raises:
         GraphError: the graph or an input is wrong, and nothing has run.
@@ -76,11 +77,16 @@ def run(file: Path, state: Path | None, inputs: str, timeout_s: float) -> None:
     except (msgspec.MsgspecError, UnicodeEncodeError) as error:
         raise UsageError(f"--inputs: expected a JSON object, got {shown(inputs)}: {error}") from error
     with connect(state) as client:
-        ended = run_graph(client.open_registrar(_HOLDER), file, inputs=given, timeout_s=timeout_s)
+        ended = run_graph(client.open_registrar(_HOLDER), _named(file) or file, inputs=given, timeout_s=timeout_s)
     say_table(("action", "state"), list(ended.states.items()), gives_way=("action",))
     say_json({"result": ended.result, "outputs": ended.outputs, "error": ended.error})
     if ended.result != "on_true":
         raise typer.Exit(1)
+
+
+def _named(file: Path) -> str:
+    """Return the name of a graph of the manager's folder, if this is none of a file."""
+    return "" if file.suffix == ".json" or file.exists() or len(file.parts) > 1 else str(file)
 
 
 def change(file: Path, id: str, state: Path | None, start: str) -> None:
@@ -95,14 +101,16 @@ def change(file: Path, id: str, state: Path | None, start: str) -> None:
         UnknownQuery: no resource has this id. UsageError: several have.
         RrError: no system runs.
     """
-    graph = read_graph_file(file)
+    name = _named(file)
+    graph = None if name else read_graph_file(file)
     with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
         found = [row for row in client.ask(Find(id)).resources if row.server.endswith("/graph")]
         if len(found) > 1:
             raise UsageError(f"{shown(id)}: {len(found)} graphs have this in their ids; give more of the id")
         if not found:
             raise UnknownQuery(f"{shown(id)}: no graph that runs has this id", query_id=id)
-        message = {"change_graph": found[0].id, "new": graph.document, "start": start, "file": str(file)}
+        new = name if graph is None else graph.document
+        message = {"change_graph": found[0].id, "new": new, "start": start, "file": "" if name else str(file)}
         manager = found[0].server.partition("/")[0]
         client.ask(AskActor(manager, encode(message, f"message to {manager}"), _ANSWER_S))
-    say(f"{found[0].id}: goes on as {graph.name}")
+    say(f"{found[0].id}: goes on as {name if graph is None else graph.name}")

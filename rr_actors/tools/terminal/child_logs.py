@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 
+from rr_actors.base.errors import NotFound
+from rr_actors.base.values.canonical import Codec
 from rr_actors.hosting.forwarded_logs import LogLine
+from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_messages import PAGE_LIMIT, ChildLog
-from rr_actors.system.console.console_questions import ListChildren, ListHistory, ListLog
+from rr_actors.system.console.console_questions import Find, ListChildren, ListHistory, ListLog
 from rr_actors.system.recording.event_memory import Event
 
+_answer = Codec(None, "answer")
 _TICK_S = 0.3  # between two questions for new lines
 
 
@@ -86,3 +91,15 @@ def new_lines(client: ConsoleClient, path: str, after: int) -> Iterator[list[Log
             after = lines[-1].seq
             yield lines
         time.sleep(_TICK_S)
+
+
+def output_of(client: ConsoleClient, program: str, count: int) -> list[str] | None:
+    """Return the last lines of an external program's output; None if this is the name or id of no program."""
+    found = [row for row in client.ask(Find(program)).resources if row.server.endswith("/program")]
+    if len(found) != 1:
+        return None
+    registrar, id = found[0].server.partition("/")[0], found[0].id
+    given = given_bytes(registrar, "output", (id, count))
+    with suppress(NotFound):  # another manager than Programs
+        return _answer.show(client.ask(CallActor(registrar, "output", given)).answer)
+    return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 from collections.abc import Iterator
@@ -13,9 +14,11 @@ import typer
 
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotRunning, UsageError, shown
+from rr_actors.base.values.canonical import Codec
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
+from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.recording.event_memory import Event, events_of, is_of_child, left_events
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
@@ -41,6 +44,7 @@ from rr_actors.tools.verbs.console_options import (
 app = typer.Typer()
 
 _LEFT = 2000  # events that a system has left
+_ANSWER_S = 10.0  # of the console, in addition to that of the actor
 _UNLOAD_S = 60.0  # for the unload callbacks, after a grace
 _PART = "its beginning or end, or a resource's name"
 _TICK_S = 0.1  # while nothing happens, lines that are settled are printed so often
@@ -278,6 +282,49 @@ def priority(
 ) -> None:
     """Give a query of any holder a priority; what its resource depends on follows."""
     carry_out(state, commands.GivePriority(id, commands.priority_from("PRIORITY", value), dry_run), as_json)
+
+
+@app.command(
+    epilog="Example: rr-actors call budgets set_capacity watts 60",
+    context_settings={"ignore_unknown_options": True},  # a negative number is no option
+)
+def call(
+    actor: ChildArgument,
+    method: Annotated[str, typer.Argument(help="One of its methods; without one, all are shown.")] = "",
+    given: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[JSON]...", help="Its arguments: 60, '{\"x\": 1}'; a word that is no JSON is a text."),
+    ] = None,
+    timeout_s: Timeout = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Call a method of an actor with plain data, and show its answer; without METHOD, show which methods there are."""
+    if not method:
+        with client_of(state, timeout_s) as client:
+            rows = client.ask(questions.ListMethods(actor)).rows
+        if as_json:
+            say_json(rows)
+        elif not rows:
+            say(f"{actor} has no methods of its own", err=True)
+        for row in rows if not as_json else ():
+            say(row.signature)
+            say_lines("\n".join(f"    {line}".rstrip() for line in row.help.splitlines()))
+        return
+    data = given_bytes(actor, method, [_argument(text) for text in given or ()])
+    with client_of(state, timeout_s + _ANSWER_S) as client:
+        answer = client.ask(CallActor(actor, method, data, timeout_s)).answer
+    say_json(Codec(None, "answer").show(answer))
+
+
+def _argument(text: str) -> Any:
+    """Return what a person has typed as an argument: JSON, or a word that stands for itself."""
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        if text[:1] in ("{", "[", '"'):
+            raise UsageError(f"expected JSON, got {shown(text)}: {error}") from None
+        return text
 
 
 @app.command(epilog="Example: rr-actors unload 01a2085d3f7c")

@@ -12,6 +12,7 @@ import typer
 from rr_actors.base.errors import UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.asking.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
 from rr_actors.system.console.console_commands import PauseActor, ResumeActor, StepActor
 from rr_actors.system.console.console_questions import ListHistory, LookAtMailbox
 from rr_actors.system.recording.event_texts import ago
@@ -19,7 +20,6 @@ from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, s
 from rr_actors.tools.explanations import explain, mailbox_lines
 from rr_actors.tools.process_usage import facts_of
 from rr_actors.tools.terminal.event_lines import event_line
-from rr_actors.tools.terminal.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
 from rr_actors.tools.verbs.console_options import (
     DryRun,
     Timeout,
@@ -122,7 +122,7 @@ def wait(
     if as_json:
         say_json({"target": target, "state": seen, "waited_s": waited_s, "done": done})
     else:
-        say(f"{target}: {seen} after {waited_s:g} s", err=not done)
+        say(f"{target}: {'' if done else 'still '}{seen} after {waited_s:g} s", err=not done)
     if not done:
         raise typer.Exit(1)
 

@@ -48,7 +48,7 @@ def new(
         target = Path(name, path.removesuffix(".txt"))
         target.parent.mkdir(exist_ok=True)
         target.write_text(text)
-    typer.echo(f"made {name}: see {name}/README.md, or: cd {name}; python -m pytest; python -m {module}")
+    typer.echo(f"made {name}: see {name}/README.md, or: cd {name}; pip install -e '.[test]'; python -m pytest")
 
 
 @app.command(epilog="Example: rr-actors import-temoto components.yaml pipes.yaml > pipes.toml")

@@ -34,7 +34,7 @@ from rr_actors.tools import graphs
 from rr_actors.tools.cli_commands import JsonOption, StateOption, json_text, say, say_json, say_lines, say_picture
 from rr_actors.tools.explanations import age_text, bytes_text, rate_text, readers_text
 from rr_actors.tools.tables.stream_table import stream_facts
-from rr_actors.tools.terminal.child_logs import LogText, events_of_child, log_of, new_lines
+from rr_actors.tools.terminal.child_logs import LogText, events_of_child, log_of, new_lines, output_of
 from rr_actors.tools.terminal.stream_frames import frames_of, png
 from rr_actors.tools.verbs.console_options import SHOWN, ChildArgument, Limit, Timeout, client_of
 from rr_actors.tools.web.timeline_file import html
@@ -153,9 +153,12 @@ def _line(entry: Entry) -> str:
 def graph(
     what: Annotated[
         Literal["check", "show", "run", "change"] | None,
-        typer.Argument(help="Without it the system is drawn. With it, FILE.json is a graph of actions."),
+        typer.Argument(help="Without it the system is drawn. With it, GRAPH is a graph of actions."),
     ] = None,
-    file: Annotated[Path | None, typer.Argument(metavar="[FILE.json]")] = None,
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[GRAPH]", help="A JSON file; of run and change also a name in the manager's folder."),
+    ] = None,
     id: Annotated[str, typer.Argument(metavar="[ID]", help="Of `change`: the resource of a graph that runs.")] = "",
     format: Annotated[
         Literal["mermaid", "dot", "svg", "png"],
@@ -170,8 +173,8 @@ def graph(
 ) -> None:
     """Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz.
 
-    With `check`, `show` or `run` and FILE.json: check a graph of actions, draw it, or have the child `actions` run it.
-    With `change`, FILE.json and ID: have a graph that runs go on as the one in the file.
+    With `check`, `show` or `run` and GRAPH: check a graph of actions, draw it, or have the child `actions` run it. With
+    `change`, GRAPH and ID: have a graph that runs go on as another one.
     """
     if format == "png" and sys.stdout.isatty():
         raise UsageError("--format png: expected a file, got a terminal: rr-actors graph --format png > graph.png")
@@ -209,14 +212,23 @@ def logs(
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the last log lines of a child, also of the processes that it had before.
+    """Show the last log lines of a child, also of the processes that it had before; or the output of a program.
 
-    The system keeps 500 lines of each child in memory, and at most 256 KiB of text.
+    The system keeps 500 lines of each child in memory, and at most 256 KiB of text. An external program is named by its
+    resource; its output is in a file.
     """
     if follow and previous:
         raise UsageError("--previous: expected no --follow with it, as a process that has ended logs no more")
     with client_of(state) as client:
-        log = log_of(client, child, lines, previous=previous)
+        try:
+            log = log_of(client, child, lines, previous=previous)
+        except NotFound:
+            if (output := output_of(client, child, lines)) is None:
+                raise
+            if follow or previous:
+                raise UsageError(f"{child}: expected a child for --follow and --previous, got a program") from None
+            say_json(output) if as_json else say_lines("\n".join(output))
+            return
         text = LogText(log.path, [] if as_json else events_of_child(client, log.path))
         _say_log(log.path, log.lines, text, as_json)
         if not log.lines:

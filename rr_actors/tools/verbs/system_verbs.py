@@ -15,15 +15,23 @@ from rr_actors.tools.tree_runner import run_tree, verified
 
 app = typer.Typer()
 
+TreeArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="TREE",
+        help="A TOML file, as Supervisor.from_toml reads it; or FILE.py[:OBJECT] or MODULE:OBJECT, a Supervisor.",
+    ),
+]
+
 
 @app.command(epilog="Example: rr-actors run robot.toml --state /var/lib/robot --log debug")
 def run(
-    tree: Annotated[Path, typer.Argument(metavar="TREE.toml", help="The tree, as Supervisor.from_toml reads it.")],
+    tree: TreeArgument,
     state: Annotated[
         Path, typer.Option("--state", envvar="RR_STATE", metavar="DIR", help="Its state directory.")
     ] = Path("rr_state"),
     config: Annotated[Path | None, typer.Option(help="Its configuration, as SystemConfig.from_toml reads it.")] = None,
-    name: Annotated[str, typer.Option(help="Its name, for logs.")] = "system",
+    name: Annotated[str, typer.Option(help="Its name, for logs. Default: the id of the tree.")] = "",
     log: Annotated[Literal["debug", "info", "warning", "error"], typer.Option(help="What its log tells.")] = "info",
     as_json: Annotated[bool, typer.Option("--json", help="The log as one object of JSON a line.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Restart a child whose module has changed.")] = False,
@@ -31,7 +39,7 @@ def run(
 ) -> None:
     """Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second one kills what is left.
 
-    Exit code 1 if the tree gave up by itself.
+    Modules and files that a TOML file names are looked for beside it. Exit code 1 if the tree gave up by itself.
     """
     if not run_tree(tree, state, config, name, log_level=log, log_json=as_json, watch=watch, debug=debug):
         raise typer.Exit(1)
@@ -39,7 +47,7 @@ def run(
 
 @app.command(epilog="Example: rr-actors verify robot.toml --config robot-config.toml")
 def verify(
-    tree: Annotated[Path, typer.Argument(metavar="TREE.toml", help="The tree, as Supervisor.from_toml reads it.")],
+    tree: TreeArgument,
     config: Annotated[Path | None, typer.Option(help="Its configuration, as SystemConfig.from_toml reads it.")] = None,
 ) -> None:
     """Say what cannot start of a tree: wrong keys, unknown classes, an on_start that waits for what starts later.

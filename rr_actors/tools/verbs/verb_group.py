@@ -121,7 +121,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
             ),
         },
         _recording: {
-            "logs": "Show the last log lines of a child, also of the processes that it had before",
+            "logs": (
+                "Show the last log lines of a child, also of the processes that it had before; or the output of a "
+                "program"
+            ),
             "graph": (
                 "Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz"
             ),
@@ -184,6 +187,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
     },
     "Run, change and stop it": {
         _console: {
+            "call": (
+                "Call a method of an actor with plain data, and show its answer; without METHOD, show which "
+                "methods there are"
+            ),
             "kill": "Send a signal to a child's process; if the child ends, its supervisor handles that as any end",
             "terminate": "Stop a child in order",
             "restart": "Start a child again",

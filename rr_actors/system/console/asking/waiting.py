@@ -1,12 +1,14 @@
-"""Waiting from outside: until a child of a running system, or a resource, is in a state."""
+"""Waiting until a child of a running system, or a resource, is in a state: for a shell, a client or the application."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 
-from rr_actors.base.errors import NotRunning, UsageError, few, shown
+from rr_actors.base.errors import NotRunning, Unavailable, UsageError, few, shown
 from rr_actors.base.names import child_meant
+from rr_actors.runtime.time_limits import deadline_of, left_until, time_limit
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_questions import Find
@@ -15,7 +17,8 @@ CHILD_STATES = ("running", "starting", "restarting", "stopped")
 RESOURCE_STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL", "loaded", "loading", "unloading", "paused", "revoked")
 GONE = "gone"
 
-_AGAIN_S = 0.1  # between two attempts to reach a system that does not run yet, and between two looks at one that does
+_AGAIN_S = 0.1  # between two attempts to reach a system that does not run yet
+_LOOKS_S = 0.02  # between two looks at one that does
 _TICK_S = 0.5  # while nothing happens, so often
 
 
@@ -36,7 +39,7 @@ def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, tim
     """
     known = (*CHILD_STATES, *RESOURCE_STATES, GONE)
     if wanted and wanted.lower() not in map(str.lower, known):
-        raise UsageError(f"--for: expected {', '.join(known)}, got {shown(wanted)}")
+        raise UsageError(f"state: expected {', '.join(known)}, got {shown(wanted)}")
     deadline = time.monotonic() + timeout_s
     accepted = {wanted.lower()} if wanted else {"running", "loaded"}
     states = [GONE]
@@ -72,7 +75,7 @@ def _looks(hearing: ConsoleClient, deadline: float) -> Iterator[None]:
     looked_at = 0.0
     for _ in hearing.follow(c.Follow(), _TICK_S):
         now = time.monotonic()
-        if now - looked_at > _AGAIN_S or now > deadline:
+        if now - looked_at > _LOOKS_S or now > deadline:
             yield
             looked_at = now
         if now > deadline:
@@ -96,7 +99,36 @@ def _states_of(asking: ConsoleClient, target: str) -> list[str]:
     if (child := child_of(asking, target)) is not None:
         return [child.state]
     resources = asking.ask(Find(target)).resources
+    if len(resources) > 1:  # those that are queued wait for the other one
+        resources = [row for row in resources if row.phase != "queued"] or resources
     if len(resources) > 1:
         several = few(f"{row.name} ({row.id})" for row in resources)
         raise UsageError(f"{shown(target)}: several resources have this in their ids: {several}; give more of the id")
     return [resources[0].condition, resources[0].state, resources[0].phase] if resources else [GONE]
+
+
+def waited_for(
+    connect: Callable[[], ConsoleClient],
+    target: str,
+    wanted: str,
+    timeout_s: float | None,
+    is_so: Callable[[str], bool] = lambda _state: True,
+) -> str:
+    """Wait as wait_for() does, and return the state.
+
+    Args:
+        is_so: says of a state that it is that of now, and not of a moment ago.
+
+    Raises:
+        Unavailable: it was not in time; the text has the state that was seen last.
+    """
+    deadline = deadline_of(time_limit(timeout_s))
+    while True:
+        left_s = left_until(deadline)
+        done, seen = wait_for(connect, target, wanted, math.inf if left_s is None else left_s)
+        if not done:
+            expected = wanted or "running or loaded"
+            raise Unavailable(f"{target}: expected {expected} within {timeout_s:g} s, it is {seen}")
+        if is_so(seen):
+            return seen
+        time.sleep(_LOOKS_S)

@@ -5,7 +5,7 @@ A resource's life, by phase::
     (request) ─> LOADING ─> LOADED ─> UNLOADING ─> (gone)
          │          │ failed           │ failed
          │          └─> (gone)         └─> UNLOAD_FAILED ─> UNLOADING ...
-         └─> QUEUED, while one of the same request is UNLOADING, then LOADING
+         └─> QUEUED, while one of the same request is UNLOADING, or another has the exclusive one; then LOADING
 
 FATAL is a status, not a phase. A FATAL resource stays with its holders, and new requests do not join it.
 
@@ -32,10 +32,11 @@ from rr_actors.registrar.core.callback_runs import (
     running,
     start_load,
 )
-from rr_actors.registrar.core.holding import break_ring
-from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
+from rr_actors.registrar.core.loads import lines
+from rr_actors.registrar.core.loads.load_rings import look_for_ring, ring_of_holds
+from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
-from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, withdraw
+from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.core.status_changes import is_busy, spread
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import (
@@ -49,22 +50,20 @@ from rr_actors.registrar.core.unloading import (
     stop_waiting,
 )
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog, Decision, Server
+from rr_actors.registrar.model.catalog import Catalog, Decision, Server, loaded
 from rr_actors.registrar.model.commands import CallbackEnded, CallbackOverdue, Reload
 from rr_actors.registrar.model.effects import AnswerCall, Effect, Happened, SendReply, SetTimer, StartCallback
-from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
+from rr_actors.registrar.model.messages import Load, LoadRefused
 from rr_actors.registrar.model.rows import (
     LOADED,
     LOADING,
     OK,
     PAUSED,
     PAUSING,
-    PENDING,
     QUEUED,
     RESTING,
     RESUMING,
     STANDBY,
-    UNLOADING,
     CallbackRun,
     Resource,
     ServedQuery,
@@ -95,33 +94,49 @@ def load(decision: Decision, message: Load) -> None:
         decision.cause(refuse(decision, message.origin, message.query_id, failures.unknown_server(catalog, server)))
         return
     resource_id = catalog.joinable(server, message.request)
-    if resource_id is None:
+    if catalog.servers[server].exclusive and lines.is_taken(catalog, message):
+        _wait_in_line(decision, message)
+    elif resource_id is None:
         _load_first(decision, message)
-    elif ring := _ring_of_holds(catalog, message, resource_id):
+    elif ring := ring_of_holds(catalog, message, resource_id):
         decision.cause(refuse(decision, message.origin, message.query_id, failures.own_part(catalog, ring)))
     elif resource_id in catalog.recovering:
         park(decision, resource_id, message)
-        _look_for_ring(decision, message, catalog.resources[resource_id])
+        look_for_ring(decision, catalog.resources[resource_id], message.query_id, message.parent)
     else:
         _join(decision, message, catalog.resources[resource_id])
 
 
-def _load_first(decision: Decision, message: Load) -> None:
+def _wait_in_line(decision: Decision, message: Load) -> None:
+    catalog = decision.catalog
+    used = catalog.used((message.server, message.request))
+    ring = next(filter(None, (ring_of_holds(catalog, message, resource.id) for resource in used)), None)
+    if ring:
+        decision.cause(refuse(decision, message.origin, message.query_id, failures.own_part(catalog, ring)))
+    elif message.wait_ms == 0:
+        lines.refuse_at_once(decision, message)
+    else:
+        _load_first(decision, message, lines.number_in(catalog, (message.server, message.request)))
+        lines.limit_wait(decision, message)
+
+
+def _load_first(decision: Decision, message: Load, number: int = 0) -> None:
+    """Begin a new resource, or have it wait; `number` is its place in the line of an exclusive one."""
     catalog = decision.catalog
     if catalog.refusing and (id := request_id(message.server, message.request)) in catalog.refusing:
         rounds = catalog.callback_runs[id].deaths
         failure = failures.still_refused(catalog, message.server, rounds, refused_for_s(rounds))
         decision.cause(refuse(decision, message.origin, message.query_id, failure))
         return
-    queued = (message.server, message.request) in catalog.unloading
+    queued = number > 0 or (message.server, message.request) in catalog.unloading
     phase = QUEUED if queued else LOADING
     resource_id = catalog.new_resource_id(message.query_id)
-    resource = Resource(resource_id, message.server, message.request, None, phase, OK, "", 1)
+    resource = Resource(resource_id, message.server, message.request, None, phase, OK, "", 1, number)
     decision.put(resource)
     _begin_query(decision, message, resource_id)
     decision.note(catalog.waiting, message.query_id, resource_id)
     if queued:
-        _look_for_ring(decision, message, resource)
+        look_for_ring(decision, resource, message.query_id, message.parent)
     else:
         start_load(decision, resource)
 
@@ -143,7 +158,7 @@ def _join(decision: Decision, message: Load, resource: Resource) -> None:
     decision.note(catalog.waited, message.server, catalog.waited.get(message.server, 0) + 1)
     if alone and resource.phase is LOADING:
         limit_load(decision, resource)
-    _look_for_ring(decision, message, resource)
+    look_for_ring(decision, resource, message.query_id, message.parent)
 
 
 def join(catalog: Catalog, message: Load) -> ServedQuery | None:
@@ -158,42 +173,14 @@ def join(catalog: Catalog, message: Load) -> ServedQuery | None:
         return None
     if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
         return None
-    if catalog.shut or message.priority or resource.id in catalog.ranked:
+    if catalog.shut or message.priority or resource.id in catalog.ranked or catalog.servers[message.server].exclusive:
         return None
-    if message.parent and message.origin == catalog.name and _ring_of_holds(catalog, message, resource.id):
+    if message.parent and message.origin == catalog.name and ring_of_holds(catalog, message, resource.id):
         return None
     id = message.query_id
     if id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
         return None
     return _query_of(message, resource.id)
-
-
-def _ring_of_holds(catalog: Catalog, message: Load, resource_id: str) -> list[str]:
-    """Return the resources from one that is loaded to the parent of a Load that would make it its own part, or [].
-
-    Such a ring of holds would never be released. Only rings within this registrar are seen here; those over several are
-    found when they have closed (core/holding.py).
-    """
-    if message.origin != catalog.name or not message.parent or catalog.resources[resource_id].phase is not LOADED:
-        return []
-    ways = {message.parent: [message.parent]}
-    left = [message.parent]
-    while left:
-        id = left.pop()
-        if id == resource_id:
-            return ways[id][::-1]
-        for query in catalog.queries_of(id):
-            if query.parent and query.origin == catalog.name and query.parent not in ways:
-                ways[query.parent] = [*ways[id], query.parent]
-                left.append(query.parent)
-    return []
-
-
-def loaded(catalog: Catalog, query_id: str, resource: Resource) -> Loaded:
-    """Return the answer to a Load whose resource is loaded."""
-    server = catalog.servers.get(resource.server)
-    types = 0 if server is None else server.types_checksum
-    return Loaded(query_id, resource.id, resource.response or b"", types, resource.state)
 
 
 def _load_again(decision: Decision, message: Load, query: ServedQuery) -> None:
@@ -204,7 +191,9 @@ def _load_again(decision: Decision, message: Load, query: ServedQuery) -> None:
         park(decision, resource.id, message)
     elif is_busy(catalog, resource) or is_to_run(query, resource):
         decision.note(catalog.waiting, query.id, resource.id)
-        _look_for_ring(decision, message, resource)
+        if resource.phase is QUEUED and resource.tries:
+            lines.limit_wait(decision, message)
+        look_for_ring(decision, resource, message.query_id, message.parent)
     else:
         decision.cause(SendReply(query.origin, loaded(catalog, query.id, resource)))
 
@@ -212,11 +201,6 @@ def _load_again(decision: Decision, message: Load, query: ServedQuery) -> None:
 def is_to_run(query: ServedQuery, resource: Resource) -> bool:
     """Return whether a resource is paused, or about to be, and is resumed for this query."""
     return resource.phase in RESTING and query.priority > STANDBY and resource.state is not State.FATAL
-
-
-def _look_for_ring(decision: Decision, message: Load, resource: Resource) -> None:
-    if message.parent:
-        chase(decision, resource, Probe(message.query_id, message.parent, message.query_id, []))
 
 
 def _begin_query(decision: Decision, message: Load, resource_id: str) -> None:
@@ -300,60 +284,6 @@ def load_overdue(decision: Decision, overdue: CallbackOverdue) -> None:
     resource = running(decision.catalog, overdue.resource_id, LOADING, overdue.run)
     if resource is not None:
         decision.effects += refuse_all(decision, resource, overdue.failure)
-
-
-# Probing finds rings of loads that wait for one another, by edge chasing (Chandy, Misra and Haas 1983).
-#
-# The last edge of a ring is always a load that joins one in flight or waits for an unload. Any other new resource waits
-# for nothing yet. So a probe starts at such a load. All other edges are known at their providers by then.
-# Therefore a load may go by another connection than the probe that follows it. A link may break and lose a probe. The
-# loads that wait at that provider are then sent again over the next link, and each starts another probe.
-
-_RING_LIMIT = 256
-
-
-def probe(decision: Decision, message: Probe) -> None:
-    """Pass a probe on to all that the query's resource waits for. Back at the waiter, it has found a ring."""
-    query = decision.catalog.queries.get(message.query_id)
-    resource_id = query.resource_id if query is not None else parked_on(decision.catalog, message.query_id)
-    if resource_id is not None:
-        go_on = _chase_holds if message.holds else chase
-        go_on(decision, decision.catalog.resources[resource_id], message)
-
-
-def _chase_holds(decision: Decision, resource: Resource, message: Probe) -> None:
-    """Pass a probe on from this resource to all its parts, once. Back at the waiter, it has found a ring of holds."""
-    catalog = decision.catalog
-    ring = [*message.ring, catalog.origin_of(resource)]
-    if resource.id == message.waiter:
-        break_ring(decision, message.blocked, ring)
-    elif len(ring) <= _RING_LIMIT and catalog.chased.get(resource.id) != message.blocked:
-        decision.note(catalog.chased, resource.id, message.blocked)
-        for held_id in parts_of(decision, resource.id):
-            held = catalog.held[held_id]
-            decision.request(held.registrar, replace(message, query_id=held.id, ring=ring))
-
-
-def chase(decision: Decision, resource: Resource, message: Probe) -> None:
-    """Pass a probe on from this resource to all that it waits for."""
-    catalog = decision.catalog
-    ring = [*message.ring, catalog.origin_of(resource)]
-    waits = is_busy(catalog, resource) or resource.phase is UNLOADING or resource.phase in RESTING
-    if not waits or len(ring) > _RING_LIMIT:
-        return
-    if resource.id == message.waiter:
-        add_in_flight(decision, message.blocked)
-        blocked = catalog.held.get(message.blocked)
-        if blocked is not None and blocked.hold is PENDING:
-            withdraw(decision, blocked, failures.circular(ring, blocked))
-        return
-    if resource.phase is QUEUED:
-        for id in list(catalog.unloading.get((resource.server, resource.request), ())):
-            chase(decision, catalog.resources[id], replace(message, ring=ring))
-    for held_id in parts_of(decision, resource.id):
-        held = catalog.held[held_id]
-        if held.hold is PENDING:
-            decision.request(held.registrar, Probe(held.id, message.waiter, message.blocked, ring))
 
 
 # -- reloads: a resource is loaded again for the same request, and its holders keep it ---------------------------------
