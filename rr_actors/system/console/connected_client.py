@@ -17,7 +17,16 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.base.errors import NotRunning, NotSerializable, RrError, Unavailable, UnknownQuery, UsageError, is_a
+from rr_actors.base.errors import (
+    LoadTimeout,
+    NotRunning,
+    NotSerializable,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UsageError,
+    is_a,
+)
 from rr_actors.base.names import ServerId, parse_server_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode
@@ -37,11 +46,11 @@ from rr_actors.registrar.pages import QueryRow
 from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, read_as, was_given
 from rr_actors.registrar.registrar import Consumer
 from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, RemoteLoads, RemoteUnloads
-from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.time_limits import deadline_of, left_until, time_limit
 from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_queries import ClientQuery, ClientViews, SystemConnections, listen
-from rr_actors.system.console.console_client import find_console
+from rr_actors.system.console.console_client import GREETING_S, find_console
 from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, OpenRegistrar, Release
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
 from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
@@ -50,7 +59,7 @@ T = TypeVar("T")
 
 logger = Log("rr_actors")
 
-_GRACE_S = 10.0  # for an answer, in addition to the time limit of its request
+_GRACE_S = 0.5  # for an answer, in addition to the time limit of its request: it says more than that none came
 _RETRY_S = 0.05  # between two looks for a system that is awaited
 
 
@@ -167,6 +176,10 @@ class _ClientCalls(RemoteCalls):
         self.connections.ask(Release(self.name, query_id, server, limit_s), limit_s + _GRACE_S)
         self.views.forget(query_id, server)
 
+    def overdue(self, timeout_s: float | None) -> RrError:
+        """Return the error of a load whose thread has not heard in time how it ended."""
+        return _too_late(f"registrar {self.name!r}", timeout_s, "the system has not answered")
+
     def all_streams(self, query: Query[Any]) -> Callable[[], bool]:
         """Return a function for one reader, which has a thread ask the system once, and returns False until it knows.
 
@@ -213,12 +226,13 @@ class _ClientLoads(RemoteLoads):
 
     def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
         client, limit_s = self._client, _limit(options.timeout_s)
+        deadline = deadline_of(limit_s + _GRACE_S)
         command = Hold(client.name, str(target), bytes(request), limit_s, options.priority)
         query: ClientQuery | None = None
         try:
             # If the connection ends before keep(), the system releases the query.
-            with client.views.loading(), client.connections.lent() as connection:
-                held = connection.ask(command, limit_s + _GRACE_S)
+            with client.views.loading(), client.connections.lent(min(GREETING_S, limit_s + _GRACE_S)) as connection:
+                held = connection.ask(command, left_until(deadline))
                 place = held.query_id, target, request, "", client.name, self.holder
                 query = ClientQuery(*place, _shown_types, client.all_streams)
                 if options.codec is not None:
@@ -229,7 +243,9 @@ class _ClientLoads(RemoteLoads):
                 client.views.add(query, options)
                 connection.keep()
             return query
-        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
+        except BaseException as error:  # also KeyboardInterrupt: the caller never gets the query
+            if type(error) is Unavailable and time.monotonic() >= deadline:
+                raise _too_late(str(target), options.timeout_s, str(error)) from error
             if query is not None:
                 threading.Thread(target=self.release, args=(query,), name="rr-undo").start()
             raise
@@ -242,9 +258,8 @@ class _ClientLoads(RemoteLoads):
                 self.send_load(sent[-1], target, request, "", options)
             wait(sent, return_when=FIRST_EXCEPTION)
             for place, one in enumerate(sent):
-                if one.done() and isinstance(error := one.exception(), RrError):
-                    note_request(error, requests, place)
-                    raise error
+                if one.done() and isinstance(one.exception(), RrError):
+                    _raise_of(one, requests, place)
             return Queries(one.get() for one in sent)
         except BaseException:
             for one in reversed(sent):
@@ -255,16 +270,27 @@ class _ClientLoads(RemoteLoads):
             raise
 
 
+def _raise_of(one: Reply[Query], requests: Sequence[LoadWanted], place: int) -> None:
+    try:
+        one.take()
+    except RrError as error:
+        note_request(error, requests, place)
+        raise
+
+
 def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
     """Have a new thread make a call, and set the reply. The application's executor may be full of other calls."""
 
-    def make() -> None:
-        try:
-            reply.set(call())
-        except BaseException as error:  # it is for the thread that reads the reply
-            fail(reply, error)
+    threading.Thread(target=_make, args=(reply, call), name="rr-client", daemon=True).start()
 
-    threading.Thread(target=make, name="rr-client", daemon=True).start()
+
+def _make(reply: Reply[T], call: Callable[[], T]) -> None:
+    try:
+        reply.set(call())
+    except BaseException as error:  # it is for the thread that reads the reply
+        fail(reply, error)
+    finally:
+        del reply  # the error has a traceback with this frame
 
 
 class ClientRegistrar(Consumer):
@@ -306,11 +332,12 @@ class ClientRegistrar(Consumer):
         """The registrar's name in the system, "client.NAME"."""
         return self._name
 
-    def _target(self, server: object) -> ServerId:
+    def _target(self, server: object, within_s: float | None = None) -> ServerId:
         if not is_a(server, Declared):
             return parse_server_id(server)
         place = declaring(cast("Declared[Any, Any, Any]", server))
-        return parse_server_id(self._connections.ask(FindServer(*place)).id)
+        limit_s = GREETING_S if within_s is None else min(GREETING_S, within_s)
+        return parse_server_id(self._connections.ask(FindServer(*place), limit_s).id)
 
     def _holder(self, parent: Parent | None) -> tuple[Consumer, str]:
         _refuse(self._name, "parent", parent is not None)
@@ -456,6 +483,12 @@ def connect(state_dir: str | os.PathLike[str] | None = None, *, wait_s: float | 
 def _limit(timeout_s: float | None) -> float:
     limit_s = time_limit(timeout_s)
     return TIMEOUT_LIMIT_S if limit_s is None else min(limit_s, TIMEOUT_LIMIT_S)
+
+
+def _too_late(server: str, timeout_s: float | None, why: str) -> LoadTimeout:
+    """Return the error of a load of which the system has not said in time how it has ended."""
+    text = f"{server}: not loaded within {timeout_s:g} s; {why}; the load is withdrawn"
+    return LoadTimeout(text, server=server, timeout_s=timeout_s, status="")
 
 
 def _encoded(value: Any, what: str) -> bytes:
