@@ -51,7 +51,7 @@ def children(count: int, times: int) -> list[Row]:
 
     Bare children do nothing, or have an event loop in a thread that listens on a socket.
     """
-    seconds: dict[str, list[float]] = {"bare": [], "listening": [], "started": [], "back": []}
+    seconds: dict[str, list[float]] = {"bare": [], "listening": [], "started": [], "back": [], "managers": []}
     specs = [rr.ChildSpec(Empty, id=f"child{number}") for number in range(count)]
     for _ in range(times):
         with _bare() as start_bare:
@@ -65,7 +65,8 @@ def children(count: int, times: int) -> list[Row]:
             with system:
                 seconds["started"].append(time.perf_counter() - start)
                 seconds["back"].append(_kill_all(system))
-    bare, listening, started, back = (Samples(tuple(taken)) for taken in seconds.values())
+        seconds["managers"].append(_start_managers(count))
+    bare, listening, started, back, managers = (Samples(tuple(taken)) for taken in seconds.values())
     return [
         Row(f"{count} bare forkserver children started and ready", bare.median, "s", max(bare.seconds)),
         Row(f"{count} that have a loop and listen", listening.median, "s", max(listening.seconds)),
@@ -74,10 +75,21 @@ def children(count: int, times: int) -> list[Row]:
         ),
         Row("  beside the bare children", started.median / bare.median, "times", at_most=1.2),
         Row("  beside those that listen", started.median / listening.median, "times"),
+        Row(f"{count} managers with a server, started and ready", managers.median, "s", max(managers.seconds)),
+        Row("  beside the children, which are empty actors", managers.median / started.median, "times", at_most=2.0),
         Row(f"{count} children killed at once, until all are back", back.median, "s", max(back.seconds)),
         Row("  beside the bare children", back.median / bare.median, "times", at_most=1.5),
         Row("  beside those that listen", back.median / listening.median, "times"),
     ]
+
+
+def _start_managers(count: int) -> float:
+    specs = [rr.ChildSpec(Echo, id=f"manager{number}") for number in range(count)]
+    with tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir:
+        config = rr.SystemConfig(preload=(Echo.__module__,))
+        start = time.perf_counter()
+        with rr.System(specs, state_dir=state_dir, config=config):
+            return time.perf_counter() - start
 
 
 def memory() -> list[Row]:

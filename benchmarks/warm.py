@@ -21,6 +21,7 @@ AT_MOST = {"none": 2.0, "process": 2.5 if find_spec("uvloop") else 3.0, "power":
 _P99_AT_MOST = 3.0
 _TURNS = 4
 _HELD = 100  # at a time
+_AWAITED_AT_MOST = {"process": 1.8, "thread": 1.3}
 _PLACES: dict[str, Literal["process", "thread"]] = {"another process": "process", "this process": "thread"}
 
 
@@ -71,25 +72,54 @@ def with_a_handler(times: int) -> list[Row]:
 
 
 def awaited(times: int) -> list[Row]:
-    """A load that a task of asyncio awaits, beside the blocking call: of one process, on one core."""
-    with placement_of.here(placement_of.ONE_CORE), running("process", "thread") as (system, consumer):
-        placement_of.part(placement_of.ONE_CORE)
-        blocking = _measure(_nothing, system, consumer, times)[1]
-        with asyncio.Runner() as runner:
-            load = runner.run(_awaited(consumer, times))
-    return [_row("awaited warm load, this process", load, blocking, "blocking", 1.3)]
+    """A load and its unload that a task of asyncio awaits, beside the blocking calls, on one core."""
+    rows: list[Row] = []
+    for name, placement in _PLACES.items():
+        blocking, load = (Samples(()), Samples(())), (Samples(()), Samples(()))
+        with placement_of.here(placement_of.ONE_CORE), running("process", placement) as (system, consumer):
+            placement_of.part(placement_of.ONE_CORE)
+            system.open_registrar("holder").load(SERVER, Ask(0))
+            for _ in range(_TURNS):
+                blocking = _added(blocking, _blocking(consumer, times // _TURNS))
+                with asyncio.Runner() as runner:
+                    load = _added(load, runner.run(_awaited(consumer, times // _TURNS)))
+        for what, took, beside in zip(("load", "unload"), load, blocking, strict=True):
+            rows.append(_row(f"awaited warm {what}, {name}", took, beside, "blocking", _AWAITED_AT_MOST[placement]))
+    return rows
 
 
-async def _awaited(consumer: rr.Registrar, times: int) -> Samples:
-    took = list[float]()
-    while len(took) < times:
+def _added(some: tuple[Samples, Samples], more: tuple[Samples, Samples]) -> tuple[Samples, Samples]:
+    return some[0] + more[0], some[1] + more[1]
+
+
+def _blocking(consumer: rr.Registrar, times: int) -> tuple[Samples, Samples]:
+    loads, unloads = list[float](), list[float]()
+    while len(loads) < times:
+        queries = list[rr.Query]()
+        for _ in range(_HELD):
+            began = time.perf_counter()
+            queries.append(consumer.load(SERVER, Ask(0)))
+            loads.append(time.perf_counter() - began)
+        for query in queries:
+            began = time.perf_counter()
+            consumer.unload(query)
+            unloads.append(time.perf_counter() - began)
+    return Samples(tuple(loads)), Samples(tuple(unloads))
+
+
+async def _awaited(consumer: rr.Registrar, times: int) -> tuple[Samples, Samples]:
+    loads, unloads = list[float](), list[float]()
+    while len(loads) < times:
         queries = list[rr.Query]()
         for _ in range(_HELD):
             began = time.perf_counter()
             queries.append(await consumer.load_async(SERVER, Ask(0)))
-            took.append(time.perf_counter() - began)
-        unload_all(queries, consumer)
-    return Samples(tuple(took))
+            loads.append(time.perf_counter() - began)
+        for query in queries:
+            began = time.perf_counter()
+            await consumer.unload_async(query)
+            unloads.append(time.perf_counter() - began)
+    return Samples(tuple(loads)), Samples(tuple(unloads))
 
 
 def _one_core(placement: Literal["process", "thread"], times: int) -> Samples:

@@ -40,6 +40,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             ActorUnavailable,
             AlreadyPresent,
             AlreadyStarted,
+            AskFailed,
             CatalogDamaged,
             CatalogError,
             CatalogLocked,
@@ -90,6 +91,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.registrar.servers.callback_context import Current, current
         from rr_actors.streams.publisher import Publisher
         from rr_actors.streams.stream import Stream, StreamFrame, StreamInfo
+        from rr_actors.streams.stream_file import RecordedStream
         from rr_actors.streams.stream_reader import StreamReader
         from rr_actors.supervision.core.rendering import Tree, render
         from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
@@ -106,6 +108,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             StreamEvent,
         )
         from rr_actors.system.recording.recordings import Recording, read_recording
+        from rr_actors.system.recording.stream_recordings import StreamRecording, read_stream, record_stream
         from rr_actors.system.recording.traces import Trace
         from rr_actors.system.system import System
 
@@ -122,6 +125,7 @@ __all__ = [
     "ActorUnavailable",
     "AlreadyPresent",
     "AlreadyStarted",
+    "AskFailed",
     "Backoff",
     "CatalogDamaged",
     "CatalogError",
@@ -176,6 +180,7 @@ __all__ = [
     "Publisher",
     "Queries",
     "Query",
+    "RecordedStream",
     "Recording",
     "Registrar",
     "RegistrarConfig",
@@ -193,6 +198,7 @@ __all__ = [
     "StreamFrame",
     "StreamInfo",
     "StreamReader",
+    "StreamRecording",
     "Subscription",
     "SupervisionError",
     "Supervisor",
@@ -214,6 +220,8 @@ __all__ = [
     "current",
     "monitor",
     "read_recording",
+    "read_stream",
+    "record_stream",
     "ref",
     "render",
     "run_graph",
@@ -241,6 +249,7 @@ if not TYPE_CHECKING:
         "rr_actors.base.values.codecs": "codec",
         "rr_actors.streams.publisher": "Publisher",
         "rr_actors.streams.stream": "Stream StreamFrame StreamInfo",
+        "rr_actors.streams.stream_file": "RecordedStream",
         "rr_actors.streams.stream_reader": "StreamReader",
         "rr_actors.managers": "Action GraphResult run_graph",
         "rr_actors.registrar.declarations": "Declared server",
@@ -260,6 +269,7 @@ if not TYPE_CHECKING:
             "ChildEvent DeadLetterEvent EndedEvent Event MissedEvent ProgressEvent ResourceEvent StreamEvent"
         ),
         "rr_actors.system.recording.recordings": "Recording read_recording",
+        "rr_actors.system.recording.stream_recordings": "StreamRecording read_stream record_stream",
         "rr_actors.system.recording.traces": "Trace",
         "rr_actors.system.system": "System",
     }

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import rr_actors as rr
 from support import Workshop
@@ -55,3 +57,11 @@ class Shop(rr.Manager):
     @load_thing.status
     def thing_status(self, request: Order, status: rr.Status) -> None:
         self.work.step(f"status {request.name} {status.state} {status.message}")
+
+
+def queue_length() -> float:
+    """Return the number in the file that RR_TEST_QUEUE names; hang while that says "hang"."""
+    file = Path(os.environ["RR_TEST_QUEUE"])
+    while (text := file.read_text()) == "hang":
+        time.sleep(0.01)
+    return float(text)

@@ -167,6 +167,8 @@ class Script:
             case e.StartCallback("unload", resource):
                 given = "" if resource.response is None else f" with {resource.response.decode()}"
                 self.say(name, f"runs the unload callback of {resource.id}{given}, try {resource.tries}")
+            case e.StartCallback("reload", resource):
+                self.say(name, f"runs the unload callback of {resource.id}, to load it again")
             case e.StartCallback("recover", resource, reload=reload):
                 self.say(name, f"runs the {'load' if reload else 'recover'} callback of {resource.id} again")
             case e.StartCallback("status", resource, notice) if notice is not None:
@@ -369,6 +371,12 @@ def _unload_ends(script: Script, name: str, id: str, how: str, text: str | None)
         script.post(name, c.CallbackEnded("unload", id, tries, Failure("UnloadFailed", text or "")))
 
 
+def _unload_first_ends(script: Script, name: str, id: str, how: str, text: str | None) -> None:
+    attempt = script.side(name).catalog.resources[id].attempt
+    failure = None if how == "returns" else Failure("UnloadFailed", text or "")
+    script.post(name, c.CallbackEnded("reload", id, attempt, failure, event=script.event()))
+
+
 def _recover_ends(script: Script, name: str, id: str, how: str, text: str) -> None:
     attempt, event = script.side(name).catalog.resources[id].attempt, script.event()
     if how == "returns":
@@ -470,6 +478,10 @@ STEPS: dict[str, Callable[..., None]] = {
     rf"{R} updates (?P<id>\w+) to (?P<text>.+)": _updates,
     rf"{R} unloads (?P<id>\S+) by force": lambda script, name, id: script.post(
         name, c.ForceUnload(id, script.event(), "force_unload", clears=True)
+    ),
+    rf"{R} reloads (?P<id>\S+)": lambda script, name, id: script.post(name, c.Reload(id, "reload")),
+    rf"{R}: the unload callback of (?P<id>\S+), to load it again, (?P<how>returns|raises)(?: (?P<text>.+))?": (
+        _unload_first_ends
     ),
     rf"{R} unregisters (?P<server>\w+)": lambda script, name, server: script.post(
         name, c.Unregister(server, script.event(), "unregister_server")

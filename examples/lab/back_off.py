@@ -1,23 +1,26 @@
-"""Back-off: a device needs time to come back, so each restart waits longer than the one before.
+"""Back-off: a device needs time to come back, so a restart can wait.
 
-Without a back-off the restarts of a second would use up the intensity. The jitter takes a random part off each wait:
-children that failed together then do not restart together.
+Two modems fail at the same time, three times. The first wait is 1 s, and each further wait is the one before times the
+factor. A jitter of 0.5 takes a random part, up to a half, off each wait.
 
-Look for: the state "restarting", which lasts longer each time; with a jitter, the two modems, which do not wait equally
-long although they failed together.
+Look for: how long the state "restarting" lasts each time, for each of the two modems.
+
+Why: with the factor 2 the third wait is 1 s times 2 times 2: 4 s. Without a back-off the restarts of one second would
+use up the intensity. With a jitter the modems do not wait equally long: children that failed together do not come back
+together, and do not overload what both of them need.
 """
 
 # /// lab
 # place = 5
-# question = "The first wait is 1 s. How long will the third one be?"
+# question = "The first wait of the left modem is 1 s, or less. How long will its third one be?"
 # levers = [
 #     {name = "factor", label = "factor", choices = [2.0, 1.0]},
 #     {name = "jitter", label = "jitter", choices = [0.0, 0.5]},
 # ]
 # [answers]
-# "about 1 s" = {prints = "wait 3: about 1 s"}
-# "2 to 3 s" = {prints = "wait 3: 2 to 3 s"}
-# "about 4 s" = {prints = "wait 3: about 4 s"}
+# "under 1.5 s" = {prints = "root/left, wait 3: under 1.5 s"}
+# "1.5 to 3 s" = {prints = "root/left, wait 3: 1.5 to 3 s"}
+# "over 3 s" = {prints = "root/left, wait 3: over 3 s"}
 # ///
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ class Modem(rr.Actor):
 
 
 def rounded(wait_s: float) -> str:
-    return "about 1 s" if wait_s < 1.5 else "2 to 3 s" if wait_s < 3.2 else "about 4 s"
+    return "under 1.5 s" if wait_s < 1.5 else "1.5 to 3 s" if wait_s <= 3 else "over 3 s"
 
 
 def main(state_dir: str, factor: float = 2.0, jitter: float = 0.0) -> None:

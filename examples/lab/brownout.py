@@ -1,10 +1,13 @@
-"""Brownout: devices share 100 W, and the least urgent give way.
+"""Brownout: devices share 100 W, and there is not enough for all.
 
-Each device is a resource, and holds a share of the pool as long as it is on. The operator gives each a priority. For a
-device that was switched off he asks again, and it waits for room.
+Each device is a resource, and holds a share of the pool as long as it is on. The operator gives each a priority, from 1
+for the radio to 5 for the arm. For a device that was switched off he asks again, and it waits for room.
 
-Look for: the resources that are unloaded before the pump is on; the ones that come back, the most urgent first, when
-there is power again.
+Look for: the resources that are unloaded before the pump is on; the ones that come back, and in which order, when there
+is power again.
+
+Why: a share of a higher priority takes the room of the least urgent ones, as many as it needs and no more. Of two
+equal ones nobody gives way. When there is room again, the most urgent of those that wait gets it first.
 """
 
 # /// lab

@@ -1,9 +1,11 @@
-"""kill -9 in the middle of an unload: the file is closed by the next process.
+"""kill -9 in the middle of an unload: a manager closes a file for five seconds, and dies after three.
 
-The manager writes the release to disk before the unload callback begins. The next process reads it, and runs the
+The consumer has released the file, and the manager's unload callback runs.
+
+Look for: the state of the resource after the kill; the manager's new process; the number of the attempt.
+
+Why: the manager writes the release to disk before the unload callback begins. The next process reads it, and runs the
 callback again. So an unload callback may find that a part of its work is done.
-
-Look for: the resource that is still there after the kill, as "unloading"; the manager's new process, and attempt 2.
 """
 
 # /// lab

@@ -1,9 +1,13 @@
-"""Escalation: if the lowest supervisor cannot cure a failure, the next one tries a wider restart.
+"""Escalation: failures at the lowest of three supervisors.
 
-The motor is killed four times. Each supervisor allows one restart within a minute.
+The motor is killed, as often as you choose. Above it are the supervisors `wheel`, `base` and `root`. Each allows one
+restart within a minute.
 
-Look for: first the motor alone starts again. At the second kill its supervisor `wheel` gives up, and `base` starts the
-battery and the wheel again. At the fourth kill `base` gives up, too, and `root` starts everything again.
+Look for: what starts again at each kill: the motor alone, or more.
+
+Why: each supervisor has a window of its own. At the second kill `wheel` gives up, and `base` starts the battery and the
+wheel again, as it is one_for_all. The new wheel allows one restart again, so the third kill costs the motor alone. At
+the fourth the wheel gives up once more. That is one restart too many for `base`, and `root` starts everything again.
 """
 
 # /// lab

@@ -1,9 +1,13 @@
 """The four strategies side by side: the same child is killed under each of four supervisors.
 
-A strategy says which children start again when one of them ends.
+A strategy says which children start again when one of them ends. Each supervisor has three children. Those of
+`simple_one_for_one` have no names: they are copies of one template, and the first counts as a, the second as b.
 
-Look for: a number in the box of each child that was started again. One of three under one_for_one, all three under
-one_for_all, the killed one and the one after it under rest_for_one, one under simple_one_for_one.
+Look for: a number in the box of each child that has been started again. Compare the four supervisors.
+
+Why: one_for_one starts only the killed child again. one_for_all starts all three again, as none can go on without the
+others. rest_for_one starts the killed child again, and those that were started after it, as they may depend on it.
+simple_one_for_one is one_for_one for copies of one template.
 """
 
 # /// lab
@@ -42,7 +46,8 @@ def main(state_dir: str, child: str = "b") -> None:
             system.supervisor("root/simple_one_for_one").start_child([])
         time.sleep(3)
         for strategy in strategies:
-            killed = system.supervisor(f"root/{strategy}").which_children()["abc".index(child)]
+            oldest_first = system.supervisor(f"root/{strategy}").which_children()[::-1]
+            killed = oldest_first["abc".index(child)]
             print(f"SIGKILL to {killed.id} under {strategy}", flush=True)
             killed.kill()
             time.sleep(3)

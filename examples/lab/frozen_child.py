@@ -1,10 +1,12 @@
-"""A frozen child: its process lives, and stands still. No signal says so; its heartbeat does.
+"""A frozen child: its process lives, and stands still. No signal says so.
 
-A supervisor with a heartbeat asks the child's process twice in that time. A process that has not answered for so long
-is killed, and started again. A process that stands still for less time goes on as if nothing had happened.
+A supervisor with a heartbeat asks the child's process twice in that time whether it still answers.
 
-Look for: the new process number if the heartbeat is shorter than the pause; the reason "hung" in the events; the late
-answer if it is not.
+Look for: the number of the process, before and after the pause; the reason of its end in the events, if it ends.
+
+Why: a process that has not answered for as long as its heartbeat counts as hung. It is killed, and another one is
+started. Without a heartbeat, or with one that is longer than the pause, it goes on as if nothing had happened, and
+what was asked meanwhile is answered late.
 """
 
 # /// lab

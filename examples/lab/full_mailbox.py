@@ -1,10 +1,12 @@
 """A full mailbox: a sensor sends faster than a filter works.
 
-A mailbox has a bound. Who asks waits for each answer, and becomes as slow as the actor that answers. Who tells goes on
-at once. In one process it hears MailboxFull at the bound. In another process the filter's side finds the mailbox full,
-when the sender has long gone on: what it does not take is a dead letter.
+A mailbox has a bound. Who asks waits for each answer. Who tells goes on at once.
 
-Look for: the number of messages that wait, which grows; the dead letters in the events.
+Look for: the number of messages that wait; what the sensor hears; the dead letters in the events.
+
+Why: who asks becomes as slow as the actor that answers. Who tells an actor of its own process hears MailboxFull at the
+bound. In another process the filter's side finds the mailbox full, when the sender has long gone on: what it does not
+take is a dead letter.
 """
 
 # /// lab

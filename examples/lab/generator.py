@@ -1,10 +1,12 @@
-"""Generator: a reserve is started before anybody is switched off.
+"""Generator: all of a battery is used, and more is needed.
 
-The battery gives 100 W, and all of it is used. A generator can give 40 W more. The pool names it as its reserve, so it
-is loaded when that is needed, and released when it is not.
+The battery gives 100 W. A generator can give 40 W more. The pool names it as its reserve. It starts only if it has
+fuel. The pump needs 40 W, and later the alarm 40 W more.
 
-Look for: the generator, which loads for two seconds while the pump waits; what becomes of the others when the alarm
-needs 40 W more, and there is no second generator.
+Look for: what the generator does while the pump waits; what becomes of the others when the alarm comes.
+
+Why: a reserve is loaded when room is needed, before anybody is switched off, and released when it is not needed any
+more. Only if it cannot be loaded, or is used already, do the least urgent ones give way.
 """
 
 # /// lab

@@ -1,9 +1,12 @@
-"""A status handled on its way up: the manager in the middle deals with it, so those above hear nothing.
+"""A status on its way up: a lens becomes dirty, and a camera stands on it.
 
-A status goes from a part to the resource that stands on it, and from there to its holders. A manager that calls
-`status.handled()` in its status callback stops it.
+A status goes from a part to the resource that stands on it, and from there to its holders. A manager can call
+`status.handled()` in its status callback.
 
 Look for: the warning at the lens, and whether the camera gets it, too; who prints that it heard.
+
+Why: `status.handled()` says that the manager in the middle has dealt with the status, so it goes no further. Without
+it the holders of the camera hear it as well.
 """
 
 # /// lab

@@ -1,9 +1,12 @@
-"""Keep: what a file wants is loaded again when it fails.
+"""Keep: a file wants three radios, and one of them fails.
 
-The file wants three radios. A radio is a resource whose part is a program. The keeper compares what is there with what
-is wanted, whenever something happens, and loads what is missing. In the end another number of radios is wanted.
+A radio is a resource whose part is a program. The keeper compares what is there with what is wanted, whenever something
+happens. In the end another number of radios is wanted.
 
-Look for: the radio that fails, and the wait before it is loaded again; which radios are left when fewer are wanted.
+Look for: the radio that fails, and what is there before and after the wait; which radios are there in the end.
+
+Why: what is wanted and not there is loaded again, under its own number, when the wait is over. If fewer are wanted, the
+ones with the highest numbers go.
 """
 
 # /// lab

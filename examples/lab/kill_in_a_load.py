@@ -1,9 +1,11 @@
-"""kill -9 in the middle of a load: the consumer waits a little longer, and gets its resource.
+"""kill -9 in the middle of a load: a manager loads a map for six seconds, and dies after three.
 
-The manager writes the request to disk before it begins. The next process reads the request, and runs the load callback
-again. The consumer has asked once, and gets one answer.
+The consumer has asked once, and waits.
 
-Look for: the resource that is still loading after the kill, the manager's new process, and attempt 2.
+Look for: the state of the resource after the kill; the manager's new process; the number of the attempt.
+
+Why: the manager writes the request to disk before it begins. The next process reads the request, and runs the load
+callback again. The consumer has asked once, and gets one answer, a little later.
 """
 
 # /// lab

@@ -1,9 +1,11 @@
 """A token ring: three actors pass a token on, and the one that has it is killed.
 
-A message that is being handled dies with its actor. The supervisor starts the actor again, but does not send a message
-again: it cannot know what was done already. So somebody must watch, and decide.
+The token is a message. Each node keeps it for a second, and sends it on.
 
 Look for: node b's new process; who has the token after that.
+
+Why: a message that is being handled dies with its actor. The supervisor starts the actor again, but does not send a
+message again: it cannot know what was done already. So somebody must watch, and decide.
 """
 
 # /// lab

@@ -1,11 +1,13 @@
 """Dining philosophers: each needs two forks, and takes one after the other.
 
-A fork that is asked has its turn for as long as the meal takes. In one process a ring of asks is found where it closes,
-and its last ask is refused at once. Asks of several processes that close a ring together wait until their time limits.
-With tells a fork notes who waits for it: nobody waits in a handler, so nobody sees the ring. An order of the forks, the
-same for all, makes a ring impossible.
+A fork that is asked has its turn for as long as the meal takes. A fork that is told notes who waits for it, and nobody
+waits in a handler.
 
-Look for: the ring in the error, or the errors of time limits; who has eaten at the end.
+Look for: the errors, and when they come; who has eaten at the end.
+
+Why: in one process a ring of asks is found where it closes, and its last ask is refused at once. Asks of several
+processes that close a ring together wait until their time limits. With tells nobody waits in a handler, so nobody sees
+the ring. An order of the forks, the same for all, makes a ring impossible.
 """
 
 # /// lab

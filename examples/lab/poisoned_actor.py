@@ -1,9 +1,13 @@
-"""A poisoned message: it ends the process that handles it. The actor starts again; the message is not sent again.
+"""A poisoned message: it ends the process that handles it.
 
-If the message were sent again after each restart, the actor would end each time. So the message is lost, and its
-sender decides: a sender that asks gets an error. A message to an actor that is stopped is a dead letter.
+A parser gets the messages "one", "poison", "two" and "three", one after another. "poison" ends its process, as a defect
+in a C library would. Then the parser is stopped, and gets "four".
 
-Look for: the parser's new process after the poison, with no message left over; and the dead letter in the events.
+Look for: the parser's new process after the poison, and how many messages wait for it; what becomes of "four".
+
+Why: the actor starts again, and the message is not sent again. If it were, the actor would end each time. So the
+message is lost, and its sender decides: a sender that asks gets an error. A message to a stopped actor is a dead
+letter.
 """
 
 # /// lab

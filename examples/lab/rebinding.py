@@ -1,10 +1,13 @@
-"""Rebinding: another sensor takes the place of one that was killed.
+"""Rebinding: a loop reads one of two sensors, and that is killed.
 
 A choice is a resource with one part: the sensor in use. A camera gives 60 readings in a second, a lidar 30. The
 consumer asks for the kind "range", and prefers many readings. One loop reads them all.
 
-Look for: the choice, whose part changes while its holder keeps it; the camera's new process, which is on trial for the
-settling time before the choice returns to it.
+Look for: the choice, and which part it has; the camera's new process, and how long it is there before it is used.
+
+Why: the choice looks for another sensor that gives enough readings, and takes it as its part. Its holder keeps the
+choice, and the loop reads on. The camera comes back with a new process, and is on trial for the settling time before
+the choice returns to it. If no sensor gives enough, the choice is lost.
 """
 
 # /// lab

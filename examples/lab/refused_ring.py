@@ -1,9 +1,11 @@
-"""A ring that is refused: a map needs a camera, and that camera needs the same map.
+"""A ring of loads: a map needs a camera, and that camera needs the same map.
 
-Each would wait for the other, for ever. The registrars see the ring when its last load is asked for, also across
-processes, and this load fails at once.
+Each would wait for the other. They are in two processes.
 
-Look for: the two resources that are still loading, and then fail; the error, which names all loads of the ring.
+Look for: the states of the two resources; what is printed, and when.
+
+Why: the registrars see the ring when its last load is asked for, also across processes. This load fails at once, with
+an error that names all loads of the ring, and so both resources fail in place of waiting for ever.
 """
 
 # /// lab

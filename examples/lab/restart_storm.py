@@ -1,10 +1,13 @@
 """A restart storm against the intensity window: a child that always fails, and a supervisor that counts.
 
-A supervisor allows some restarts within some seconds. At one more, it stops all its children and ends. The supervisor
-above it decides what follows: here it starts the whole branch again, once.
+A supervisor allows some restarts within some seconds. `branch` has a child that fails again and again, and an innocent
+one. `root`, above it, allows one restart.
 
-Look for: the squares in the box of `branch`, which fill up; its innocent child, which is stopped with it; then the
-squares of `root`. In the end nothing runs.
+Look for: the squares in the boxes of `branch` and `root`, which fill up; what becomes of the innocent child.
+
+Why: at one restart more than it allows, `branch` stops all its children, the innocent one too, and ends. `root` starts
+it again, once. The new `branch` fails in the same way, and that is one restart too many for `root`: it ends, and with
+it the whole tree.
 """
 
 # /// lab
@@ -43,7 +46,7 @@ def main(state_dir: str, max_restarts: int = 3) -> None:
     children = [rr.ChildSpec(Innocent, id="innocent"), rr.ChildSpec(Broken, id="broken")]
     branch = rr.Supervisor(children, id="branch", max_restarts=max_restarts, max_seconds=15)
     with rr.System(rr.Supervisor([branch], max_restarts=1, max_seconds=60), state_dir=state_dir) as system:
-        print(f"broken fails 1.5 s after each start; {max_restarts} restarts within 15 s are allowed", flush=True)
+        print(f"broken fails 1.5 s after each start; restarts allowed within 15 s: {max_restarts}", flush=True)
         system.wait(60)
         print(f"the tree has ended: {system.ended.reason if system.ended else 'not yet'}", flush=True)
         time.sleep(3)

@@ -1,10 +1,14 @@
-"""Sharing and dependencies: a camera stands on a lens, and two consumers share it.
+"""Sharing and dependencies: a camera stands on a lens, and two consumers want it.
 
-A resource that is asked for twice is loaded once. If a load callback loads another resource, that becomes a part of
-its own, and is unloaded with it.
+The load callback of the camera loads a lens. The mapper and the guard both load the front camera. Then the lens becomes
+dirty, and the two release the camera one after the other.
 
-Look for: one camera with two holders, and one lens; the warning about the lens, which travels to the camera and from
-there to both consumers; the camera that stays until the second consumer releases it, and takes its lens along.
+Look for: how many cameras and lenses there are, and who holds them; how far the warning about the lens travels; when
+the camera goes, and what goes with it.
+
+Why: a resource that is asked for twice is loaded once. If a load callback loads another resource, that becomes a part,
+and is unloaded with it. A status of a part travels to what stands on it, and from there to all its holders. The last
+release unloads the camera.
 """
 
 # /// lab

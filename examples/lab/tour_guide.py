@@ -1,9 +1,12 @@
-"""A tour guide: programs that run only while they are needed.
+"""A tour guide: programs that are needed now and then.
 
 A use case, such as "drive", is a resource, and the programs that it needs are its parts. Nobody pauses or ends a
-program by hand: one that nobody holds is idle, and its manager does what was chosen for that.
+program by hand: one that nobody holds is idle, and its manager does what you choose, after as long as you choose.
 
 Look for: the programs that are there when the guide does not drive, and how soon they answer when it drives again.
+
+Why: a program that is paused is there again at once, and keeps its memory. One that was ended frees its memory, and
+has to start again. What lingers longer than the pause between two drives is not touched.
 """
 
 # /// lab

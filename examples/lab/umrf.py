@@ -1,10 +1,13 @@
-"""Actions as a graph: a picture is taken with another camera if the first one fails.
+"""Actions as a graph: the robot drives, takes a picture, and reports.
 
-Each action is a class, and the graph says which one runs when. An action's run is a resource: what it loads is its
-part, and is released when the run has ended. Each step of the graph is on disk before the next one begins.
+Each action is a class, and the graph says which one runs when: if the arm's camera fails, the spare one is tried. An
+action's run is a resource: what it loads is its part, and is released when the run has ended.
 
-Look for: the graph's parts, one for each action that runs; if the manager of the actions is killed, the action that
-runs again, and the ones that do not.
+Look for: the graph's parts, one for each action that runs; if the manager of the actions is killed, which action runs
+again, and which do not.
+
+Why: each step of the graph is on disk before the next one begins. After a crash the actions that had ended stay so, and
+the one that ran begins again, as its next attempt.
 """
 
 # /// lab
@@ -15,6 +18,7 @@ runs again, and the ones that do not.
 #     {name = "killed", label = "what is killed during a picture", choices = ["nobody", "actions"]},
 # ]
 # [answers]
+# "the arm's camera takes it" = {prints = "TakePicture_0 is FINISHED"}
 # "the spare camera takes it" = {prints = "TakePicture_1 is FINISHED"}
 # "the graph ends with an error" = {prints = "the graph ends with on_error"}
 # "the drive runs again" = {prints = "Drive begins, attempt 2"}

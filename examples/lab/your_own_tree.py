@@ -1,10 +1,12 @@
 """A tree of your own: you choose the strategy, the intensity, the child that is killed, and how often.
 
-The supervisor `team` has three children. At one kill more than its intensity allows it gives up. Then `root` starts the
-whole team again.
+The supervisor `team` has three children. Its intensity is the number of restarts that it allows within a minute.
 
-Look for: the children that start again with the killed one; the squares in the box of `team`, which fill up; the mark
-at `team` itself if it gives up.
+Look for: the children that start again with the killed one; the squares in the box of `team`, which count its restarts;
+a mark at `team` itself.
+
+Why: the strategy says which children start again with the killed one. The intensity says how often. At one kill more,
+the team gives up: it stops all its children and ends, and `root` starts the whole team again.
 """
 
 # /// lab

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import pykka
 from pykka import ActorDeadError
+from pykka import Timeout as Timeout  # for the console
 
 from rr_actors.actors.messaging import ask_cycles, dead_letters
 from rr_actors.actors.messaging.ask_cycles import Target

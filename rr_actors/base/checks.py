@@ -8,6 +8,7 @@ import inspect
 import math
 import os
 from collections.abc import Callable, Generator, Mapping, Sequence
+from types import FunctionType, MethodType
 from typing import Any, NamedTuple, TypeGuard, cast
 
 from msgspec import Struct
@@ -145,6 +146,8 @@ def check_takes(callback: Callable[..., Any], names: Sequence[str], who: str, fi
     while isinstance(function, functools.partial):
         given, keywords = (*function.args, *given), {**function.keywords, **keywords}
         function = function.func
+    if _plainly_takes(function, len(given) + len(names), keywords):
+        return
     try:
         # The wrapper's own signature: it may take other arguments than the function that it wraps.
         signature = inspect.signature(function, follow_wrapped=False)
@@ -161,6 +164,24 @@ def check_takes(callback: Callable[..., Any], names: Sequence[str], who: str, fi
         raise InvalidSpec(
             f"{who}: {field}: expected {expected}, got {got}: {error}", field=field, expected=expected, got=got
         ) from error
+
+
+def _plainly_takes(function: object, positional: int, keywords: Mapping[str, object]) -> bool:
+    """Return whether a function of Python takes so many positional arguments, and none by keyword.
+
+    False: it does not, or its signature has to be read, which takes ten times as long.
+    """
+    if keywords:
+        return False
+    if isinstance(function, MethodType):
+        function, positional = function.__func__, positional + 1
+    if type(function) is not FunctionType or "__signature__" in function.__dict__:
+        return False
+    code, defaults = function.__code__, function.__defaults__ or ()
+    if code.co_kwonlyargcount:
+        return False
+    most = positional if code.co_flags & inspect.CO_VARARGS else code.co_argcount
+    return code.co_argcount - len(defaults) <= positional <= most
 
 
 # Checks of installed libraries: those of an extra are imported where they are first needed.

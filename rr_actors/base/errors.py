@@ -150,6 +150,11 @@ def shown(value: object) -> str:
     return shortened(exact_text(text))
 
 
+def with_article(noun: str) -> str:
+    """Return "a camera", "an Open"."""
+    return f"{'an' if noun[:1].lower() in 'aeiou' else 'a'} {noun}"
+
+
 def shortened(text: str) -> str:
     """Return the beginning of a user's text, such as an id, for a message: at most TEXT_LIMIT characters."""
     return text if len(text) <= TEXT_LIMIT else f"{text[: TEXT_LIMIT - 1]}…"
@@ -371,6 +376,18 @@ class ResourceLost(RrError):
 
     query_id: str
     resource_id: str
+
+
+class AskFailed(RrError):
+    """The handler of an actor raised while a client of rr.connect() asked it: its exception cannot be brought here.
+
+    `.actor`: as it was asked; `.error`: the exception's class, "ValueError", as its text names it.
+    `.traceback`: its lines as Python prints them; a note shows them, too.
+    """
+
+    actor: str
+    error: str
+    traceback: str = ""
 
 
 class Unavailable(RrError):

@@ -266,6 +266,11 @@ def modules_of(value: object, what: str = "value") -> set[str]:
     return pickler.modules
 
 
+def send_by_value(module: types.ModuleType) -> None:
+    """Have the classes and functions of a module travel with their code: other processes cannot import it."""
+    cloudpickle.register_pickle_by_value(module)  # pyright: ignore[reportUnknownMemberType]  # its own has no types
+
+
 def _dumps_by_value(
     value: object, *, resolve: bool = True, keep: Callable[[pickle.PickleBuffer], bool] | None = None
 ) -> bytes:

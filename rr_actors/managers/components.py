@@ -24,15 +24,18 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import signal
+import string
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.base.errors import ConfigError, LoadError, LoadFailed, LoadTimeout, RrError, UnknownQuery
+from rr_actors.base.checks import is_number
+from rr_actors.base.errors import ConfigError, LoadError, LoadFailed, LoadTimeout, RrError, UnknownQuery, shown
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
@@ -43,7 +46,6 @@ from rr_actors.managers.planning.last_good import last_good_file, path_of
 from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import Retries
 from rr_actors.managers.planning.searches import Loading, Search, groups, release_soon, release_strays
-from rr_actors.managers.program_checks import parameter_faults, program_faults, template_faults
 from rr_actors.managers.program_conditions import ProgramHealth
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
@@ -406,11 +408,46 @@ def check_components(file: str, components: Sequence[ComponentDescription]) -> N
         key = f"component[{i}]"
         if not component.type:
             faults.append(wrong(file, f"{key}.type", "the name of a type", component.type))
-        faults += parameter_faults(file, f"{key}.parameters", component.parameters)
-        faults += program_faults(file, f"{key}.program", component.program)
+        faults += _parameter_faults(file, f"{key}.parameters", component.parameters)
+        faults += _program_faults(file, f"{key}.program", component.program)
         if component.program.health is not None:
             expected = f"none here, but at {key}.health"
             faults.append(wrong(file, f"{key}.program.health", expected, component.program.health, said="one"))
         if component.health is not None:
-            faults += template_faults(file, f"{key}.health", [("socket", component.health.socket or "")])
+            faults += _template_faults(file, f"{key}.health", [("socket", component.health.socket or "")])
     raise_faults(faults)
+
+
+# -- what is wrong with the programs of a registry, as far as its file alone says it -----------------------------------
+
+_TEMPLATE = "text in which ${name} or $$ follows each dollar sign"
+
+
+def _program_faults(file: str, key: str, program: RunProgram) -> Iterator[ConfigError]:
+    """Yield what would be wrong at each load of a program that stands at `key` in a file."""
+    if not program.command:
+        yield wrong(file, f"{key}.command", "the name of a program", program.command)
+    if program.stop_signal not in signal.Signals.__members__:
+        said = f"{shown(program.stop_signal)}"
+        yield wrong(
+            file, f"{key}.stop_signal", "the name of a signal, such as 'SIGTERM'", program.stop_signal, said=said
+        )
+    for name, amount in program.cost.items():
+        if not is_number(amount) or amount < 0:
+            yield wrong(file, f"{key}.cost.{name}", "a number of at least 0", amount)
+    texts = [("command", program.command), ("directory", program.directory or "")]
+    texts += [(f"arguments[{i}]", text) for i, text in enumerate(program.arguments)]
+    texts += [(f"environment.{name}", text) for name, text in program.environment.items()]
+    yield from _template_faults(file, key, texts)
+
+
+def _parameter_faults(file: str, key: str, parameters: Parameters) -> Iterator[ConfigError]:
+    """Yield which parameters that stand at `key` in a file are no templates."""
+    yield from _template_faults(file, key, ((name, str(value)) for name, value in parameters.items()))
+
+
+def _template_faults(file: str, key: str, texts: Iterable[tuple[str, str]]) -> Iterator[ConfigError]:
+    """Yield which texts, by their keys below `key`, have a dollar sign that begins nothing."""
+    for name, text in texts:
+        if not string.Template(text).is_valid():
+            yield wrong(file, f"{key}.{name}", _TEMPLATE, text)

@@ -40,9 +40,9 @@ from rr_actors.registrar.servers.callback_context import Current, check_not_own,
 from rr_actors.runtime.callback_errors import described
 from rr_actors.runtime.shielding import Flag
 from rr_actors.runtime.time_limits import TimeLimits, deadline_of, left_until
-from rr_actors.runtime.workers import LettingIn
+from rr_actors.runtime.workers import LetsIn, LettingIn
 from rr_actors.wire.name_service import Presence
-from rr_actors.wire.thread_connections import ThreadConnections
+from rr_actors.wire.thread_connections import BlockingLink, ThreadConnections
 from rr_actors.wire.transport import Exchange
 from rr_actors.wire.unix_sockets import paused
 
@@ -51,8 +51,11 @@ T = TypeVar("T")
 CALL_TIMEOUT_S = 30.0
 """Seconds for which a thread waits until the loop has answered a short call."""
 
-_JOINS_AT_ONCE = 16
-"""The most loads of tasks that are answered without a turn of their event loop."""
+_ANSWERS_AT_ONCE = 16
+"""The most answers of this process to tasks that come without a turn of their event loop."""
+
+_FAR = 4
+"""For how many of these an answer of another process counts."""
 
 GRACE_S = 5.0
 """Seconds for which a thread waits, after a time limit, until the loop says how the call has ended."""
@@ -65,6 +68,8 @@ class Calls:
         self.actor = actor
         self.dispatcher = actor.node.dispatcher
         self.limits = TimeLimits(self.dispatcher.loop)
+        self._unshared = 0
+        self._turn: tuple[asyncio.AbstractEventLoop, asyncio.Task[Any] | None] | None = None
 
     def check_open(self) -> None:
         """Raise RegistrarDown if the registrar is closed."""
@@ -107,6 +112,40 @@ class Calls:
             client.is_uncalled = False
             return None
         return client.connections
+
+    def line_of_task(self, connections: ThreadConnections[Exchange]) -> BlockingLink | None:
+        """Return a connection for the running task alone; None if the loop has to ask instead.
+
+        If other tasks have asked in this turn of their event loop, the loop asks: it sends and reads many at once.
+        """
+        if self.dispatcher.is_loop_thread() or not self._is_alone():
+            return None
+        line = connections.take_idle(self._in_worker)
+        if line is None or isinstance(line, BlockingLink):
+            return line
+        connections.give_back(line)
+        return None
+
+    def _is_alone(self) -> bool:
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        if self._turn is None or self._turn[0] is not loop:
+            self._turn = loop, task
+            loop.call_soon(self._end_turn)
+        return self._turn[1] is task
+
+    def _end_turn(self) -> None:
+        self._turn = None
+
+    def _in_worker(self, work: Callable[[], None]) -> None:
+        with contextlib.suppress(RrError):  # no thread is free, or the workers have ended
+            self.dispatcher.workers.submit(work)
+
+    async def let_others_in(self, weight: int) -> None:
+        """Let the other tasks of the event loop have their turns, after answers that came without one."""
+        self._unshared += weight
+        if self._unshared >= _ANSWERS_AT_ONCE:
+            self._unshared = 0
+            await asyncio.sleep(0)
 
     def call(self, fn: Callable[..., T], *args: Any) -> T:
         """Run fn on the loop, behind the commands that threads have given it before, and return what it returns.
@@ -248,6 +287,19 @@ def exchanged(actor: RegistrarActor, client: ProviderLink, line: Exchange, messa
     return answer
 
 
+async def exchanged_awaited(
+    actor: RegistrarActor, client: ProviderLink, line: BlockingLink, message: Message, deadline: float
+) -> Any:
+    """Exchange as exchanged() does, in a task; if that is inside a serial manager, another callback may come in."""
+    recorded = actor.node.watched.level[0] > 1
+    if recorded:
+        actor.recorder.message("sent", actor.name, client.provider, message)
+    answer = await LetsIn(line.exchange_awaited(message, deadline))
+    if recorded:
+        actor.recorder.message("received", actor.name, client.provider, answer)
+    return answer
+
+
 def answered(actor: RegistrarActor, client: ProviderLink, message: Message) -> Any:
     """Return a provider's answer if it is in this process, and answers at once; None if it has not taken the message.
 
@@ -325,7 +377,6 @@ class Loads:
         self.calls = calls
         self.limits = calls.limits
         self.views = views
-        self._joins = 0
         self._starting = set[str]()  # the queries for whose loads on_start waits
 
     def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions, query_id: str = "") -> Loading:
@@ -401,7 +452,7 @@ class Loads:
             self._listen(query, options)
             if hearer is not None:
                 return await self._begin(query, request, options, HearsOnThisLoop(hearer))
-            if not await self._joined(query, request, options):
+            if not (await self._joined(query, request, options) or await self._awaited(query, request, options)):
                 await self._begin(query, request, options)
             return query
         except RrError:
@@ -432,9 +483,7 @@ class Loads:
             command: c.Command = c.SendAgain(id)
         elif actor.hold(answer):
             loaded_directly(query, answer.resource_id, answer.response, answer.state)
-            self._joins += 1
-            if self._joins % _JOINS_AT_ONCE == 0:
-                await asyncio.sleep(0)  # other tasks have their turns, too
+            await self.calls.let_others_in(1)
             return True
         else:
             command = c.Got(id, answer.resource_id, answer.response, answer.state, epoch)
@@ -563,23 +612,14 @@ class Loads:
             self.views.add(query)
             answer = exchanged(actor, client, line, load, deadline)
             connections.give_back(line)
-        except TimeoutError:
-            command = c.GiveUp(query.id, _too_late(actor, query, timeout_s), unheard=True)
-        except OSError:
-            command = c.SendAgain(query.id)
-        except NotSerializable as error:
-            command = c.GiveUp(query.id, failure_of(error), unheard=True)
+        except (OSError, NotSerializable) as error:
+            command = self._not_answered(query, error, timeout_s)
         except BaseException:  # such as KeyboardInterrupt, which may come anywhere
             connections.drop_mine()
             raise
         else:
-            if type(answer) is Loaded and client.checksums.get(query.server, 0) != answer.types:
-                command = c.SendAgain(query.id)  # the link brings the types, and then the answer once more
-            elif type(answer) is Loaded and actor.hold(answer):
-                loaded_directly(query, answer.resource_id, answer.response, answer.state)
+            if (command := self._after(query, client, answer, line.epoch)) is None:
                 return True
-            else:
-                command = self._not_held(query, answer, line.epoch)
         connections.drop_mine()
         if not over:
             try:
@@ -591,8 +631,68 @@ class Loads:
             raise over[0]
         return True
 
-    def _not_held(self, query: Query, answer: Loaded | LoadRefused, epoch: int) -> c.Command:
-        """Return the loop's command after an answer that refuses the load, or that this thread could not store.
+    async def _awaited(self, query: Query, request: bytes, options: LoadOptions) -> bool:
+        """Load on a connection of this task's own. Return False if the loop has to load instead.
+
+        Raises:
+            RrError: how the load ended.
+        """
+        actor = self.actor
+        client = actor.clients.get(query.registrar)
+        if client is None or (connections := self.calls.connections_to(client)) is None:
+            return False
+        if (line := self.calls.line_of_task(connections)) is None:
+            return False
+        over: list[RrError] = []  # as in _directly()
+
+        def ended(_held: Held | None, error: RrError | None) -> None:
+            if error is not None:
+                over.append(error)
+                connections.cut(line)
+
+        timeout_s = options.timeout_s
+        deadline = deadline_of(timeout_s)
+        try:
+            load = actor.begin_directly(query, request, ended, _rank(options), options.own)
+            if load is None:
+                connections.give_back(line)
+                return False
+            self.views.add(query)
+            answer = await exchanged_awaited(actor, client, line, load, deadline)
+            connections.give_back(line)
+        except (OSError, NotSerializable) as error:
+            command = self._not_answered(query, error, timeout_s)
+        except BaseException:  # cancelled, or KeyboardInterrupt
+            connections.drop(line)
+            raise
+        else:
+            if (command := self._after(query, client, answer, line.epoch)) is None:
+                await self.calls.let_others_in(_FAR)
+                return True
+        connections.drop(line)
+        if not over:
+            limit_s = None if isinstance(command, c.GiveUp) else left_until(deadline)
+            loading = Loading(self, query, limit_s, timeout_s)
+            self.calls.dispatcher.call(loading.begin, actor.go_on_loading, query.id, loading.ended, command)
+            try:
+                await loading
+            except RrError:
+                if not over:
+                    raise
+        if over:
+            raise over[0]
+        return True
+
+    def _not_answered(self, query: Query, error: Exception, timeout_s: float | None) -> c.Command:
+        """Return the loop's command after a question that has no answer on its connection."""
+        if isinstance(error, TimeoutError):
+            return c.GiveUp(query.id, _too_late(self.actor, query, timeout_s), unheard=True)
+        if isinstance(error, OSError):
+            return c.SendAgain(query.id)
+        return c.GiveUp(query.id, failure_of(error), unheard=True)
+
+    def _after(self, query: Query, client: ProviderLink, answer: Loaded | LoadRefused, epoch: int) -> c.Command | None:
+        """Store the answer to a load; return the loop's command if the query is not held then.
 
         Args:
             epoch: the provider's.
@@ -602,6 +702,11 @@ class Loads:
         """
         actor, id = self.actor, query.id
         if isinstance(answer, Loaded):
+            if client.checksums.get(query.server, 0) != answer.types:
+                return c.SendAgain(id)  # the link brings the types, and then the answer once more
+            if actor.hold(answer):
+                loaded_directly(query, answer.resource_id, answer.response, answer.state)
+                return None
             return c.Got(id, answer.resource_id, answer.response, answer.state, epoch)
         if not actor.forget_refused(id):
             # The loop may have sent the load again. It is withdrawn, on disk, before the caller hears the error.
@@ -708,6 +813,10 @@ class UnloadWays(Protocol):
         """Release a query, and return when that is done."""
         ...
 
+    async def awaited(self, query_id: str, timeout_s: float | None) -> None:
+        """Release a query, awaited on any event loop. Cancelled, the release goes on."""
+        ...
+
     def force_begin(self, target: str, timeout_s: float | None) -> Reply[None]:
         """Begin to unload a resource that the registrar serves, even if it is held."""
         ...
@@ -747,6 +856,16 @@ class Unloads:
             if not self._directly(query_id, timeout_s):
                 self._finish(self.begin(query_id, timeout_s))
 
+    async def awaited(self, query_id: str, timeout_s: float | None) -> None:
+        """Release a query, awaited on any event loop. Cancelled, the release goes on.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+        self.check_order(query_id)
+        if not await self._directly_awaited(query_id, timeout_s):
+            await self.begin(query_id, timeout_s)
+
     def check_order(self, query_id: str) -> None:
         """Raise UsageError if on_start waits for this unload, and the provider starts only after it."""
         held = None if ask_cycles.starting() is None else self._actor.catalog.held.get(query_id)
@@ -784,8 +903,23 @@ class Unloads:
         begin = functools.partial(self.calls.start, start)
         self._end_of(target, "the revocation", "another thread may make it", begin, timeout_s)
 
+    def reload(self, target: str, timeout_s: float | None) -> None:
+        """Unload a resource that is served here, load it again, and return when that is done.
+
+        Raises:
+            RrError: how the reload ended.
+        """
+        begin = functools.partial(self.calls.start, functools.partial(self._actor.reload, target))
+        self._end_of(target, "the reload", "another thread may make it", begin, timeout_s, "reloading")
+
     def _end_of(
-        self, target: str, called: str, instead: str, begin: Callable[[], Reply[None]], timeout_s: float | None
+        self,
+        target: str,
+        called: str,
+        instead: str,
+        begin: Callable[[], Reply[None]],
+        timeout_s: float | None,
+        doing: str = "unloading",
     ) -> None:
         resource, is_served = self.calls.call(self._find, target)
 
@@ -794,7 +928,7 @@ class Unloads:
 
         what = f"registrar {self._actor.name!r}: {called} of {shortened(target)}"
         check_not_own(what, is_of_it, instead)
-        what = f"unloading {shortened(target)}"
+        what = f"{doing} {shortened(target)}"
         if resource is not None and not is_served:
             what += f", which waits for its server {self._actor.catalog.origin_of(resource)!r} to be registered again,"
         self.calls.finish(begin(), timeout_s, what)
@@ -882,6 +1016,52 @@ class Unloads:
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             self.go_on(Unloading(self, query_id, left_until(deadline), timeout_s), refusal)
+        return True
+
+    async def _directly_awaited(self, query_id: str, timeout_s: float | None) -> bool:
+        """Release a query on a connection of this task's own, or by a call if the provider is in this process.
+
+        Return False if the loop has to do it instead.
+        """
+        actor, calls = self._actor, self.calls
+        held = actor.catalog.held.get(query_id)
+        client = None if held is None else actor.clients.get(held.registrar)
+        connections = None if client is None else calls.connections_to(client)
+        if client is None or connections is None:
+            return False
+        line = None
+        if client.epoch_here() is None and (line := calls.line_of_task(connections)) is None:
+            return False
+        if not actor.owe(query_id):
+            if line is not None:
+                connections.give_back(line)
+            return False
+        deadline = deadline_of(timeout_s)
+        unload = Unload(query_id, actor.name)
+        answer: Any = None
+        try:
+            if line is None:
+                answer = answered(actor, client, unload)
+            else:
+                answer = await exchanged_awaited(actor, client, line, unload, deadline)
+                connections.give_back(line)
+            if type(answer) is Unloaded and not actor.forget_released(query_id):
+                calls.dispatcher.call(actor.receive, answer, client.provider)
+        except OSError:  # also TimeoutError, and then no time is left
+            pass
+        except BaseException:  # cancelled, or KeyboardInterrupt: the loop goes on with the release
+            calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
+            raise
+        finally:
+            if line is not None:
+                connections.drop(line)  # it has been given back, unless it is lost or has an answer to come
+        if type(answer) is not Unloaded:
+            refusal = answer.failure if type(answer) is UnloadRefused else None
+            unloading = Unloading(self, query_id, left_until(deadline), timeout_s)
+            await self._begin(unloading, functools.partial(actor.go_on_unloading, refusal=refusal))
+            return True
+        self._views.forget(query_id)
+        await calls.let_others_in(1 if line is None else _FAR)
         return True
 
     def go_on(self, unloading: Unloading, refusal: Failure | None) -> None:

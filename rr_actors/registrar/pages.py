@@ -19,6 +19,8 @@ import msgspec
 
 from rr_actors.base.names import named
 from rr_actors.base.values.canonical import json_of, shown_plain, text_of_value
+from rr_actors.registrar.core.callback_runs import run_id
+from rr_actors.registrar.core.loading import is_reloaded
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model import failures
@@ -36,10 +38,13 @@ _RUN = 5000  # names that are sorted by one call of C, which lets no other threa
 _VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
 
 CONDITIONS = (
-    "FATAL", "ERROR", "unload_failed", "revoked", "WARNING", "loading", "resuming", "queued", "unloading", "pausing",
-    "paused", "UPDATE", "OK",
+    "FATAL", "ERROR", "unload_failed", "revoked", "WARNING", "loading", "reloading", "resuming", "queued", "unloading",
+    "pausing", "paused", "UPDATE", "OK",
 )  # fmt: skip
 """What a ResourceRow.condition may be, the worst first."""
+
+RELOADING = "reloading"
+"""The phase, for people, of a resource that is loaded again on demand."""
 
 _TAKEN = frozenset(("loaded", "pausing", "paused", "resuming"))  # phases of which a revocation says more
 
@@ -97,7 +102,8 @@ class ResourceRow(msgspec.Struct, frozen=True):
     Attributes:
         server: "registrar/server".
         request, response: as JSON, cut if it is long. What JSON does not have is shown as in Python.
-        phase: "queued", "loading", "loaded", "unloading", "unload_failed", "pausing", "paused" or "resuming".
+        phase: "queued", "loading", "loaded", "reloading", "unloading", "unload_failed", "pausing", "paused" or
+            "resuming".
         state, message: of the last status. While the resource is loading, `message` is its progress ("50% opening");
             if it could not be unloaded, the reason.
         holders: the first 20 queries on it; `holder_count`: how many there are.
@@ -186,11 +192,15 @@ class ServerRow(msgspec.Struct, frozen=True):
         server: "registrar/server"; for what a registrar holds itself, "registrar".
         states: how many resources are in each state (ResourceRow.condition).
         holds: how many queries they hold at each "registrar/server".
+        runs: how many of its callbacks run now, by their roles, "load" for instance.
+        waiting: how many messages wait in its mailbox, of callbacks that have no room yet.
     """
 
     server: str
     states: dict[str, int] = {}
     holds: dict[str, int] = {}
+    runs: dict[str, int] = {}
+    waiting: int = 0
 
 
 class LoadRow(msgspec.Struct, frozen=True):
@@ -317,13 +327,14 @@ def _stream_rows(actor: RegistrarActor, match: str) -> list[StreamRow]:
 
 
 def _server_rows(actor: RegistrarActor) -> list[ServerRow]:
-    resources, held, names, revoked = _read(
+    resources, held, names, revoked, runs = _read(
         actor,
         lambda catalog: (
             list(catalog.resources.values()),
             list(catalog.held.values()),
             list(catalog.servers),
             set(catalog.revocations),
+            set(catalog.callback_runs),
         ),
     )
     states: dict[str, Counter[str]] = {name: Counter() for name in names}
@@ -331,13 +342,23 @@ def _server_rows(actor: RegistrarActor) -> list[ServerRow]:
     homes: dict[str, str] = {}
     for row in resources:
         homes[row.id] = row.server
-        condition = _condition(row.phase.value, str(row.state), revoked=row.id in revoked)
+        phase = RELOADING if run_id("reload", row.id) in runs else row.phase.value
+        condition = _condition(phase, str(row.state), revoked=row.id in revoked)
         states.setdefault(row.server, Counter())[condition] += 1
     for query in held:
         if query.hold is not Hold.OWED:
             holds.setdefault(homes.get(query.parent, ""), Counter())[f"{query.registrar}/{query.server}"] += 1
-    rows = [ServerRow(f"{actor.name}/{name}", dict(states[name]), dict(holds.get(name, {}))) for name in states]
+    rows = [
+        ServerRow(f"{actor.name}/{name}", dict(states[name]), dict(holds.get(name, {})), *_doing(actor, name))
+        for name in states
+    ]
     return [*rows, ServerRow(actor.name, {}, dict(holds[""]))] if "" in holds else rows
+
+
+def _doing(actor: RegistrarActor, name: str) -> tuple[dict[str, int], int]:
+    """Return the callbacks of a server that run now, by their roles, and how many wait in its mailbox."""
+    server = actor.servers.get(name)
+    return ({}, 0) if server is None else (dict(Counter(list(server.inside.values()))), len(server.waiting))
 
 
 def load_rows(actor: RegistrarActor) -> list[LoadRow]:
@@ -433,7 +454,11 @@ _ORDERS: dict[str, Callable[[Catalog, Resource], float]] = {
 
 
 def _condition_in(catalog: Catalog, row: Resource) -> str:
-    return _condition(row.phase.value, str(row.state), revoked=row.id in catalog.revocations)
+    return _condition(_phase_in(catalog, row), str(row.state), revoked=row.id in catalog.revocations)
+
+
+def _phase_in(catalog: Catalog, row: Resource) -> str:
+    return RELOADING if is_reloaded(catalog, row.id) else row.phase.value
 
 
 def _of_each(
@@ -506,7 +531,7 @@ def _with_part(text: str, ids: Iterable[str]) -> list[str]:
 def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[ResourceRow]:
     def around(
         catalog: Catalog, resource: Resource
-    ) -> tuple[list[HolderRow], int, list[str], int, int | None, bool, list[str]]:
+    ) -> tuple[str, tuple[list[HolderRow], int, list[str], int, int | None, bool, list[str]]]:
         queries, parts = catalog.holders.get(resource.id, ()), catalog.parts_of(resource.id)
         first = [catalog.queries[id] for id in itertools.islice(queries, HOLDERS_SHOWN)]
         unheard = [len(catalog.notices_on.get(query.id, ())) for query in first]
@@ -517,18 +542,19 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         priority = priority_of(catalog.priority_of(resource.id))
         shown = list(reversed(parts))[:HOLDERS_SHOWN]
         below = [catalog.held[id].resource_id for id in shown if id in catalog.held]
-        return holders, len(queries), shown, len(parts), priority, resource.id in catalog.revocations, below
+        revoked = resource.id in catalog.revocations
+        return _phase_in(catalog, resource), (holders, len(queries), shown, len(parts), priority, revoked, below)
 
     neighbours = _read(actor, lambda catalog: [around(catalog, resource) for resource in resources])
     rows: list[ResourceRow] = []
-    for row, others in zip(resources, neighbours, strict=True):
+    for row, (phase, others) in zip(resources, neighbours, strict=True):
         state = str(row.state) if row.phase is Phase.LOADED else ""
         message = row.message
         if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
             message = shown_progress(*progress)
         elif row.server not in actor.catalog.servers:
             message = failures.waits_for_server(actor.catalog, row)
-        texts = text_of_value(row.request), text_of_value(row.response), row.phase.value, state, message
+        texts = text_of_value(row.request), text_of_value(row.response), phase, state, message
         rows.append(ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *others))
     return rows
 

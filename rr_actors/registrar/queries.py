@@ -56,6 +56,9 @@ class Holder(Protocol):
     def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Release the query, and return when that is done; with ``block=False``, a future of the end at once."""
 
+    async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
+        """Release the query, awaited."""
+
     def fetch_state(self, query_or_id: Query, /) -> str:
         """Return the state of the query's last status, as the registrar has it."""
         ...
@@ -212,11 +215,14 @@ class Query(Generic[Response]):
 
     @property
     def request(self) -> Any:
-        """The request, decoded as the server's request type."""
+        """The request, decoded as the server's request type.
+
+        It is plain data if the query was loaded before an upgrade, and does not fit the type of today.
+        """
         request = self._request
         if type(request) is _Bytes:
             codec = self._types(self.server_id)[0]
-            request = codec.decode(request.raw, self.server_id)
+            request = codec.show_stored(request.raw)
             if codec is not PLAIN:  # else the types are not known yet, and the next read tries again
                 self._request = request
         return request
@@ -252,7 +258,7 @@ class Query(Generic[Response]):
     async def unload_async(self, *, timeout_s: float | None = 30.0) -> None:
         """Release the query as unload() does, awaited. If it is cancelled, the unload goes on."""
         check_asyncio("unload_async")
-        await self._at_holder().unload(self, timeout_s=timeout_s, block=False)
+        await self._at_holder().unload_async(self, timeout_s=timeout_s)
         self._is_released = True
 
     def fetch_state(self) -> str:

@@ -462,22 +462,30 @@ class Consumer(abc.ABC):
                 comes from outside, by a handle, and the query is a part that a resource of this registrar holds.
             Unavailable: the provider did not come back in time. The release is owed, on disk, until it does.
         """
-        self._check_open()
-        limit_s = time_limit(timeout_s)
-        query_id = target_id(query_or_id)
+        query_id, limit_s = self._checked_unload(query_or_id, force, timeout_s)
         unloads = self._unload_ways
         if force:
             return (unloads.force_wait if block else unloads.force_begin)(query_id, limit_s)
-        if is_a(query_or_id, Query) and query_or_id.origin != self.name:
-            raise error_of(failures.not_holder(query_id, query_or_id.origin, self.name))
         return unloads.wait(query_id, limit_s) if block else unloads.begin(query_id, limit_s)
+
+    def _checked_unload(
+        self, query_or_id: Query | ResourceInfo | str, force: bool, timeout_s: float | None
+    ) -> tuple[str, float | None]:
+        self._check_open()
+        limit_s = time_limit(timeout_s)
+        query_id = target_id(query_or_id)
+        if not force and is_a(query_or_id, Query) and query_or_id.origin != self.name:
+            raise error_of(failures.not_holder(query_id, query_or_id.origin, self.name))
+        return query_id, limit_s
 
     async def unload_async(
         self, query_or_id: Query | ResourceInfo | str, *, force: bool = False, timeout_s: float | None = 30.0
     ) -> None:
         """Release a query as unload() does, awaited. If it is cancelled, the unload goes on."""
         check_asyncio("unload_async")
-        await self.unload(query_or_id, force=force, timeout_s=timeout_s, block=False)
+        query_id, limit_s = self._checked_unload(query_or_id, force, timeout_s)
+        unloads = self._unload_ways
+        await (unloads.force_begin if force else unloads.awaited)(query_id, limit_s)
 
     @overload
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
@@ -807,6 +815,28 @@ class Registrar(Consumer):
         self._unloads.revoke(target, message_text(why), seconds, limit_s)
 
     @for_handles(repeatable=False)
+    def reload(self, query_or_resource_id: Query | ResourceInfo | str, *, timeout_s: float | None = None) -> None:
+        """Unload a resource served here and load it again for the same request; return when that is done.
+
+        The unload callback runs, the parts of the resource are released, and the load callback runs, which may load
+        them again. The holders keep their queries, and hear UPDATE with the new response. Loads and unloads of the
+        resource wait meanwhile. After a crash the reload goes on where it was.
+
+        Args:
+            query_or_resource_id: the resource or its id, or a query on it or the query's id.
+            timeout_s: seconds to wait. The reload goes on after them.
+
+        Raises:
+            UnknownQuery: this registrar serves no such resource.
+            UsageError: the resource is not loaded, or is FATAL, revoked or being reloaded already; or a callback of the
+                resource made the call, and would wait for itself.
+            UnloadFailed: the unload callback raised. The resource is not loaded again, and its holders hear ERROR.
+            LoadFailed: the load callback raised. The holders hear FATAL.
+        """
+        self._check_open()
+        self._unloads.reload(target_id(query_or_resource_id), time_limit(timeout_s))
+
+    @for_handles(repeatable=False)
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
     ) -> None:
@@ -1090,7 +1120,7 @@ class Registrar(Consumer):
 
     def _info(self, resource: Resource, server: ServerActor | None, queries: list[QueryRow]) -> ResourceInfo:
         """Describe a resource. The calling thread decodes its values, which may run code of users' types."""
-        request = (server.request if server else PLAIN).show(resource.request)
+        request = (server.request if server else PLAIN).show_stored(resource.request)
         response = None
         if resource.response is not None:
             response = (server.response if server else PLAIN).show(resource.response)

@@ -263,6 +263,10 @@ class RemoteUnloads:
         """Release a query, and return when that is done."""
         self._calls.ask(self._release, query_id, timeout_s=timeout_s)
 
+    async def awaited(self, query_id: str, timeout_s: float | None) -> None:
+        """Release a query, awaited on any event loop. If it is cancelled, the release goes on."""
+        await self.begin(query_id, timeout_s)
+
     def force_begin(self, target: str, timeout_s: float | None) -> Reply[None]:
         """Begin to unload a resource that the registrar serves, even if it is held."""
         return self._begun("unload", target, force=True, timeout_s=timeout_s)

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Generator, Hashable
 from contextvars import Context, ContextVar
 from types import FunctionType
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
@@ -29,6 +29,8 @@ from rr_actors.runtime.thread_pool import GETS_A_THREAD, REFUSED, WAITS, Task, T
 from rr_actors.runtime.user_loop import COROUTINE, Done, UserLoop, closing, name_of
 
 logger = Log("rr_actors")
+
+T = TypeVar("T")
 
 
 def is_async(fn: Callable[..., Any]) -> bool:
@@ -381,20 +383,30 @@ class LettingIn:
             visit.is_out = False
 
 
-def letting_in(wait: Generator[Any, Any, None]) -> Generator[Any, Any, None]:
+def letting_in(wait: Generator[Any, Any, T]) -> Generator[Any, Any, T]:
     """Await what a task waits for; if it is inside a gate, another callback may come in meanwhile."""
     visit = None if _visit.get() is None else _gone_out(asyncio.current_task())
     if visit is None:
-        yield from wait
-        return
+        return (yield from wait)
     try:
-        yield from wait
+        result = yield from wait
     except GeneratorExit:  # the task is dropped
         raise
     except BaseException:
         yield from _back(visit).__await__()
         raise
     yield from _back(visit).__await__()
+    return result
+
+
+class LetsIn(Generic[T]):
+    """A coroutine, awaited as letting_in() does."""
+
+    def __init__(self, coroutine: Coroutine[Any, Any, T]) -> None:
+        self._coroutine = coroutine
+
+    def __await__(self) -> Generator[Any, Any, T]:
+        return letting_in(self._coroutine.__await__())
 
 
 def _gone_out(caller: object) -> _Visit | None:

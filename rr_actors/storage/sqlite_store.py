@@ -357,17 +357,19 @@ class SqliteStore:
 
 # -- its files ---------------------------------------------------------------------------------------------------
 
+_ENDINGS = ("", "-wal", "-shm", ".spare-wal")
 _NUMBER = re.compile(r"[1-9]\d{0,17}$")
 
 
 def files_of(path: Path) -> list[Path]:
     """Return the catalog's file, and the files that there are beside it while it is open."""
-    return [path, *(path.with_name(path.name + ending) for ending in ("-wal", "-shm", ".spare-wal"))]
+    return [path.with_name(path.name + ending) for ending in _ENDINGS]
 
 
 def files_among(names: Sequence[str], path: Path) -> list[str]:
     """Return the names that belong to files_of() this catalog, or to its journal."""
-    return [file.name for file in files_of(path) if file.name in names] + segments_among(names, path)
+    files = (path.name + ending for ending in _ENDINGS)
+    return [name for name in files if name in names] + segments_among(names, path)
 
 
 def has_file(folder: Folder, path: Path) -> bool:

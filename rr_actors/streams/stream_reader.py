@@ -124,6 +124,10 @@ class StreamReader:
             self.close()
             raise
 
+    def _reads(self) -> Stream | None:
+        """Return the stream that is read now; None: the resource has none yet."""
+        return self._stream
+
     # -- the iteration -------------------------------------------------------------------------------------------------
 
     def __iter__(self) -> Self:
@@ -373,3 +377,6 @@ class StreamReader:
             self._is_once = self._is_once or link.opened_once  # else one that a dying publisher did not take in
             self._apart_at = time.monotonic()
             link.close()
+
+
+stream_of = StreamReader._reads  # pyright: ignore[reportPrivateUsage]  # same file

@@ -211,6 +211,8 @@ def _phase(resource: ResourceRow) -> str:
             return "is paused, and FATAL: it does not run again."
         case "paused":
             return "is paused, as nobody needs it now. A load resumes it."
+        case "reloading":
+            return "is being unloaded and loaded again: its callbacks have not returned."
         case "resuming":
             return "is being resumed: its parts are, or its resume callback has not returned."
         case _:

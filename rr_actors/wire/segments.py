@@ -17,6 +17,7 @@ import asyncio
 import contextlib
 import errno
 import fcntl
+import functools
 import mmap
 import os
 import resource
@@ -122,9 +123,7 @@ class Segments:
     """
 
     def __init__(self, limit_bytes: int | None = None, frame_limit_bytes: int = FRAME_LIMIT_BYTES) -> None:
-        if limit_bytes is None:
-            limit_bytes = memory_bytes() // 4
-        self.limit_bytes = limit_bytes
+        self._given_bytes = limit_bytes
         self.frame_limit_bytes = frame_limit_bytes
         self.large_bytes = min(LARGE_BYTES, frame_limit_bytes // 2)
         self._lock = threading.RLock()
@@ -133,6 +132,11 @@ class Segments:
         self._owned: weakref.WeakSet[_Owned] = weakref.WeakSet()
         self._waiting = False
         self._used_at = 0.0
+
+    @functools.cached_property
+    def limit_bytes(self) -> int:
+        """The memory that they may take. To find what this process may have takes some 20 reads of files."""
+        return memory_bytes() // 4 if self._given_bytes is None else self._given_bytes
 
     def _is_used(self) -> bool:
         with self.bookkeeping():

@@ -3,10 +3,13 @@
 It saves two hand-overs between threads, as this process's event loop has no part in it. The other end is an ordinary
 link. Asks of actors use these connections, and loads and unloads of registrars. A thread has its connection alone until
 it gives it back. If no connection is available, the question goes over the loop's link.
+
+A task of asyncio has a connection in the same way, and awaits the answer on its own event loop.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import math
 import os
@@ -49,6 +52,7 @@ class ThreadConnections(Generic[E]):
         self._idle: list[E] = []
         self._in_use: dict[E, int] = {}  # and the thread that uses it
         self._dialling: set[int] = set()  # the threads that dial
+        self._is_adding = False
         self._dial_after = 0.0
         self.closed = False
 
@@ -77,6 +81,27 @@ class ThreadConnections(Generic[E]):
             self.drop(line)
             return None
         return line
+
+    def take_idle(self, work: Callable[[Callable[[], None]], object]) -> E | None:
+        """Return a connection as take() does, but open none here: an event loop must not wait for a handshake.
+
+        Args:
+            work: runs a function in another thread. If no connection is free, it is given one that opens another.
+        """
+        if self._idle:
+            return self.take(None)
+        if not self._is_adding:
+            self._is_adding = True
+            work(self._add)
+        return None
+
+    def _add(self) -> None:
+        try:
+            line = self._dialled(None)
+            if line is not None:
+                self.give_back(line)
+        finally:
+            self._is_adding = False
 
     def _dialled(self, timeout_s: float | None) -> E | None:
         me = threading.get_ident()
@@ -222,6 +247,41 @@ class BlockingLink:
         messages = self._reader.feed(self._receive_soon(deadline)) or self._rest(deadline)
         return messages[0]
 
+    async def exchange_awaited(self, message: Any, deadline: float) -> Any:
+        """Exchange as exchange() does, in a task of asyncio. If it is cancelled, drop the connection.
+
+        Like a thread it spins first, but not for longer than a turn of an event loop takes.
+        """
+        frame = framed(message, self._limit)
+        rest = memoryview(frame)[self._send(frame) :]
+        loop = asyncio.get_running_loop()
+        while rest:
+            await self._is_ready(loop.add_writer, loop.remove_writer, deadline)
+            rest = rest[self._send(rest) :]
+        data = self._spun(time.monotonic(), _TASK_SPIN_S) if self._spin.worthwhile else b""
+        if data and (messages := self._reader.feed(data)):
+            return messages[0]
+        parked = time.monotonic()
+        while True:
+            self._check_reader()
+            await self._is_ready(loop.add_reader, loop.remove_reader, deadline)
+            with contextlib.suppress(BlockingIOError):
+                if messages := self._reader.feed(self._read(_DONT_WAIT)):
+                    self._spin.parked(time.monotonic() - parked)
+                    return messages[0]
+
+    async def _is_ready(self, add: Callable[..., object], remove: Callable[[int], object], deadline: float) -> None:
+        loop, fd = asyncio.get_running_loop(), self._socket.fileno()
+        ready: asyncio.Future[None] = loop.create_future()
+        timer = None if deadline == math.inf else loop.call_later(deadline - time.monotonic(), _set_late, ready)
+        add(fd, _set_ready, ready)
+        try:
+            await ready
+        finally:
+            remove(fd)
+            if timer is not None:
+                timer.cancel()
+
     def _send(self, data: bytes | memoryview) -> int:
         """Write as much as the kernel takes at once; return the number of bytes."""
         try:
@@ -241,21 +301,27 @@ class BlockingLink:
     def _rest(self, deadline: float) -> list[Any]:
         """Read until a message is complete, and return all messages that are then complete."""
         while True:
-            if self._reader.error is not None or self._reader.ended:
-                raise ConnectionResetError(f"the link has ended: {self._reader.error or 'closed'}")
+            self._check_reader()
             if messages := self._reader.feed(self._receive(deadline)):
                 return messages
+
+    def _check_reader(self) -> None:
+        if self._reader.error is not None or self._reader.ended:
+            raise ConnectionResetError(f"the link has ended: {self._reader.error or 'closed'}")
 
     def _receive_soon(self, deadline: float) -> bytes:
         """Wait for data as _receive() does, but spin first: a quick answer comes before a thread could wake up."""
         began = time.monotonic()
         if deadline - began < SPIN_LIMIT_S:
             return self._receive(deadline)
-        spin = self._spin
-        if not spin.worthwhile:
+        if not self._spin.worthwhile:
             data = self._receive(deadline)
-            spin.parked(time.monotonic() - began)
+            self._spin.parked(time.monotonic() - began)
             return data
+        return self._spun(began, SPIN_LIMIT_S) or self._receive(deadline)
+
+    def _spun(self, began: float, limit_s: float) -> bytes:
+        """Return the data that arrives while this thread spins; empty: none has."""
         while True:
             os.sched_yield()  # for the thread that answers, if it waits for this core
             try:
@@ -263,10 +329,10 @@ class BlockingLink:
             except BlockingIOError:
                 data = b""
             took_s = time.monotonic() - began
-            if data or took_s >= SPIN_LIMIT_S:
+            if data or took_s >= limit_s:
                 break
-        spin.spun(took_s, bool(data))
-        return data or self._receive(deadline)
+        self._spin.spun(took_s, bool(data))
+        return data
 
     def _receive(self, deadline: float) -> bytes:
         # not recv() alone: it also wakes up when the other side has read the question, which costs both sides time
@@ -310,6 +376,16 @@ class BlockingLink:
         self.parcels.close()
 
 
+def _set_ready(ready: asyncio.Future[None]) -> None:
+    if not ready.done():
+        ready.set_result(None)
+
+
+def _set_late(ready: asyncio.Future[None]) -> None:
+    if not ready.done():
+        ready.set_exception(TimeoutError())
+
+
 def _milliseconds_until(deadline: float) -> float | None:
     return None if deadline == math.inf else max(0.0, deadline - time.monotonic()) * 1e3
 
@@ -321,6 +397,8 @@ def _milliseconds_until(deadline: float) -> float | None:
 # adaptive mutexes do.
 
 SPIN_LIMIT_S = 200e-6
+
+_TASK_SPIN_S = 100e-6  # other tasks of the event loop wait meanwhile
 
 _QUICK_S = 2 * SPIN_LIMIT_S  # a parked thread sees the answer only when it has been woken
 _EARNED_SPINNING_S = 50e-6  # two wake-ups are saved

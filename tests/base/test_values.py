@@ -242,7 +242,7 @@ OTHERS = [collections.OrderedDict(a=1), collections.Counter("aab"), memoryview(b
 @pytest.mark.parametrize("value", [*NEEDS_ANNOTATION, *OTHERS], ids=lambda value: type(value).__name__)
 def test_what_only_an_annotation_brings_back_is_refused_without_one_and_the_error_says_so(value: Any) -> None:
     name = type(value).__name__
-    says = rf"got a {name}, which only a declared type brings back: annotate .*request_type.* rr\.codec"
+    says = rf"got an? {name}, which only a declared type brings back: annotate .*request_type.* rr\.codec"
     for given_, path in ((value, ""), ({"parts": [1, value]}, r"\.parts\[1\]"), ((value,), r"\[0\]")):
         with pytest.raises(rr.InvalidRequest, match=rf"^s/t: request{path}: expected any plain value, {says}"):
             Codec().decode(encode(given_), "s/t")

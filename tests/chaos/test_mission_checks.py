@@ -190,4 +190,4 @@ def test_the_graphs_and_the_files_of_the_mission_are_right(tmp_path: Path) -> No
         f"{name}_0" for name in ("Start", "Look", "Fetch", "Survey", "Turn", "Finish")
     ]
     write_files(tmp_path)
-    assert [*GraphLibrary(STEPS, graphs_folder(tmp_path)).find("Survey").nodes] == ["Aim_0", "Shoot_0"]
+    assert [*GraphLibrary(STEPS, graphs_folder(tmp_path)).look().find("Survey").nodes] == ["Aim_0", "Shoot_0"]

@@ -6,15 +6,17 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import rr_actors as rr
-from rr_actors.managers import Budgets, Measure, Pool, PoolInfo, Share
+from rr_actors.base.errors import ConfigError
+from rr_actors.managers import Budgets, Measure, Pool, PoolInfo, Share, Sink
 from rr_actors.managers.budgets.gauge import Gauge
-from rr_actors.managers.budgets.measures import next_capacity
-from rr_actors.managers.budgets.probes import NoProbe, probe_of
+from rr_actors.managers.budgets.measures import next_capacity, surplus
+from rr_actors.managers.planning.probes import NoProbe, probe_of
 from support import Calls, eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -165,3 +167,108 @@ def test_a_pool_follows_its_probe_keeps_the_last_value_and_knows_it_after_a_cras
     assert info().capacity == 50
     file.write_text("70")
     assert eventually(lambda: info() == PoolInfo("watts", 70, 30, 0))
+
+
+# -- too much ----------------------------------------------------------------------------------------------------------
+
+GRID = Measure(no_probe, shed_at=49.0, restore_at=49.8, step=20, settled_at=50.2, surplus_at=50.5)
+FULL = Measure(no_probe, surplus_at=5.0, settled_at=20.0)  # small readings say that there is too much
+
+
+@pytest.mark.parametrize(
+    ("measure", "readings", "said"),
+    [
+        (GRID, (48, 50, 50.2, 50.3, 50.5, 51), (-1, -1, -1, 0, 1, 1)),
+        (FULL, (30, 20, 10, 5, 0), (-1, -1, 0, 1, 1)),
+        (HERTZ, (48, 51, 60), (0, 0, 0)),
+    ],
+)
+def test_a_reading_says_whether_there_is_too_much(
+    measure: Measure, readings: tuple[float, ...], said: tuple[int, ...]
+) -> None:
+    assert tuple(surplus(measure, reading) for reading in readings) == said
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"surplus_at": 50.5}, "settled_at"),
+        ({"surplus_at": 50.5, "settled_at": 50.5}, "settled_at"),
+        ({"surplus_at": "high", "settled_at": 50.0}, "surplus_at"),
+        ({"shed_at": 49, "restore_at": 50, "settled_at": 49.5, "surplus_at": 51, "step": 1}, "surplus_at"),
+        ({"shed_at": 49, "restore_at": 50, "settled_at": 48, "surplus_at": 47, "step": 1}, "surplus_at"),
+    ],
+)
+def test_readings_that_cannot_be_are_refused_by_name(options: dict[str, object], key: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Budgets([Pool("watts", 100, measure=Measure(battery, **options))])  # type: ignore[arg-type]
+    assert caught.value.key == f"pool[0].measure.{key}"
+
+
+@pytest.mark.parametrize(
+    ("pool", "key"),
+    [
+        (Pool("watts", 100, sink=(Sink("house/boiler"),)), "pool[0].sink"),
+        (Pool("watts", 100, sink=(Sink("boiler"),), measure=GRID), "pool[0].sink[0].server"),
+        (Pool("watts", 100, sink=(Sink("house/boiler", least_on_s=-1),), measure=GRID), "pool[0].sink[0].least_on_s"),
+        (Pool("watts", 100, sink=("house/boiler",), measure=GRID), "pool[0].sink[0]"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_sink_that_cannot_be_is_refused_by_name(pool: Pool, key: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Budgets([pool])
+    assert caught.value.key == key
+
+
+def test_while_there_is_too_much_sinks_are_loaded_one_after_another(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "battery"
+    file.write_text("50")
+    measure = msgspec.structs.replace(GRID, probe=battery, every_s=0.02)
+    sinks = tuple(Sink("house/sink", name, least_on_s=0.0) for name in ("boiler", "car"))
+    budgets = rr.ChildSpec(Budgets, id="budgets", args=([Pool("hertz", 100, sink=sinks, measure=measure)],))
+    system = start(rr.Supervisor([budgets], max_restarts=9))
+    house, proxy = system.open_registrar("house"), system.ref("budgets").proxy()
+    steps = Calls()
+
+    def take(name: str) -> str:
+        house.load("budgets/share", Share("hertz", 30))
+        steps(f"on {name}")
+        return name
+
+    house.register_server("sink", take, lambda name, _: steps(f"off {name}"))
+
+    def problem() -> str:
+        return proxy.pools().get()[0].problem
+
+    file.write_text("50.6")
+    steps.wait(2)
+    eventually(lambda: problem() == "there is too much: its probe reads 50.6, and no sink is left")
+    assert [info.priority for info in house.resources()] == [-1000, -1000]
+    assert proxy.pools().get()[0].used == 60
+    file.write_text("50.3")  # between: nothing changes
+    eventually(lambda: problem() == "")
+    wait_respawned(system, "budgets", kill(system, "budgets"))
+    assert eventually(lambda: proxy.pools().get()[0].used == 60)
+    assert [len(info.queries) for info in house.resources()] == [1, 1]
+    file.write_text("50.1")
+    steps.wait(4)
+    assert steps.items == ["on boiler", "on car", "off car", "off boiler"]
+
+
+def test_a_sink_that_is_lost_is_loaded_again_while_there_is_too_much(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "battery").write_text("51")
+    measure = Measure(battery, every_s=0.02, surplus_at=50.5, settled_at=50.1)
+    pool = Pool("hertz", 100, sink=(Sink("house/sink", "boiler"),), measure=measure)
+    system = start(rr.ChildSpec(Budgets, id="budgets", args=([pool],)))
+    house, loads = system.open_registrar("house"), Calls()
+    house.register_server("sink", lambda name: loads(name) or name)
+    loads.wait(1)
+    eventually(lambda: house.resources()[0].state == "OK")
+    house.send_status(house.resources()[0], rr.Status("FATAL", "burnt out"))
+    loads.wait(2)

@@ -95,7 +95,7 @@ PSI = "a function, its name 'package.module:function', or one of psi:cpu, psi:me
         (
             'probe = "os:getpid"\nstepp = 1',
             "stepp",
-            "one of probe, every_s, timeout_s, shed_at, restore_at, step",
+            "one of probe, every_s, timeout_s, shed_at, restore_at, step, surplus_at, settled_at",
             "stepp",
         ),
     ],

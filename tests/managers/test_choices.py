@@ -19,6 +19,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.managers import Alternative, Budgets, Choices, Choose, Chosen, Pool, Share
 from support import Calls, Gate, Served, eventually, hang, kill, pid_of, serve, wait_respawned
+from support_cli import run_cli
 
 Start = Callable[..., rr.System]
 
@@ -825,3 +826,151 @@ def test_a_manager_that_ends_for_good_is_replaced_and_does_not_come_back(start: 
     choice = world.choose()
     kill(world.system, "cars")
     world.settled(choice, "camera")
+
+
+# -- chosen by hand ----------------------------------------------------------------------------------------------------
+
+
+class ByHand(World):
+    """A world with a manager that an operator drives."""
+
+    def fix(self, choice: Any, alternative: str, **options: Any) -> Any:
+        return self.system.ref("choices").proxy().choose(choice.resource_id, alternative, **options).get()
+
+    def free(self, choice: Any) -> Any:
+        return self.system.ref("choices").proxy().choose_freely(choice.resource_id).get()
+
+    def info(self) -> Any:
+        (info,) = self.system.ref("choices").proxy().choices().get()
+        return info
+
+
+def test_what_is_chosen_by_hand_takes_the_place_and_stays_until_it_is_taken_back(start: Start) -> None:
+    world = ByHand(start, settle_s=0.1)
+    choice = world.choose()
+    world.fix(choice, "sensors/sonar", by="eve")
+    world.settled(choice, "sonar")
+    assert world.updates()[-1].state is rr.State.UPDATE
+    info = world.info()
+    assert (info.kind, info.present, info.by_hand, info.by, info.why) == (
+        *("range", 'sensors/sonar "front"', 'sensors/sonar "front"', "eve"),
+        "",
+    )
+    assert info.allowed[0] == info.present
+    assert abs(info.at - time.time()) < LONG_S
+
+    assert world.free(choice).by_hand == ""
+    world.settled(choice, "camera")  # by itself, as it is better
+
+
+def test_while_what_is_chosen_by_hand_fails_another_one_serves_and_it_comes_back(start: Start) -> None:
+    world = ByHand(start, settle_s=0.1)
+    choice = world.choose()
+    world.fix(choice, "sensors/lidar")
+    world.settled(choice, "lidar")
+    world.broken = {"lidar"}
+    world.say("lidar", "FATAL", "the cable is out")
+    eventually(lambda: choice.response.server == "sensors/camera", LIMIT_S)
+    assert world.info().why == "it is not in use yet, or has failed"
+    world.broken = set()
+    world.settled(choice, "lidar")
+    assert world.info().why == ""
+
+
+def test_what_cannot_be_loaded_is_taken_when_it_can(start: Start) -> None:
+    world = ByHand(start, settle_s=0.1)
+    choice = world.choose()
+    world.broken = {"sonar"}
+    world.fix(choice, "sensors/sonar")
+    world.failures.wait()
+    assert choice.response.server == "sensors/camera"
+    world.broken = set()
+    world.settled(choice, "sonar")
+
+
+def test_what_is_exclusive_is_taken_if_it_is_chosen_by_hand(start: Start) -> None:
+    world = ByHand(start, [sensor("camera"), sensor("sonar", break_first=True)], 0.1)
+    choice = world.choose()
+    world.fix(choice, "sensors/sonar")
+    world.settled(choice, "sonar")
+    assert world.steps.items == ["load camera", "unload camera", "load sonar"]
+    world.broken = {"sonar"}
+    world.say("sonar", "FATAL")
+    world.settled(choice, "camera")
+
+
+def test_an_exclusive_one_that_cannot_be_loaded_leaves_the_next_in_its_place(start: Start) -> None:
+    world = ByHand(start, [sensor("camera"), sensor("sonar", break_first=True)], 0.1)
+    choice = world.choose()
+    world.broken = {"sonar"}
+    world.fix(choice, "sensors/sonar")
+    world.failures.wait()
+    world.settled(choice, "camera")
+
+
+def test_what_is_chosen_by_hand_is_known_after_a_kill_and_forgotten_with_the_choice(start: Start) -> None:
+    world = ByHand(start, settle_s=0.1)
+    choice = world.choose()
+    world.fix(choice, "sensors/sonar")
+    world.settled(choice, "sonar")
+    world.respawn()
+    assert world.info().by_hand == 'sensors/sonar "front"'
+    kept = world.system.registrar("choices").directory / "choices.json"
+    assert list(json.loads(kept.read_text())["by_hand"]) == [choice.resource_id]
+    choice.unload()
+    eventually(lambda: json.loads(kept.read_text())["by_hand"] == {})
+    assert world.choose().response.server == "sensors/camera"
+
+
+@pytest.mark.parametrize(
+    ("choice", "alternative", "error", "said"),
+    [
+        ("nothing", "sensors/sonar", rr.NotFound, "no choice 'nothing': there are "),
+        ("range", "sensors/radar", rr.NotFound, "no alternative 'sensors/radar': the choice allows sensors/camera "),
+        ("range", "sensors/sonar", rr.NotFound, "the choice allows sensors/camera "),
+        ("range", 5, rr.UsageError, "expected an alternative, as 'registrar/server' or with its request, got 5"),
+        (None, "sensors/sonar", rr.UsageError, "expected the id or the kind of a choice, got None"),
+    ],
+)
+def test_what_cannot_be_chosen_is_refused_by_name(
+    start: Start, choice: Any, alternative: Any, error: type[Exception], said: str
+) -> None:
+    world = ByHand(start)
+    world.choose(Choose("range", {"rate_hz": ">=10"}, ["rate_hz"]))
+    with pytest.raises(error, match=said):
+        world.system.ref("choices").proxy().choose(choice, alternative).get()
+    with pytest.raises(rr.UsageError, match="nothing is chosen for it by hand"):
+        world.system.ref("choices").proxy().choose_freely("range").get()
+    assert world.info().by_hand == ""
+
+
+def test_a_choice_that_is_one_of_several_is_named_by_its_id(start: Start) -> None:
+    world = ByHand(start)
+    one = world.choose()
+    world.choose(Choose("range"))
+    with pytest.raises(rr.UsageError, match="'range' means several choices"):
+        world.system.ref("choices").proxy().choose("range", "sensors/sonar").get()
+    assert world.fix(one, 'sensors/sonar "front"', dry_run=True).by_hand == ""
+    part = one.resource_id[-8:]
+    assert world.system.ref("choices").proxy().choose(part, "sensors/sonar").get().id == one.resource_id
+
+
+@pytest.mark.usefixtures("runtime_dir")
+def test_the_command_line_chooses_and_says_what_is_chosen(start: Start) -> None:
+    def said(*arguments: object, code: int = 0) -> str:
+        ran = run_cli(*arguments)
+        assert ran.returncode == code, ran.stdout + ran.stderr
+        return ran.stdout or ran.stderr
+
+    world = ByHand(start)
+    choice = world.choose()
+    assert said("choose", "range", "sensors/sonar", "--dry-run").startswith("would choose sensors/sonar for choice ")
+    assert world.info().by_hand == ""
+    assert said("choose", "range", "sensors/sonar", "--by", "eve").startswith('chose sensors/sonar "front" for choice ')
+    world.settled(choice, "sonar")
+    (row,) = said("choices").splitlines()[1:]
+    assert row.split(maxsplit=1)[1].split("  ") == ["range", 'sensors/sonar "front"', 'sensors/sonar "front"', "eve"]
+    assert said("choose", "range", "--freely").startswith("took back what was chosen by hand for choice ")
+    assert json.loads(said("choices", "--json"))[0]["by_hand"] == ""
+    assert "expected an alternative or --freely, and not both" in said("choose", "range", code=2)
+    assert "no alternative 'sensors/radar': the choice allows " in said("choose", "range", "sensors/radar", code=2)

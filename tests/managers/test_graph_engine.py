@@ -11,6 +11,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_engine import GraphEngine
+from rr_actors.managers.actions.graph_library import Shelf
 from rr_actors.managers.actions.graph_runs import Begin, Ended, first_run
 from support import Calls, eventually
 
@@ -36,7 +37,7 @@ class FakeManager:
         self.then: Callable[[], object] = lambda: None
         self._errors = errors or {}
         self.registrar: Any = SimpleNamespace(update_response=self._write, send_status=lambda id, status: None)
-        self.engine = GraphEngine(self, "g", GRAPH, first_run(GRAPH))
+        self.engine = GraphEngine(self, "g", GRAPH, first_run(GRAPH), Shelf({}, {}))
 
     def _write(self, id: str, response: dict[str, Any], text: str) -> None:
         if self.refusals:

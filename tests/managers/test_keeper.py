@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import resource
 import threading
 import time
@@ -44,11 +45,14 @@ class Place:
         self.alive, self.opened, self.most = dict[str, int](), dict[str, int](), 0
         self.open_s, self.unload_fails = 0.0, False
         self.well = True
+        self.load: float | str = 0.0
 
     def serve(self) -> rr.Registrar:
         self.things = self.system.open_registrar("things")
         health = rr.Health(every_s=0.05, timeout_s=10.0, fail_after=2)
-        self.things.register_server("thing", self._load, self._unload, health=health, probe=self._probe)
+        self.things.register_server(
+            "thing", self._load, self._unload, health=health, probe=self._probe, usage=self._usage
+        )
         return self.things
 
     def _load(self, request: Any) -> str:
@@ -70,6 +74,12 @@ class Place:
     def _probe(self, request: Any, response: str) -> None:
         if not self.well:
             raise OSError("no answer")
+
+    def _usage(self, request: Any, response: str) -> dict[str, float]:
+        """Share what there is to do among the things; a text is an error."""
+        if isinstance(self.load, str):
+            raise OSError(self.load)
+        return {"load": self.load / sum(self.alive.values())}
 
     def write(self, name: str, text: str) -> str:
         (self.folder / name).write_text(text)
@@ -357,6 +367,87 @@ def test_a_replica_that_cannot_be_unloaded_has_no_second_one(make: Make) -> None
     place.unload_fails = False
     assert place.wait_kept(Kept("a", 1, 1))
     assert (place.opened, place.alive, len(place.things.resources())) == ({"r0": 2}, {"r0": 1}, 1)
+
+
+def scaled(most: int = 4, **on: object) -> str:
+    table = {"usage": "load", "target": 1.0, "every_s": 0.05, "down_s": 0.5, **on}
+    text = "".join(f"{key} = {json.dumps(value)}\n" for key, value in table.items())
+    return f"{keep('a', min=1, max=most)}[keep.scale_on]\n{text}"
+
+
+def test_replicas_come_and_go_with_what_they_have_to_do_also_after_a_crash(make: Make) -> None:
+    place = make(scaled())
+    place.serve()
+    assert place.wait_kept(Kept("a", 1, 1, min=1, max=4))
+    place.load = 2.5
+    assert eventually(lambda: (kept := place.kept("a")).wanted == kept.ready == 3)
+    assert place.kept("a").scaled == "1 -> 3: load is 2.5, the target 1"
+    place.load = 1.0
+    place.keeper.apply(place.write("slow.toml", scaled(down_s=600.0))).get()  # before half a second is over
+    before = place.kept("a")
+    place.respawn()
+    assert place.wait_kept(before)  # its number is on disk, with the reason
+    assert {info.request for info in place.things.resources()} >= {"r0", "r1"}
+    place.keeper.apply(place.write("quick.toml", scaled())).get()
+    assert eventually(lambda: place.kept("a").wanted == 1)
+    assert eventually(lambda: place.there() == ["r0"])
+    place.load = 900.0
+    assert eventually(lambda: place.there() == ["r0", "r1", "r2", "r3"])
+    place.keeper.apply(place.write("less.toml", scaled(most=2))).get()
+    assert eventually(lambda: place.there() == ["r0", "r1"])
+    assert place.kept("a").scaled == "4 -> 2: max is 2"
+    assert place.most == 1
+
+
+def test_what_cannot_be_read_changes_nothing_and_is_a_warning(make: Make, runtime_dir: object) -> None:
+    place = make(scaled())
+    place.serve()
+    place.load = 2.0
+    assert eventually(lambda: (kept := place.kept("a")).wanted == kept.ready == 2)
+    query = place.app.load("keeper/kept", "a", response_type=Kept)
+    place.load = "no meter"
+    assert query.wait_status("WARNING", timeout_s=60).message.startswith("2 of 2 ready: no reading: load: ")
+    assert query.response.why == "no reading"
+    assert "OSError: no meter" in run_cli("keep", "diff").stdout
+    (row,) = run_cli("keep", "get").stdout.splitlines()[1:]
+    assert re.match(r"a +2 of 2 +1-4 +1 -> 2: load is 2, the target 1 +no reading +load: ", row)
+    assert place.there() == ["r0", "r1"]
+    place.load = 2.0
+    assert query.wait_status("OK", timeout_s=60).message == "2 of 2 ready"
+    place.keeper.apply(place.write("other.toml", scaled(usage="loads"))).get()
+    assert query.wait_status("WARNING", timeout_s=60).message.endswith(
+        "loads: not among what they use: load; did you mean 'load'?"
+    )
+    assert place.there() == ["r0", "r1"]
+
+
+def test_a_thing_that_is_kept_already_goes_on_with_as_many_when_it_begins_to_scale(make: Make) -> None:
+    place = make(keep("a", replicas=3))
+    place.serve()
+    assert place.wait_kept(Kept("a", 3, 3))
+    place.keeper.apply(place.write("scaled.toml", scaled(down_s=600.0))).get()
+    assert place.wait_kept(Kept("a", 3, 3, min=1, max=4))
+
+
+def test_a_probe_says_what_there_is_to_do(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = tmp_path / "queue"
+    queue.write_text("0")
+    monkeypatch.setenv("RR_TEST_QUEUE", str(queue))
+    on = {"usage": "", "probe": "support_managers:queue_length", "target": 5, "timeout_s": 0.2}
+    place = make(scaled(**on).replace("min = 1", "min = 0"))
+    place.serve()
+    assert place.wait_kept(Kept("a", 0, 0, min=0, max=4))
+    queue.write_text("13")
+    assert eventually(lambda: place.there() == ["r0", "r1", "r2"])
+    assert place.kept("a").scaled == "0 -> 3: support_managers:queue_length is 13, the target 5 each"
+    for text, said in (
+        ("nan", "returned nan, not a finite number"),
+        ("many", "raised ValueError: could not convert string to float: 'many'"),
+        ("hang", "has not been read within 0.2 s"),
+    ):
+        queue.write_text(text)
+        assert eventually(lambda said=said: any(said in line for line in place.keeper.diff().get()), what=said)
+        assert place.there() == ["r0", "r1", "r2"]
 
 
 def test_a_full_disk_ends_no_keeper_and_what_is_wanted_comes_when_there_is_room(make: Make) -> None:

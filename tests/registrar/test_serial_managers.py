@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 import threading
 import time
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Actions, Budgets, Choices, Components, Keeper, Pipes, Programs, Robots
+from rr_actors.runtime.workers import Gate
 from support import eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -377,3 +379,173 @@ def test_at_once_is_a_whole_number_of_at_least_one(start: Start, wrong: Any) -> 
         rr.server("printer", at_once=wrong)
     with pytest.raises(rr.InvalidSpec, match="at_once: expected a whole number of at least 1, or None"):
         start().open_registrar("app").register_server("printer", lambda page: page, at_once=wrong)
+
+
+# -- rings, and many of everything -------------------------------------------------------------------------------------
+
+
+class Ring(rr.Manager, serial=True):
+    """Loads of the next manager in a ring what that loads of its next one: another thing at each step."""
+
+    def __init__(self, following: str) -> None:
+        self.following, self.inside, self.most = following, 0, 0
+
+    @rr.server("thing")
+    def load(self, steps: int) -> list[str]:
+        self._pass()
+        rest = self.registrar.load(f"{self.following}/thing", steps - 1, timeout_s=LIMIT_S).response if steps else []
+        self._pass()
+        return [self.registrar.name, *rest]
+
+    def _pass(self) -> None:
+        self.inside += 1
+        self.most = max(self.most, self.inside)
+        time.sleep(0)
+        self.inside -= 1
+
+    def on_receive(self, message: str) -> int:
+        self._pass()
+        return self.most
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_three_serial_managers_that_load_from_each_other_in_a_ring_go_on(start: Start, placement: Placement) -> None:
+    ring = {"a": "b", "b": "c", "c": "a"}
+    specs = [rr.ChildSpec(Ring, id=id, args=(following,), placement=placement) for id, following in ring.items()]
+    system = start(*specs)
+    app = system.open_registrar("app")
+    loads = [app.load(f"{id}/thing", 7, timeout_s=LIMIT_S, block=False) for id in ring]
+    assert ["".join(load.get(timeout=2 * LIMIT_S).response) for load in loads] == ["abcabcab", "bcabcabc", "cabcabca"]
+    app.unload_all(timeout_s=LIMIT_S)
+    assert [system.ref(id).ask("how many?", timeout=LIMIT_S) for id in ring] == [1, 1, 1]
+
+
+class Simulated:
+    """Serial managers in a ring, with the real gates and threads that are made up: chance says which goes on.
+
+    A load at a manager enters its gate. If it has steps left, it goes out, loads from the next manager, and comes back.
+
+    Args:
+        lets_in: whether a callback that waits lets another in.
+    """
+
+    def __init__(self, seed: int, *, lets_in: bool = True) -> None:
+        self.chance, self.lets_in = random.Random(seed), lets_in
+        self.gates = [Gate(1) for _ in range(self.chance.randint(2, 4))]
+        self.inside = [0] * len(self.gates)
+        self.ready: list[Callable[[], None]] = []
+        self.left = 0
+        for _ in range(self.chance.randint(2, 6)):
+            self._load(self.chance.randrange(len(self.gates)), self.chance.randint(0, 5), lambda: None)
+
+    def run(self) -> bool:
+        """Go on until nothing can; return whether all loads have ended."""
+        while self.ready:
+            self.ready.pop(self.chance.randrange(len(self.ready)))()
+        return not self.left
+
+    def _load(self, manager: int, steps: int, then: Callable[[], None]) -> None:
+        self.left += 1
+        gate = self.gates[manager]
+
+        def ended() -> None:
+            self._go(manager, -1)
+            self.left -= 1
+            self.ready.append(then)
+            gate.leave()
+
+        def come_back() -> None:
+            self._enter(gate.come_back, manager, ended) if self.lets_in else ended()
+
+        def began() -> None:
+            if not steps:
+                ended()
+                return
+            if self.lets_in:
+                self._go(manager, -1)
+            self.ready.append(lambda: self._load((manager + 1) % len(self.gates), steps - 1, come_back))
+            if self.lets_in:
+                gate.leave()
+
+        if self.chance.random() < 0.1:  # withdrawn while it waited: it does not begin
+            self.ready.append(lambda: gate.enter(lambda: False))
+        self.ready.append(lambda: self._enter(gate.enter, manager, began))
+
+    def _enter(self, enter: Callable[[Callable[[], bool]], None], manager: int, then: Callable[[], None]) -> None:
+        def begin() -> bool:
+            self._go(manager, 1)
+            self.ready.append(then)
+            return True
+
+        enter(begin)
+
+    def _go(self, manager: int, step: int) -> None:
+        self.inside[manager] += step
+        assert 0 <= self.inside[manager] <= 1
+
+
+def test_rings_of_serial_managers_end_in_whatever_order_their_threads_go_on() -> None:
+    assert all(Simulated(seed).run() for seed in range(1000))
+    assert not all(Simulated(seed, lets_in=False).run() for seed in range(50))  # else the simulation would find nothing
+
+
+class Counter(rr.Manager, serial=True):
+    """Counts all that comes in, in a way that only one at a time can use."""
+
+    def __init__(self) -> None:
+        self.inside = self.most = 0
+        self.counts: dict[str, int] = {}
+
+    def _count(self, what: str) -> None:
+        self.inside += 1
+        self.most = max(self.most, self.inside)
+        before = self.counts.get(what, 0)
+        if before % 16 == 0:
+            time.sleep(0)  # another thread may go on here
+        self.counts[what] = before + 1
+        self.inside -= 1
+
+    @rr.server("thing")
+    def load(self, number: int) -> int:
+        self._count("load")
+        return number
+
+    @load.unload
+    def unload(self, number: int, response: int) -> None:
+        self._count("unload")
+
+    @rr.server("awaited")
+    async def load_awaited(self, number: int) -> int:
+        self._count("awaited")
+        return number
+
+    def on_receive(self, message: Any) -> Any:
+        match message:
+            case "how many?":
+                return self.counts, self.most
+            case ("timers", int(count)):
+                for number in range(count):
+                    rr.send_after(0.0005 * (number % 100), self.actor_ref, "timer")
+            case _:
+                self._count(message)
+        return None
+
+
+@pytest.mark.parametrize("count", [100, pytest.param(20_000, marks=(pytest.mark.slow, pytest.mark.timeout(600)))])
+def test_of_many_loads_unloads_messages_and_timers_one_is_inside_at_a_time(start: Start, count: int) -> None:
+    system = start(rr.ChildSpec(Counter, id="counter", placement="thread"))
+    app, counter = system.open_registrar("app"), system.ref("counter")
+    limit_s = 20 * LIMIT_S
+    counter.tell(("timers", count))
+    done = 0
+    while done < count:
+        some = range(done, min(done + 250, count))
+        for _ in some:
+            counter.tell("message")
+        with app.load_all(
+            [(f"counter/{it}", number) for number in some for it in ("thing", "awaited")], timeout_s=limit_s
+        ):
+            done += len(some)
+    expected = dict.fromkeys(("load", "unload", "awaited", "message", "timer"), count)
+    assert eventually(lambda: counter.ask("how many?", timeout=limit_s)[0] == expected, limit_s)
+    assert counter.ask("how many?", timeout=limit_s) == (expected, 1)

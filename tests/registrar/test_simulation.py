@@ -21,6 +21,7 @@ from simulation.process_faults import (
     OWE_FIRST,
     PARTS_FIRST,
     RANK_FIRST,
+    RELOAD_FIRST,
     REVOKE_FIRST,
     SAY_FIRST,
     SWAP_FIRST,
@@ -95,7 +96,18 @@ def assert_kept(outcome: Outcome) -> None:
 
 
 FIRSTS = (
-    *(IDLE_FIRST, REVOKE_FIRST, RANK_FIRST, LIVES_FIRST, PARTS_FIRST, SWAP_FIRST, SAY_FIRST, HASTY_FIRST, TELL_FIRST),
+    *(
+        RELOAD_FIRST,
+        IDLE_FIRST,
+        REVOKE_FIRST,
+        RANK_FIRST,
+        LIVES_FIRST,
+        PARTS_FIRST,
+        SWAP_FIRST,
+        SAY_FIRST,
+        HASTY_FIRST,
+        TELL_FIRST,
+    ),
     *(AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST),
 )
 

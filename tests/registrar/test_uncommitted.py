@@ -86,6 +86,7 @@ TOLD: list[tuple[Any, Any]] = [
     (c.Swap("r", "part", "spare", (), "event", b"", "", "ticket"), e.AnswerCall("ticket", FULL)),
     (c.SetPriority("mine", 5, "ticket"), e.AnswerCall("ticket", FULL)),
     (c.ForceUnload("r", "event", "ticket"), e.AnswerCall("ticket", FULL)),
+    (c.Reload("r", "ticket"), e.AnswerCall("ticket", FULL)),
     (c.Revoke("r", "event", "why", 5000, "ticket"), e.AnswerCall("ticket", FULL)),
     (c.Unregister("cam", "event", "ticket"), e.AnswerCall("ticket", FULL)),
 ]

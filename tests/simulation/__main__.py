@@ -7,7 +7,7 @@ import random
 import sys
 import time
 
-from simulation.process_faults import IDLE_FIRST
+from simulation.process_faults import RELOAD_FIRST
 from simulation.runner import Outcome, report, run
 
 _EVERY_S = 2.0
@@ -17,11 +17,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run as many worlds as asked; 1 if a promise was broken."""
     parser = argparse.ArgumentParser(prog="python -m simulation", description="Simulated worlds of registrars.")
     parser.add_argument("runs", nargs="?", type=int, help="how many worlds (default: as many as fit in --seconds)")
-    parser.add_argument("--seed", type=int, help="of the first world (default: fresh, from 2**52 on)")
+    parser.add_argument("--seed", type=int, help="of the first world (default: fresh, from 2**53 on)")
     parser.add_argument("--steps", type=int, default=400, help="steps of chance in each world (default: 400)")
     parser.add_argument("--seconds", type=float, default=60.0, help="without a number of runs: for how long")
     options = parser.parse_args(arguments)
-    fresh = random.SystemRandom().randrange(IDLE_FIRST, 2 * IDLE_FIRST)
+    fresh = random.SystemRandom().randrange(RELOAD_FIRST, 2 * RELOAD_FIRST)
     first: int = fresh if options.seed is None else options.seed
     broken = _run(first, options.runs, options.steps, options.seconds)
     if broken is None:

@@ -51,7 +51,7 @@ class SmallWorld(NamedTuple):
         layout: the servers of each registrar.
         parts: what the load callback of a server loads: registrar and server.
         people: who asks.
-        statuses: what the owner of the first resource of a registrar says: registrar and state; or "revoke".
+        statuses: what the owner of the first resource of a registrar says: registrar and state; or "revoke", "reload".
         crashes: how many processes die.
         cuts: how many links break.
         raises: how many callbacks raise.
@@ -201,6 +201,10 @@ def _arrives(world: World, consumer: str, provider: str, way: int) -> str:
 # -- what can happen -------------------------------------------------------------------------------------------------
 
 
+_CALLS = ("revoke", "reload")
+"""What an owner does to a resource, beside saying a state."""
+
+
 def _moves(world: World, small: SmallWorld, spent: _Spent) -> Iterator[tuple[Step, _Spent]]:
     if small.budget is not None:
         for step, book in small.budget.moves(world, spent.book):
@@ -216,7 +220,7 @@ def _moves(world: World, small: SmallWorld, spent: _Spent) -> Iterator[tuple[Ste
         name, state = small.statuses[spent.statuses]
         for resource in [*world.registrars[name].catalog.resources][:1]:
             if world.registrars[name].state == "up":
-                step = ("own", name, state, resource) if state == "revoke" else ("own", name, "status", resource, state)
+                step = ("own", name, state, resource) if state in _CALLS else ("own", name, "status", resource, state)
                 yield step, spent._replace(statuses=spent.statuses + 1)
     if spent.crashes < small.crashes:
         for name, registrar in world.registrars.items():

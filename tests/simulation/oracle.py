@@ -22,7 +22,7 @@ class Violation(Exception):
 class Life(NamedTuple):
     """Where the outside sees a resource: its callbacks' log, folded."""
 
-    stage: str  # loading, loaded, unloading, unload_failed
+    stage: str  # loading, loaded, unloading, unload_failed; renewing, renewed: unloaded, to be loaded again
     number: int  # of the last run: attempt or tries
     interrupted: bool  # a crash may have come since that run began or ended
 
@@ -122,6 +122,10 @@ class Ledger:
         self.deaths.pop(key, None)
         self.open[key] = max(0, self.open.get(key, 0) - 1)
 
+    def reload_began(self, registrar: str, id: str) -> None:
+        """An owner has a resource reloaded: what was given up before is tried again."""
+        self.deaths.pop((registrar, "renew", id), None)
+
     def given_up_unload(self, registrar: str, id: str, *, died: bool) -> None:
         """That a resource is kept as unload_failed is on disk: its unload callback has ended so, or runs no more.
 
@@ -147,13 +151,13 @@ class Ledger:
     def settled(self, registrar: str, id: str, *, cleared: bool = False) -> None:
         """That a resource is gone is on disk: its callbacks must not run again. `cleared`: without its callback."""
         key = (registrar, id)
-        for kind in ("load", "unload", "recover", "reload", "status", "pause", "resume"):
+        for kind in ("load", "unload", "recover", "reload", "renew", "status", "pause", "resume"):
             self.deaths.pop((registrar, kind, id), None)
             self.open.pop((registrar, kind, id), None)
         life = self.lives.pop(key, None)
         if life is None:
             return
-        if life.stage != "gone" and not (cleared and life.stage == "unload_failed"):
+        if life.stage not in ("gone", "renewed") and not (cleared and life.stage == "unload_failed"):
             raise Violation("callbacks", f"{registrar}: {id} left the catalog while it was {life}")
         self.by_request[self.request_of.pop(key)].discard(id)
 
@@ -326,14 +330,20 @@ class Ledger:
                 self.wishes[query_id] = kept
 
 
-_BEGINS = {"load": "loading", "reload": "loaded", "unload": "unloading"}
+_BEGINS = {"load": "loading", "reload": "loaded", "unload": "unloading", "renew": "renewing"}
 _INTERRUPTED = {"load": ("loading", "loaded", "gone"), "reload": ("loaded",), "unload": ("unloading", "gone")}
 
 
 def _may_follow(life: Life, kind: str, number: int) -> bool:
     """Load, then unload, in turn; a repetition only where a crash came between, and told by a greater number."""
-    if kind == "unload" and life.stage == "loaded":
+    if kind in ("unload", "renew") and life.stage == "loaded":
         return True
+    if kind == "renew":
+        return life.interrupted and life.stage in ("renewing", "renewed")
+    if kind == "reload" and (life.stage == "renewed" or (life.interrupted and life.stage == "renewing")):
+        return number > life.number
+    if kind == "unload" and life.interrupted and life.stage in ("renewing", "renewed"):
+        return True  # nobody holds it any more
     if kind == "unload" and life.stage == "unload_failed":
         return number > life.number
     return life.interrupted and life.stage in _INTERRUPTED[kind] and number > life.number

@@ -37,7 +37,9 @@ RANK_FIRST = 2**50
 REVOKE_FIRST = 2**51
 """From here on, owners revoke resources."""
 IDLE_FIRST = 2**52
-"""From here on, servers pause what idles; fresh seeds are from here."""
+"""From here on, servers pause what idles."""
+RELOAD_FIRST = 2**53
+"""From here on, owners reload resources; fresh seeds are from here."""
 PRIORITIES = (STANDBY, -3, 0, 0, 4, 9)
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 
@@ -136,6 +138,11 @@ class Rough:
             self.hastens = revoking.random() ** 3  # the end of the grace
             if revoking.random() < 0.5:
                 self.subs = max(self.subs, 0.7)
+        self._reloading: random.Random | None = None
+        if seed >= RELOAD_FIRST:
+            reloading = random.Random(f"reload {seed}")
+            self._reloading = reloading if reloading.random() < 0.8 else None
+            self.reload = reloading.random() ** 2 * 0.1
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -164,6 +171,8 @@ class Rough:
         if self._ranking is not None and (step := self._rank(world, self._ranking)) is not None:
             return step
         if self._revoking is not None and (step := self._revoke(world, self._revoking)) is not None:
+            return step
+        if self._reloading is not None and (step := self._reload(world, self._reloading)) is not None:
             return step
         if self.brief and (step := self._let_go(world)) is not None:
             return step
@@ -336,6 +345,21 @@ class Rough:
         name, id = rng.choice(servings)
         return ("own", name, "revoke", id)
 
+    def _reload(self, world: World, rng: random.Random) -> Step | None:
+        """An owner reloads a resource."""
+        if rng.random() >= self.reload:
+            return None
+        servings = [(r.name, id) for r in world.live() for id in r.catalog.resources]
+        if not servings:
+            return None
+        name, id = rng.choice(servings)
+        return ("own", name, "reload", id)
+
+    @property
+    def reloads(self) -> bool:
+        """Whether owners reload resources in this world."""
+        return self._reloading is not None
+
     def _rank(self, world: World, rng: random.Random) -> Step | None:
         """Somebody gives a query another priority: one of people outside, or now and then a part."""
         if rng.random() >= self.rank:
@@ -361,7 +385,7 @@ class Rough:
             return None
         key = rng.choice(keys)
         servers = [server for servers in world.layout.values() for server in servers]
-        rings = self.part_rings and not any(server.recovery == "reload" for server in servers)
+        rings = self.part_rings and not self.reloads and not any(server.recovery == "reload" for server in servers)
         names = self.names if rings else self.names[: self.names.index(str(key[1]))]
         places = [(name, server.name) for name in names for server in world.layout[name]]
         if not places:

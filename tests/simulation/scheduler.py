@@ -68,7 +68,8 @@ class Chance:
         if self.rough is not None:
             self.rings = max(self.rings, self.rough.rings)
             self.subs = max(self.subs, self.rough.subs)
-        if any(server.recovery == "reload" for servers in self.layout.values() for server in servers):
+        reloads = self.rough is not None and self.rough.reloads
+        if reloads or any(server.recovery == "reload" for servers in self.layout.values() for server in servers):
             self.rings = 0.0  # a reload that loads what holds it makes a ring that waits for nothing: not found
         self.tired = draw() ** 2 * 0.5
         self.direct = 0.5 if draw() < 0.5 else 0.0  # of those who ask

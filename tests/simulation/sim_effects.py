@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rr_actors.registrar.core.loading import is_reloaded
 from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.core.status_delivery import is_listened
 from rr_actors.registrar.model import commands as c
@@ -63,6 +64,8 @@ def _start_callback(shell: SimShell, effect: e.StartCallback) -> None:
             if resource.server in shell.registered:
                 number = resource.attempt if effect.role == "load" else resource.tries
                 shell.start_run(effect.role, resource.id, number, resource)
+        case "reload":
+            shell.start_run("renew", resource.id, resource.attempt, resource)
         case role:
             shell.start_run("reload" if effect.reload else role, resource.id, resource.attempt, resource)
 
@@ -71,7 +74,8 @@ def _start_status(shell: SimShell, effect: e.StartCallback) -> None:
     resource, notice = effect.resource, effect.notice
     assert notice is not None
     now = shell.catalog.resources.get(resource.id)
-    if now is not None and is_busy(shell.catalog, now):
+    begun = now is not None and is_reloaded(shell.catalog, now.id) and now.id not in shell.reloading
+    if now is not None and is_busy(shell.catalog, now) and not begun:  # else it was caused before its reload
         raise Violation("statuses", f"{resource.id} hears {notice} before its load has returned")
     if is_own(notice):
         if now is not None and notice.id not in shell.disk["notices"]:
@@ -154,6 +158,9 @@ def _answer(shell: SimShell, effect: e.AnswerCall) -> None:
 
 
 def _happened(shell: SimShell, effect: e.Happened) -> None:
+    if effect.what == "reloading":
+        shell.world.ledger.reload_began(shell.name, effect.resource.id)
+        shell.reloading.add(effect.resource.id)
     shell.world.note(f"{shell.name}: {effect.what} {effect.resource.id} {effect.detail}")
 
 

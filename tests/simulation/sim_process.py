@@ -75,7 +75,10 @@ class Surroundings(Protocol):
 
 
 class Run:
-    """One callback that runs: load, reload, unload, recover or status of a resource, or hear of a query."""
+    """One callback that runs: load, reload, unload, recover or status of a resource, or hear of a query.
+
+    "renew" is an unload before a reload.
+    """
 
     __slots__ = ("id", "key", "kind", "listener", "notice", "number", "resource", "subs", "waits")
 
@@ -147,6 +150,7 @@ class SimShell:
         self.effects: deque[Effect] = deque()  # decided, and not done yet
         self.acting = False
         self.unwanted: set[str] = set()  # resources that nobody held when they were found loading
+        self.reloading: set[str] = set()  # resources of which it has been said that they are reloaded
         self.budget = -1  # effects acted upon until it dies; -1: all
 
     # -- what comes in -------------------------------------------------------------------------------------------
@@ -287,7 +291,7 @@ class SimShell:
         self.world.todo.add(run.key)
         if resource is not None:
             self.world.ledger.callback_began(self.name, kind, id)
-        if resource is not None and kind in ("load", "unload", "reload"):
+        if resource is not None and kind in ("load", "unload", "reload", "renew"):
             request = (self.name, resource.server, resource.request)
             if kind == "unload" and resource.response is None:
                 if id in self.catalog.holders:

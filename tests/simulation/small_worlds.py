@@ -73,6 +73,17 @@ WORLDS = {
     "crash and statuses": _LEAST._replace(
         layout={"a": (), "r": _HEARING}, statuses=(("r", "WARNING"), ("r", "FATAL")), crashes=1
     ),
+    "reload": _ONE._replace(statuses=(("r", "reload"),), raises=1),
+    "crash and reload": _LEAST._replace(statuses=(("r", "reload"),), crashes=1),
+    "two crashes and reload": _LEAST._replace(
+        statuses=(("r", "reload"),), crashes=2, people=(Person("a", "r", "part"),)
+    ),
+    "reload and unload": _LEAST._replace(
+        statuses=(("r", "reload"), ("r", "reload")), people=(Person("a", "r", "part", ("unload",)),), raises=1
+    ),
+    "reload of a paused": _LEAST._replace(
+        layout={"a": (), "r": _PAUSING}, people=(Person("a", "r", "part", _AT_TIMES),), statuses=(("r", "reload"),)
+    ),
     "crash and priorities": _LEAST._replace(people=(Person("a", "r", "part", (5, STANDBY, "unload")),), crashes=1),
     "direct lines": _TWO._replace(people=_DIRECT, linked=True),
     "direct lines and errors": _LEAST._replace(

@@ -289,6 +289,8 @@ class People(Trouble):
                 registrar.post(c.SetResponse(target, event, f"late:{event}".encode(), "", self.new_ticket()))
             case "swap":
                 return self._swap(registrar, target)
+            case "reload":
+                registrar.post(c.Reload(target, self.new_ticket()))
             case "revoke":
                 registrar.post(c.Revoke(target, self.new_event(), "revoked", 1000, self.new_ticket()))
             case _:

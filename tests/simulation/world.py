@@ -164,6 +164,11 @@ class World(Lives):
             case "unload":
                 ledger.run_ended(name, run.id, "gone" if ok else "unload_failed")
                 return c.CallbackEnded("unload", *place, None if ok else STUCK)
+            case "renew":
+                ledger.run_ended(name, run.id, "renewed" if ok else "loaded")
+                if not ok:
+                    registrar.reloading.discard(run.id)
+                return c.CallbackEnded("reload", *place, None if ok else STUCK, event=self.new_event())
             case "hear":
                 ledger.dealt_with(*place)
                 handled = bool(run.listener) and not ok
@@ -181,6 +186,8 @@ class World(Lives):
             case kind:
                 event = self.new_event()
                 changed = with_change or kind == "reload"
+                if kind == "reload":
+                    registrar.reloading.discard(run.id)
                 response = f"{run.id}:{run.number}:{event}".encode() if ok and changed else None
                 role = "resume" if kind == "resume" else "recover"
                 return c.CallbackEnded(role, *place, None if ok else RAISED, response, event)

@@ -58,8 +58,8 @@ def camera(provider: rr.Registrar) -> Served:
 class NotedConnections(SystemConnections):
     """`opened`: all that were opened."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         self.opened: list[ConsoleClient] = []
 
     def open(self, greeting_s: float = console_client.GREETING_S) -> ConsoleClient:
@@ -72,8 +72,8 @@ def connections(monkeypatch: pytest.MonkeyPatch) -> list[NotedConnections]:
     """The connections of each client that is made."""
     made: list[NotedConnections] = []
 
-    def noted(*args: Any) -> NotedConnections:
-        made.append(NotedConnections(*args))
+    def noted(*args: Any, **options: Any) -> NotedConnections:
+        made.append(NotedConnections(*args, **options))
         return made[-1]
 
     monkeypatch.setattr(connected_client, "SystemConnections", noted)

@@ -86,6 +86,7 @@ _REPORT = """
     if {wants_fatal}: eventually(lambda: query.state is rr.State.FATAL)
     (resource,) = system.registrar("cameras").resources()
     print("STATE", query.state, resource.message)
+    print("ASKED", query.request, resource.request)
     again = app.load("cameras/{server}", {request!r})
     print("AGAIN", again.resource_id == query.resource_id, again.response)
     again.unload()
@@ -109,6 +110,11 @@ def report(request: dict[str, Any], *, fatal: bool, server: str = "camera") -> s
             {"device": "front"},
             "request: expected fields device, got the unknown field 'dev'",
         ),
+        (
+            {"request": "device: str = 'none'", "made": "request.device"},
+            {"device": "front"},
+            "request: expected fields device, got the unknown field 'dev'",
+        ),
         ({"response": "topic: int", "made": "7"}, {"dev": "front"}, "response.topic: expected int, got str"),
     ],
 )
@@ -118,6 +124,8 @@ def test_what_does_not_fit_todays_types_is_lost_by_name_and_released_without_its
     run(_LOAD)
     said = run(report(request_, fatal=True), **changes)
     assert f"STATE FATAL lost: {why}" in said
+    stored = {"dev": "front"} if "request" in changes else "Open(dev='front')"
+    assert f"ASKED {stored} {stored}" in said, "what was asked for, and no other request"
     assert "stored by an earlier version; its unload callback does not run" in said
     assert "AGAIN False Feed(" in said
     assert "LEFT 0" in said
@@ -131,6 +139,7 @@ def test_what_fits_todays_types_is_kept_and_an_equal_request_finds_it(run: Calla
         report({"dev": "front"}, fatal=False), request="dev: str; fps: int = 30", response="topic: str; n: int=0"
     )
     assert "STATE OK" in said
+    assert "ASKED Open(dev='front', fps=30) Open(dev='front', fps=30)" in said
     assert "AGAIN True Feed(topic='front', n=0)" in said
     assert (tmp_path / "unloads").read_text() == "Open(dev='front', fps=30) Feed(topic='front', n=0)\n"
 

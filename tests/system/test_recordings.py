@@ -250,7 +250,7 @@ def test_a_message_is_one_arrow_whoever_recorded_it_and_one_that_did_not_arrive_
         "    participant p1 as cams",
         "    p0->>p1: 0.0 ms: Load cams/cam",
         "    p1-->>p0: 2.0 ms: Loaded",
-        "    p0-xp1: 4.0 ms: Unload (did not arrive)",
+        "    p0-xp1: 4.0 ms: Unload (no record of its arrival)",
     ]
 
 
@@ -260,14 +260,33 @@ def test_a_question_has_arrived_if_it_was_answered_before_it_was_asked_again() -
             entry(float(number), "received" if "ed" in name else "sent", "app", "cams", name, query="abcd1")
             for number, name in enumerate(names)
         ]
-        return [line.partition(": ")[2] for line in sequence_of(entries).splitlines() if "did not arrive" in line]
+        return [
+            line.partition(": ")[2] for line in sequence_of(entries).splitlines() if "no record of its arrival" in line
+        ]
 
     assert cross("Load", "Loaded") == []
-    assert cross("Load", "Load", "LoadRefused") == ["0.0 ms: Load (did not arrive)"]
+    assert cross("Load", "Load", "LoadRefused") == ["0.0 ms: Load (no record of its arrival)"]
     assert cross("Load", "Unloaded", "Unload") == [
-        "0.0 ms: Load (did not arrive)",
-        "2000.0 ms: Unload (did not arrive)",
+        "0.0 ms: Load (no record of its arrival)",
+        "2000.0 ms: Unload (no record of its arrival)",
     ]
+
+
+def test_a_request_has_arrived_if_a_callback_for_it_began_later() -> None:
+    def crosses(*entries: Entry) -> int:
+        return sequence_of(entries).count("no record of its arrival")
+
+    load = entry(1.0, "sent", "app", "cams", "Load", query="abcd1", server="cams/cam")
+    died = Entry(1.1, "exited", registrar="cams", seq=1100)
+    runs = entry(1.2, "began", "cams", "", "load", resource="abcd1", server="cams/cam", detail="attempt 2")
+
+    assert crosses(load, died, runs) == 0
+    assert "load cams/cam begins, attempt 2" in sequence_of([load, died, runs])
+    assert crosses(load, died) == 1
+    assert crosses(load, died, msgspec.structs.replace(load, at=1.15), runs) == 1, "the second one has arrived"
+    assert crosses(load, msgspec.structs.replace(runs, resource="abcd2")) == 1
+    assert crosses(load, msgspec.structs.replace(runs, registrar="maps")) == 1
+    assert crosses(load, msgspec.structs.replace(runs, name="unload")) == 1
 
 
 def test_a_diagram_of_many_messages_without_an_answer_takes_no_longer_for_each() -> None:

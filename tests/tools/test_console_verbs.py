@@ -183,6 +183,21 @@ def test_a_resource_is_revoked_from_outside(app: rr.Registrar) -> None:
     assert "no registrar serves a resource" in refused(2, "revoke", query.id, "again")
 
 
+def test_a_resource_is_reloaded_from_outside(app: rr.Registrar) -> None:
+    heard = Calls()
+    query = app.load("shop/thing", Order("lamp"), on_status=heard)
+    name = 'shop/thing {"name":"lamp","parts":[]}'
+    assert re.fullmatch(rf"would reload {re.escape(name)} \(\w+\), held by app\n", said("reload", name, "--dry-run"))
+    assert len(heard) == 0
+    assert "; `rr-actors reload" in refused(2, "restart", query.resource_id)
+    assert f"got a resource, {name}; `rr-actors reload {query.resource_id}`" in refused(2, "restart", name)
+    done = json.loads(said("reload", query.resource_id, "--json"))
+    assert (done["resource_id"], done["server"], done["holders"]) == (query.resource_id, "shop/thing", 1)
+    assert heard.wait()[0].message == "reloaded"
+    assert "no registrar serves a resource" in refused(2, "reload", "0000000000")
+    assert "no child 'nobody' (it has: shop)" in refused(2, "restart", "nobody")
+
+
 # -- finding it ------------------------------------------------------------------------------------------------------
 
 
@@ -238,6 +253,49 @@ def test_where_nothing_runs_the_error_says_what_to_do(tmp_path: Path) -> None:
 
 
 # -- looking ---------------------------------------------------------------------------------------------------------
+
+
+class Gated(rr.Manager):
+    """Opens doors one at a time, and each when the test says so."""
+
+    gate = Gate()
+
+    @rr.server("door", at_once=1)
+    def open_door(self, door: str) -> str:
+        self.gate(door)
+        return door
+
+    @rr.server("lamp")
+    def switch_on(self, lamp: str) -> str:
+        return lamp
+
+
+def test_ps_shows_the_parts_of_a_manager_and_what_they_do(start: Start) -> None:
+    Gated.gate = Gate()
+    system = start(
+        rr.ChildSpec(Gated, id="house", placement="thread"), rr.ChildSpec(Quiet, id="quiet", placement="thread")
+    )
+    app = system.open_registrar("app")
+    app.load("house/lamp", "hall")
+    loads = [app.load("house/door", number, block=False) for number in ("1", "2", "3")]
+    Gated.gate.wait_arrived()
+    assert "registrar" not in said("ps")
+    eventually(lambda: "2 wait" in said("ps", "--parts"))
+    rows = {row["path"]: row for row in json.loads(said("ps", "--parts", "--json"))}
+    place = "root/house/registrar"
+    assert list(rows) == ["root", "root/house", place, f"{place}/servers/door", f"{place}/servers/lamp", "root/quiet"]
+    assert [
+        (rows[f"{place}/servers/{name}"]["type"], rows[f"{place}/servers/{name}"]["note"]) for name in ("door", "lamp")
+    ] == [("server", "runs 1 load; 2 wait; 3 resources"), ("server", "1 resource")]
+    assert f"{place}/servers/door" in said("ps", "house", "--parts")
+    Gated.gate.open()
+    for load in loads:
+        load.get(timeout=LIMIT_S)
+    eventually(lambda: "runs" not in said("ps", "--parts"))
+
+
+class Quiet(rr.Actor):
+    """Has no registrar."""
 
 
 def test_ps_shows_each_child_with_its_process(shop: rr.System) -> None:

@@ -6,12 +6,13 @@ import asyncio
 import json
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
+from rr_actors.tools.web.lab.lab_declarations import Seen
 from rr_actors.tools.web.lab.lab_folder import read_lab
 from rr_actors.tools.web.lab.lab_runs import Place, Run
 from support import eventually
@@ -117,8 +118,10 @@ def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page
     with web("--lab", LAB) as url:
         tab.goes_to(url)
         tab.clicks("Sharing and dependencies")
+        assert "Look for:" not in tab.text("body")
+        tab.clicks("what to look for")
+        tab.sees("body", "Look for: how many cameras and lenses there are")
         tab.clicks("run it")
-        tab.sees("body", "Look for:", "two consumers share it")
         code = tab.do(tab.locate("textarea").input_value())
         assert "def main(state_dir: str)" in code
         tab.sees('button[data-path="root/lenses"]', "running", limit_s=LONG_S)
@@ -181,72 +184,144 @@ def test_a_run_that_fails_or_is_stopped_has_not_finished() -> None:
     assert "ZeroDivisionError" in failed.lines[-1]
 
 
-RIGHT = {
-    "four_strategies": {"b", "c"},
-    "your_own_tree": {"restart b"},
-    "restart_storm": {"branch", "root, too"},
-    "escalation_levels": {"wheel", "base"},
-    "back_off": {"about 4 s"},
-    "poisoned_actor": {"never see it"},
-    "frozen_child": {"another process takes its place"},
-    "sharing_and_parts": {"one"},
-    "kill_in_a_load": {"the map, a little later"},
-    "handled_status": {"the cameras' manager"},
-    "refused_ring": {"an error that names the ring"},
-    "crash_in_unload": {"its unload runs again"},
-    "brownout": {"radio", "lamp"},
-    "generator": {"the generator starts, and nobody is switched off"},
-    "tour_guide": {"it is paused"},
-    "rebinding": {"the lidar, and later the camera again"},
-    "keep": {"radio 0, radio 1 and radio 2"},
-    "umrf": {"the spare camera takes it"},
-    "full_mailbox": {"nothing: readings become dead letters"},
-    "philosophers": {"one is refused at once, the others eat"},
-    "lost_token": {"it is gone, and the ring stands still"},
-}
-PULLED = (
-    ("your_own_tree", {"strategy": "one_for_all", "max_restarts": 0}, {"give up"}),
-    ("frozen_child", {"heartbeat_s": 0.0}, {"it goes on after that"}),
-    ("handled_status", {"handled": "no"}, {"the cameras' manager", "the consumer"}),
-    ("brownout", {"priority": 2}, {"nobody: the pump waits"}),
-    ("generator", {"fuel": "no"}, {"the radio and the lamp are switched off"}),
-    ("tour_guide", {"idle": "unload"}, {"it has been ended"}),
-    ("tour_guide", {"linger_s": 30.0}, {"it runs on"}),
-    ("rebinding", {"settle_s": 30.0}, {"the lidar, to the end"}),
-    ("rebinding", {"at_least_hz": 50}, {"nothing: it ends with an error"}),
-    ("keep", {"fault": "silent", "then_wanted": 5}, {"radio 0, radio 1 and radio 2"}),
-    ("keep", {"delay_s": 20.0}, {"radio 1 and radio 2"}),
-    ("full_mailbox", {"way": "ask"}, {"each answer, as slow as the filter"}),
-    ("full_mailbox", {"where": "its own process"}, {"MailboxFull"}),
-    ("full_mailbox", {"limit": 1000}, {"nothing: all of them wait"}),
-    ("philosophers", {"where": "processes of their own"}, {"all wait, until a time limit ends one"}),
-    ("philosophers", {"first": "the fork with the lower number"}, {"all eat, one after another"}),
-    ("philosophers", {"way": "tell"}, {"all wait for ever"}),
-    ("lost_token", {"watch": "the program, with a monitor"}, {"the one that watches makes a new one"}),
-    ("umrf", {"killed": "actions"}, {"the spare camera takes it", "the spare camera begins again, as attempt 2"}),
+def happened(seen: Seen, event: str, path: str) -> int:
+    return sum((one.event, one.facts.get("path")) == (event, path) for one in seen.events)
+
+
+def watts_on(seen: Seen, step: str) -> int:
+    on = next(line for line in seen.lines[list(seen.lines).index(step) :] if line.startswith("on:"))
+    return sum(40 if device == "pump" else 20 for device in on.split()[1:])
+
+
+def waits(seen: Seen, modem: str) -> list[str]:
+    return [line.rpartition("(")[2] for line in seen.lines if line.startswith(f"root/{modem}, wait")]
+
+
+def restarts(count: int, path: str) -> Callable[[Seen], bool]:
+    return lambda seen: happened(seen, "restarted", path) == count
+
+
+def prints(*texts: str) -> Callable[[Seen], bool]:
+    return lambda seen: all(any(text in line for line in seen.lines) for text in texts)
+
+
+class Played(NamedTuple):
+    """A run with these values of its levers, and others as they begin.
+
+    Attributes:
+        right: the answers that it shows to be right.
+        shows: whether it has shown what the labels of the levers say. None where the answers themselves do.
+    """
+
+    name: str
+    levers: dict[str, Any]
+    right: set[str]
+    shows: Callable[[Seen], bool] | None = None
+
+
+PLAYED = (
+    Played("four_strategies", {}, {"b", "c"}),
+    Played("four_strategies", {"child": "a"}, {"a", "b", "c"}),
+    Played("four_strategies", {"child": "c"}, {"c"}, restarts(1, "root/one_for_one/c")),
+    Played("your_own_tree", {}, {"restart b"}, restarts(1, "root/team/b")),
+    Played("your_own_tree", {"strategy": "one_for_all", "child": "a"}, {"restart a", "restart b", "restart c"}),
+    Played("your_own_tree", {"strategy": "rest_for_one", "kills": 2}, {"restart b", "restart c"}),
+    Played("your_own_tree", {"max_restarts": 0}, {"give up"}),
+    Played("your_own_tree", {"max_restarts": 1, "kills": 2, "child": "c"}, {"restart c", "give up"}),
+    Played("your_own_tree", {"kills": 3}, {"restart b", "give up"}, restarts(2, "root/team/b")),
+    Played("your_own_tree", {"max_restarts": 3, "kills": 3}, {"restart b"}, restarts(3, "root/team/b")),
+    Played("your_own_tree", {"max_restarts": 3, "kills": 4}, {"restart b", "give up"}, restarts(3, "root/team/b")),
+    Played("restart_storm", {}, {"branch", "root, too"}, restarts(6, "root/branch/broken")),
+    Played("restart_storm", {"max_restarts": 1}, {"branch", "root, too"}, restarts(2, "root/branch/broken")),
+    Played("restart_storm", {"max_restarts": 2}, {"branch", "root, too"}, restarts(4, "root/branch/broken")),
+    Played("escalation_levels", {}, {"wheel", "base"}, prints("kill 4")),
+    Played("escalation_levels", {"kills": 1}, {"none: the motor alone"}, restarts(1, "root/base/wheel/motor")),
+    Played("escalation_levels", {"kills": 2}, {"wheel"}, restarts(1, "root/base/wheel/motor")),
+    Played("escalation_levels", {"kills": 3}, {"wheel"}, restarts(2, "root/base/wheel/motor")),
+    Played("back_off", {}, {"over 3 s"}, lambda seen: waits(seen, "left") == waits(seen, "right")),
+    Played("back_off", {"factor": 1.0}, {"under 1.5 s"}, prints("wait 2: under 1.5 s (1.00 s)")),
+    Played(
+        "back_off",
+        {"factor": 1.0, "jitter": 0.5},
+        {"under 1.5 s"},
+        lambda seen: waits(seen, "left") != waits(seen, "right"),
+    ),
+    Played("poisoned_actor", {}, {"never see it"}),
+    Played("frozen_child", {}, {"another process takes its place"}, prints("is no longer there")),
+    Played("frozen_child", {"heartbeat_s": 3.0}, {"another process takes its place"}, prints("is no longer there")),
+    Played("frozen_child", {"heartbeat_s": 0.0}, {"it goes on after that"}),
+    Played("sharing_and_parts", {}, {"one"}),
+    Played("kill_in_a_load", {}, {"the map, a little later"}),
+    Played("handled_status", {}, {"the cameras' manager"}),
+    Played("handled_status", {"handled": "no"}, {"the cameras' manager", "the consumer"}),
+    Played("refused_ring", {}, {"an error that names the ring"}),
+    Played("crash_in_unload", {}, {"its unload runs again"}),
+    Played("brownout", {}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 60 W") == 60),
+    Played("brownout", {"capacity": 80}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 80 W") == 80),
+    Played("brownout", {"capacity": 40}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 40 W") == 40),
+    Played("brownout", {"priority": 2}, {"nobody: the pump waits"}),
+    Played("generator", {}, {"the generator starts, and nobody is switched off"}),
+    Played("generator", {"fuel": "no"}, {"the radio and the lamp are switched off"}),
+    Played("tour_guide", {}, {"it is paused"}),
+    Played("tour_guide", {"idle": "unload"}, {"it has been ended"}),
+    Played("tour_guide", {"linger_s": 30.0}, {"it runs on"}),
+    Played("rebinding", {}, {"the lidar, and later the camera again"}),
+    Played("rebinding", {"settle_s": 30.0}, {"the lidar, to the end"}),
+    Played("rebinding", {"at_least_hz": 50}, {"nothing: it ends with an error"}),
+    Played("keep", {}, {"radio 0, radio 1 and radio 2"}, prints("radio 0 is killed", "1 wanted: radio 0")),
+    Played(
+        "keep",
+        {"fault": "silent", "then_wanted": 5},
+        {"radio 0, radio 1 and radio 2"},
+        prints("radio 0 is silent", "5 wanted: radio 0, radio 1, radio 2, radio 3, radio 4"),
+    ),
+    Played("keep", {"delay_s": 20.0}, {"radio 1 and radio 2"}),
+    Played("umrf", {}, {"the spare camera takes it"}),
+    Played("umrf", {"broken": "none"}, {"the arm's camera takes it"}),
+    Played("umrf", {"broken": "spare"}, {"the arm's camera takes it"}),
+    Played("umrf", {"killed": "actions"}, {"the spare camera takes it", "the spare camera begins again, as attempt 2"}),
+    Played("full_mailbox", {}, {"nothing: readings become dead letters"}),
+    Played("full_mailbox", {"way": "ask"}, {"each answer, as slow as the filter"}),
+    Played("full_mailbox", {"where": "its own process"}, {"MailboxFull"}),
+    Played("full_mailbox", {"limit": 1000}, {"nothing: all of them wait"}),
+    Played("philosophers", {}, {"one is refused at once, the others eat"}),
+    Played("philosophers", {"where": "processes of their own"}, {"all wait, until a time limit ends one"}),
+    Played("philosophers", {"first": "the fork with the lower number"}, {"all eat, one after another"}),
+    Played("philosophers", {"way": "tell"}, {"all wait for ever"}),
+    Played("lost_token", {}, {"it is gone, and the ring stands still"}),
+    Played("lost_token", {"watch": "the program, with a monitor"}, {"the one that watches makes a new one"}),
 )
 
 
+def test_each_lever_is_played_with_each_of_its_values() -> None:
+    assert {played.name for played in PLAYED} == set(EXPERIMENTS)
+    for experiment in EXPERIMENTS.values():
+        runs = [played for played in PLAYED if played.name == experiment.name]
+        for lever in experiment.levers:
+            played = {run.levers.get(lever.name, lever.choices[0]) for run in runs}
+            assert played == set(lever.choices), (experiment.name, lever.label)
+
+
 @pytest.mark.slow
-def test_each_run_shows_which_answers_to_its_question_are_right() -> None:
+@pytest.mark.parametrize("first", range(0, len(PLAYED), AT_ONCE))
+def test_each_run_does_what_its_levers_say_and_shows_which_answers_are_right(first: int) -> None:
     before = left_behind()
-    wanted = [*((name, {}, right) for name, right in RIGHT.items()), *PULLED]
-    for first in range(0, len(wanted), AT_ONCE):
-        assert_right(wanted[first : first + AT_ONCE])
+    assert_right(PLAYED[first : first + AT_ONCE])
     assert left_behind() == before
-    assert set(EXPERIMENTS) == set(RIGHT)
 
 
-def assert_right(wanted: Sequence[tuple[str, dict[str, Any], set[str]]]) -> None:
+def assert_right(wanted: Sequence[Played]) -> None:
     """Let these experiments run side by side, and look at what each has shown."""
-    runs = [(Run(LAB / f"{name}.py", levers), right) for name, levers, right in wanted]
+    runs = [(Run(LAB / f"{played.name}.py", played.levers), played) for played in wanted]
     try:
-        for run, right in runs:
+        for run, played in runs:
             eventually(lambda run=run: not run.is_running, 2 * LONG_S, run.name)
-            question = EXPERIMENTS[run.name].question
+            question, seen = EXPERIMENTS[run.name].question, run.seen
             assert question is not None
             assert run.has_finished, run.lines
-            assert question.right(run.seen) == right, (run.name, run.lines)
+            assert question.right(seen) == played.right, (run.name, played.levers, run.lines)
+            assert played.shows is None or played.shows(seen), (run.name, played.levers, run.lines)
+            assert not any(one.event == "dead_letter" and "Question" in str(one.facts) for one in seen.events)
     finally:
         for run, _ in runs:
             run.stop()
@@ -265,14 +340,21 @@ def test_the_lab_asks_runs_what_was_chosen_compares_and_plays_it_again(tab: Tab)
         href = tab.do(tab.page.get_by_role("link", name="the same as a notebook").get_attribute("href"))
         answer = tab.do(tab.page.request.get(url.partition("/lab")[0] + str(href)))
         notebook = json.loads(tab.do(answer.text()))
-        assert "strategy='rest_for_one', max_restarts=2" in notebook["cells"][-1]["source"]
+        assert "strategy='rest_for_one', max_restarts=2" in notebook["cells"][-2]["source"]
         assert tab.do(tab.page.request.get(url.partition("/lab")[0] + "/lab/no.ipynb")).status == 404
+        assert "Look for:" not in tab.text("body")
         tab.clicks("run it")
+        tab.sees("body", "Look for: the children that start again")
         tab.sees("[role=log]", "SIGKILL to b", "restarted     root/team/c", limit_s=LONG_S)
+        assert "Why:" not in tab.text("body")
         tab.clicks("pause")
         tab.sees("[role=toolbar]", "go on", "at ")
         tab.clicks("go on")
         tab.sees(".rr-verdict", "Not quite. You said: restart b. It was: restart b, restart c.", limit_s=LONG_S)
+        tab.sees("body", "Why: the strategy says which children start again")
+        tab.sees(".rr-status", "has ended")
+        for child in ("b", "c"):
+            tab.sees(f'button[data-path="root/team/{child}"]', "running", "↻1")
         tab.clicks("again")
         tab.clicks("step")
         tab.waits(lambda: "SIGKILL" not in tab.text("[role=log]"), "the log as it was")

@@ -68,7 +68,7 @@ def test_a_question_of_which_a_run_shows_nothing_says_so() -> None:
 
 def test_levers_have_their_first_value_unless_another_is_chosen() -> None:
     levers = (Lever("kills", "kills", (1, 2)), Lever("child", "child", ("a", "b")))
-    experiment = LabExperiment(Path("room/name.py"), "", "", "", "", LabDeclaration(levers=levers))
+    experiment = LabExperiment(Path("room/name.py"), "", "", "", "", "", LabDeclaration(levers=levers))
     assert experiment.name == "name"
     assert experiment.values({}) == {"kills": 1, "child": "a"}
     assert experiment.values({"kills": "2"}) == {"kills": 2, "child": "a"}
@@ -86,6 +86,17 @@ def test_the_levers_of_an_experiment_are_the_parameters_of_its_program(name: str
     assert experiment.code.startswith("from __future__ import annotations\n")
 
 
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_what_is_read_before_a_question_does_not_answer_it(name: str) -> None:
+    experiment = EXPERIMENTS[name]
+    assert experiment.question is not None
+    told = " ".join((experiment.title, experiment.about, experiment.question.text)).lower()
+    answers = [words for answer in experiment.question.answers if len(words := answer.lower().split()) > 2]
+    for words in answers:
+        assert " ".join(words[:4]) not in told
+    assert experiment.why
+
+
 def test_every_program_of_the_examples_is_an_experiment() -> None:
     assert read_lab(ROOT / "examples" / "lab").broken == []
 
@@ -97,6 +108,9 @@ MINE = '''"""Mine: what it shows.
 More of `it`.
 
 Look for: the child.
+
+Why: it is
+supervised.
 """
 
 # /// lab
@@ -125,7 +139,8 @@ def written(folder: Path, text: str, name: str = "mine.py") -> Path:
 def test_a_file_says_its_title_its_texts_its_levers_and_its_question(tmp_path: Path) -> None:
     mine = read_experiment(written(tmp_path, MINE))
 
-    assert (mine.title, mine.about, mine.look_for) == ("Mine: what it shows", "More of it.", "the child.")
+    assert (mine.title, mine.about) == ("Mine: what it shows", "More of it.")
+    assert (mine.look_for, mine.why) == ("the child.", "it is supervised.")
     assert mine.code == "import time\n\n\ndef main(state_dir, kills=1):\n    time.sleep(kills)\n"
     assert mine.levers == (Lever("kills", "how often", (1, 2.5, "never")),)
     assert mine.question == Question(
@@ -195,7 +210,11 @@ def test_a_notebook_has_the_same_code_and_the_chosen_levers(name: str) -> None:
     levers = {lever.name: lever.choices[-1] for lever in experiment.levers}
     notebook = nbformat.reads(notebook_of(experiment, levers), as_version=4)
     nbformat.validate(notebook)
-    _, code, call = [cell.source for cell in notebook.cells]
+    asked, code, call, why = [cell.source for cell in notebook.cells]
+    assert experiment.question is not None
+    assert asked.endswith(f"**{experiment.question.text}**")
+    assert experiment.why not in asked
+    assert why == f"Why: {experiment.why}"
     compile(code, "cell", "exec")
     arguments = ast.parse(call, mode="eval").body
     assert isinstance(arguments, ast.Call)

@@ -247,10 +247,25 @@ def test_arrays_and_bytes_are_saved(system: rr.System, camera: rr.Query, tmp_pat
     assert (tmp_path / "it.bin").read_bytes() == bytes(range(10))
 
 
+def test_a_stream_is_recorded_as_one_reader_more(system: rr.System, camera: rr.Query, tmp_path: Path) -> None:
+    system.ref("cameras").proxy().go_on("images", "colour").get()
+
+    told = said("stream", camera.resource_id, "images", "--record", tmp_path / "f", "--count", "3")
+
+    recorded = rr.read_stream(tmp_path / "f")
+    assert told.startswith(f"recorded 3 frames in {tmp_path / 'f'}")
+    assert [frame.value.shape for frame in recorded] == [(4, 5, 3)] * 3
+    assert (recorded.server, recorded.request, recorded.response) == ("cameras/camera", camera.request, None)
+    ran = run_cli("stream", camera.resource_id, "images", "--record", tmp_path / "g", "--limit-bytes", "1000")
+    assert ran.stderr == f"{tmp_path / 'g'} has reached its limit of 1000 bytes\n"
+    ran = run_cli("stream", camera.resource_id, "images", "--record", tmp_path / "f")
+    assert "f: expected a new file, got FileExistsError" in ran.stderr
+
+
 @pytest.mark.parametrize(
     ("what", "options", "told"),
     [
-        ("text", ("--rate", "--echo"), "expected one of --rate, --echo and --save FILE, got several"),
+        ("text", ("--rate", "--echo"), "expected one of --rate, --echo, --save FILE and --record FILE, got several"),
         ("text", ("--save", "it.jpeg"), "expected a file that ends with .png, .npy or .bin, got 'it.jpeg'"),
         ("text", ("--save", "old.png"), "expected a new file, got old.png, which is there already"),
         ("text", ("--save", "new.png"), "'a note', cannot be saved"),

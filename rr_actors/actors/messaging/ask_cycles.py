@@ -9,7 +9,9 @@ The error is a UsageError. Its `.ring` has the names of the actors.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
+from collections.abc import Generator
 from contextvars import ContextVar
 from typing import NamedTuple, Protocol
 
@@ -65,6 +67,24 @@ def chain() -> Chain:
     """Return the chain that a blocking ask of the current handler must carry."""
     me = activity.get()
     return () if me is None or not me.active else (*me.chain, me.target)
+
+
+@contextlib.contextmanager
+def asking_as(name: str) -> Generator[None]:
+    """Have asks within the `with` block carry this name: that of a client, which is no actor."""
+    token = activity.set(Activity(Target(f"asker:{name}", name), ()))
+    try:
+        yield
+    finally:
+        activity.reset(token)
+
+
+def asker() -> str | None:
+    """Return the name of the actor or client that asks, "" if it is not known; None outside of a handler."""
+    me = activity.get()
+    if me is None or not me.active or me.starts_in is not None:
+        return None
+    return me.chain[-1].name if me.chain else ""
 
 
 def here() -> object:

@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.base.checks import SupervisorLook
 from rr_actors.base.errors import Unavailable, shown
 from rr_actors.base.reporting.log import Log
 from rr_actors.runtime import event_loop
@@ -85,7 +86,11 @@ class Office:
             return DeadLetters(self.count - after, [letter for number, letter in self._kept if number > after])
 
     def record(self, to: str, messages: Sequence[Any], why: str, *, unheard: int) -> None:
-        """Record messages that did not reach one actor, for one reason. `unheard`: how many senders get no error."""
+        """Record messages that did not reach one actor, for one reason. `unheard`: how many senders get no error.
+
+        A question about a supervisor's tree is none of them: consoles ask many, also while a system stops.
+        """
+        messages = [message for message in messages if not isinstance(message, SupervisorLook)]
         process = event_loop.current()
         at = time.time()
         if process is not None and process.is_loop_thread() and not all(type(message) is Lost for message in messages):

@@ -39,7 +39,7 @@ from rr_actors.actors.remote.protocol import (
 from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.reporting.tracebacks import add_note
+from rr_actors.base.reporting.tracebacks import note_raised
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import deadline_of
 from rr_actors.wire.segments import Lie
@@ -431,7 +431,7 @@ def _reraise(raised: HandlerRaised, origin: str) -> Any:
             logger.debug("an exception of %s cannot be made here: %r", origin, reason)
     if not isinstance(error, Exception):
         error = RrError(raised.text)
-    add_note(error, f"raised by {origin}:\n{raised.trace.rstrip()}")
+    note_raised(error, origin, raised.trace)
     try:
         raise error
     finally:

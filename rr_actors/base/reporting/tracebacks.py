@@ -11,6 +11,7 @@ import sys
 import threading
 import traceback
 from types import FrameType, TracebackType
+from typing import cast
 
 import msgspec
 
@@ -60,6 +61,23 @@ def add_note(error: BaseException, note: str) -> None:
         BaseException.add_note(error, note)
     except BaseException:
         return  # what the note says is in the log of the process where it was raised
+
+
+_RAISED_BY = "raised by "
+
+
+def note_raised(error: BaseException, origin: str, trace: str) -> None:
+    """Note where an exception was raised, and how, that has come from another process."""
+    add_note(error, f"{_RAISED_BY}{origin}:\n{trace.rstrip()}")
+
+
+def raised_elsewhere(error: BaseException) -> str:
+    """Return the trace that note_raised() has noted last; "" if the exception is of this process."""
+    notes: object = getattr(error, "__notes__", None)
+    for note in reversed(cast("list[object]", notes)) if is_a(notes, list) else ():
+        if is_a(note, str) and note.startswith(_RAISED_BY):
+            return note.partition("\n")[2]
+    return ""
 
 
 def stacks_of_threads() -> dict[int, FrameType]:

@@ -93,10 +93,11 @@ class Codec:
         self.type = type_
         wanted = Any if type_ is None else _declared_type(type_)
         self.shape = shape_of(wanted, what)
-        self._gaps = gaps_of(self.shape)
+        parts = [part for _, part in walk(self.shape, "")]
+        self._gaps = gaps_of(parts)
         self._has_class = has_class(self.shape)
-        self._runs_code = runs_code(self.shape)
-        self._takes_any = any(isinstance(part, AnyType) for _, part in walk(self.shape, ""))
+        self._runs_code = runs_code(parts)
+        self._takes_any = any(isinstance(part, AnyType) for part in parts)
         self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=_value_of).decode
         self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=_value_of).decode
 
@@ -154,6 +155,17 @@ class Codec:
             return self.decode(raw)
         except (InvalidRequest, InvalidResponse):
             return shown_plain(raw)
+
+    def show_stored(self, raw: bytes) -> Any:
+        """Return the value of a request that an earlier version may have stored.
+
+        It is a plain value if it does not fit the type, also by today(): the type could only be guessed.
+        """
+        try:
+            self.today(raw)
+        except (InvalidRequest, NotSerializable):
+            return shown_plain(raw)
+        return self.decode(raw)
 
     def canonical(self, raw: bytes, server: str = "", what: str = "request") -> bytes:
         """Return the canonical bytes for a value's bytes: equal requests have equal canonical bytes.

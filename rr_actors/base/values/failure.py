@@ -85,7 +85,8 @@ def error_of(failure: Failure) -> errors.RrError:
         details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)
     error = cls(failure.message, **details)
     if lines := details.get("traceback"):
-        error.add_note(f"raised in {failure.trace[0][0] if failure.trace else 'a callback'}:\n{lines}")
+        place = failure.trace[0][0] if failure.trace else details.get("actor", "a callback")
+        error.add_note(f"raised in {place}:\n{lines}")
     return error
 
 

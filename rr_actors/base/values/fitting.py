@@ -12,7 +12,7 @@ import msgspec
 from msgspec import inspect
 from msgspec.msgpack import Ext
 
-from rr_actors.base.errors import shown
+from rr_actors.base.errors import shown, with_article
 from rr_actors.base.values.codecs import ARRAY, BY_CODE, CODEC, NAMED, SCALAR, codec_named, numpy_value, split_name
 from rr_actors.base.values.packing import plain_form
 from rr_actors.base.values.type_shapes import Shape, alternative, fields_of, name_of
@@ -84,10 +84,12 @@ def _undeclared(mark: Mark) -> str:
         return f"the MessagePack extension {mark.code}"
     name, _ = split_name(mark.data)
     if mark.code == CODEC:
-        return f"a {shown(name)} that has no codec in this process: import the module that gives it one (rr.codec)"
+        of = with_article(shown(name))
+        return f"{of} that has no codec in this process: import the module that gives it one (rr.codec)"
+    of = with_article(_shortest(name))
     return (
-        f"a {_shortest(name)}, which only a declared type brings back: annotate the load callback with it (or give "
-        f"request_type, response_type), or give it an rr.codec"
+        f"{of}, which only a declared type brings back: annotate the load callback with it (or give request_type, "
+        "response_type), or give it an rr.codec"
     )
 
 

@@ -95,9 +95,9 @@ def has_class(shape: Shape) -> bool:
     return any(isinstance(part, (*_RECORDS, inspect.EnumType)) for part in parts)
 
 
-def runs_code(shape: Shape) -> bool:
-    """Return whether decoding to the shape may run a user's code, except in the place of any plain value."""
-    return any(_runs_code(part) for _, part in walk(shape, ""))
+def runs_code(parts: Sequence[Shape]) -> bool:
+    """Return whether decoding to the shape of these parts may run a user's code, except in a place of any value."""
+    return any(_runs_code(part) for part in parts)
 
 
 def _runs_code(part: Shape) -> bool:
@@ -150,9 +150,9 @@ class Gaps(msgspec.Struct, frozen=True):
     within: tuple[str, ...]
 
 
-def gaps_of(shape: Shape) -> dict[type, Gaps]:
-    """Return the gaps of all classes in the shape; {} if there are none."""
-    records = [part for _, part in walk(shape, "") if isinstance(part, _RECORDS)]
+def gaps_of(parts: Sequence[Shape]) -> dict[type, Gaps]:
+    """Return the gaps of all classes in the shape of these parts; {} if there are none."""
+    records = [part for part in parts if isinstance(part, _RECORDS)]
     unset = {part.cls: _unset_defaults(part) for part in records}
 
     def leads_on(part: Shape) -> bool:

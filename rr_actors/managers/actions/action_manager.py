@@ -19,6 +19,7 @@ from rr_actors.base import pickling
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import (
     CatalogError,
+    GraphError,
     LoadFailed,
     LoadTimeout,
     NotFound,
@@ -31,10 +32,10 @@ from rr_actors.base.errors import (
 )
 from rr_actors.base.names import is_planned, new_id
 from rr_actors.base.reporting.log import Log
-from rr_actors.managers.actions.action import Action, bind, given_to, name_of, result_of, run_alone
+from rr_actors.managers.actions.action import Action, RunControl, Word, bind, given_to, name_of, result_of, run_alone
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_engine import GraphEngine
-from rr_actors.managers.actions.graph_library import GraphLibrary
+from rr_actors.managers.actions.graph_library import GraphLibrary, Shelf
 from rr_actors.managers.actions.graph_log import GraphLog, logged
 from rr_actors.managers.actions.graph_model import ActionGraph, flat, wrong_graph
 from rr_actors.managers.actions.graph_runs import (
@@ -57,7 +58,6 @@ from rr_actors.managers.actions.graph_runs import (
     first_run,
     run_in,
 )
-from rr_actors.managers.actions.run_controls import RunControl, Word
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOADED, State
@@ -152,20 +152,28 @@ class Actions(Manager):
     _side_by_side = True
 
     def __init__(
-        self, actions: Sequence[type[Action]] = (), graphs: str | os.PathLike[str] | None = None, stop_s: float = 5.0
+        self,
+        actions: Sequence[type[Action]] = (),
+        graphs: str | os.PathLike[str] | None = None,
+        stop_s: float = 5.0,
+        action_folder: str | os.PathLike[str] | None = None,
     ) -> None:
         """Take the classes of actions, and a folder with graphs in ``*.json`` files.
 
         Args:
             stop_s: seconds that actions have to end when their graph is released.
+            action_folder: a folder with further classes of actions in ``*.py`` files. They are code that runs in this
+                manager's process. Each load of a graph, and of an action alone, finds what has changed there. What runs
+                goes on with the classes that it began with.
 
         Raises:
             GraphError: a graph is wrong. `.file`, `.path`, `.expected`, `.got`
+            ConfigError: a file of `action_folder` is wrong. `.file`, `.key` has the line, `.expected`, `.got`
             UsageError: an action is none, or `stop_s` is no number of at least 0.
         """
         if not is_number(stop_s) or stop_s < 0:
             raise UsageError(f"Actions: stop_s: expected a number of at least 0, got {shown(stop_s)}")
-        self._library = GraphLibrary(actions, graphs, self._beginning())
+        self._library = GraphLibrary(actions, graphs, action_folder, self._beginning())
         self._stop_s = stop_s
         self._lock = threading.Lock()
         self._engines: dict[str, GraphEngine] = {}
@@ -278,8 +286,14 @@ class Actions(Manager):
             GraphError: the new graph is wrong, or has no action `start`, or that lacks an input; or the graph that is
                 to be changed has ended. `.file`, `.path`, `.expected`, `.got`
         """
-        self._engine(graph)
-        self._say(graph, Change(self._library.find(new, file), start))
+        engine, shelf = self._engine(graph), self._library.look()
+        change, before = Change(shelf.find(new, file), start), engine.shelf
+        engine.shelf = shelf
+        try:
+            self._say(graph, change)
+        except GraphError:
+            engine.shelf = before
+            raise
 
     def _say(self, graph: str, event: Event) -> None:
         if unconfirmed := self._engine(graph).tell(event):
@@ -299,8 +313,10 @@ class Actions(Manager):
     @server("action", recovery="keep")
     def run_action(self, request: RunAction) -> ActionEnd:
         """Run an action until its end."""
-        kind = self._library.action(request.action)
-        if request.engine == self.registrar.name and current().attempt > 1:
+        is_own = request.engine == self.registrar.name
+        shelf = self._shelf_of(request.run) if is_own else self._library.look()
+        kind = shelf.action(request.action)
+        if is_own and current().attempt > 1:
             text = f"{request.action}: a crash has interrupted it, and its graph runs it again as the next attempt"
             raise LoadFailed(text, server=f"{self.registrar.name}/action")
         action = kind()
@@ -338,9 +354,13 @@ class Actions(Manager):
             control.tell(_WORDS[said.response.word], said.response.step)
 
     def _said(self, key: str) -> tuple[Word, int]:
-        with self._lock:
-            engine = self._engines.get(key.partition("/")[0])
+        engine = self._engine_of(key)
         return ("stop", 0) if engine is None else engine.said(key)
+
+    def _engine_of(self, key: str) -> GraphEngine | None:
+        """Return the engine of the graph that a run is of, by the key of the run."""
+        with self._lock:
+            return self._engines.get(key.partition("/")[0])
 
     @server("control", recovery="keep")
     def control_run(self, request: ControlRun) -> RunControlled:
@@ -390,10 +410,11 @@ class Actions(Manager):
     @server("graph", recovery="keep")
     def load_graph(self, request: RunGraph) -> dict[str, Any]:
         """Check a graph, and begin it."""
-        graph = self._library.find(request.graph, request.file)
+        shelf = self._library.look()
+        graph = shelf.find(request.graph, request.file)
         inputs = checked_inputs(graph, _flat_inputs(graph, request.inputs))
         run = first_run(graph)
-        engine = self._add(current().resource_id, request.instance, graph, run)
+        engine = self._add(current().resource_id, request.instance, graph, run, shelf)
         self._begin_graph(engine, request, inputs, current().loaded)
         return feedback(graph, run)
 
@@ -424,9 +445,9 @@ class Actions(Manager):
             engine.close(self._stop_s)
         GraphLog(self.registrar.directory, current().resource_id).remove()
 
-    def _add(self, id: str, instance: str, graph: ActionGraph, run: GraphRun) -> GraphEngine:
+    def _add(self, id: str, instance: str, graph: ActionGraph, run: GraphRun, shelf: Shelf) -> GraphEngine:
         log = GraphLog(self.registrar.directory, id) if self.registrar.config.durability == "process" else None
-        engine = GraphEngine(self, id, graph, run, self._stop_s, log)
+        engine = GraphEngine(self, id, graph, run, shelf, self._stop_s, log)
         engine.replay()
         with self._lock:
             self._engines[id] = engine
@@ -439,10 +460,11 @@ class Actions(Manager):
         """Make the engine of a graph again; None: it does not fit, and is put to what is lost."""
         try:
             run = run_in(response)
-            graph = self._library.complete(read_graph(document_in(response)))
+            shelf = self._library.now
+            graph = shelf.complete(read_graph(document_in(response)))
             if not run.steps:
                 checked_inputs(graph, _flat_inputs(graph, request.inputs))
-            return self._add(id, request.instance, graph, run)
+            return self._add(id, request.instance, graph, run, shelf)
         except CatalogError as error:
             lost.append((id, Status(State.FATAL, f"the graph cannot go on: {error}")))
         except RrError as error:
@@ -461,10 +483,15 @@ class Actions(Manager):
         """Return whether this manager stops, so that ends of actions mean nothing."""
         return self._closing
 
+    def _shelf_of(self, key: str) -> Shelf:
+        """Return the actions and graphs that a graph runs with, by its id or by the key of one of its runs."""
+        engine = self._engine_of(key)
+        return self._library.now if engine is None else engine.shelf
+
     def begin_run(self, graph_id: str, graph: ActionGraph, node: str, run: NodeRun, key: str) -> Query:
         """Run an action or a sub-graph; return its query when that has ended, or when the sub-graph has begun."""
         action = graph.nodes[node]
-        if not action.actor and action.action not in self._library.actions:
+        if not action.actor and action.action not in self._shelf_of(graph_id).actions:
             request: RunGraph | RunAction = RunGraph(action.action, run.inputs, key)
             return self.registrar.load(f"{self.registrar.name}/graph", request, parent=graph_id, timeout_s=None)
         request = RunAction(action.action, run.inputs, key, run.attempt, self.registrar.name)

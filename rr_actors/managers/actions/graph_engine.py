@@ -14,6 +14,8 @@ from typing import Any, Protocol
 
 from rr_actors.base.errors import CatalogError, RrError, Unavailable, UnknownQuery, text_of
 from rr_actors.base.reporting.log import Log
+from rr_actors.managers.actions.action import Word
+from rr_actors.managers.actions.graph_library import Shelf
 from rr_actors.managers.actions.graph_log import GraphLog
 from rr_actors.managers.actions.graph_model import ActionGraph
 from rr_actors.managers.actions.graph_runs import (
@@ -32,7 +34,6 @@ from rr_actors.managers.actions.graph_runs import (
     decide,
     feedback,
 )
-from rr_actors.managers.actions.run_controls import Word
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
@@ -84,6 +85,7 @@ class GraphEngine:
 
     Attributes:
         graph_id: the id of the resource.
+        shelf: the actions and graphs that it runs with. The manager puts another one here when the graph changes.
     """
 
     def __init__(
@@ -92,10 +94,12 @@ class GraphEngine:
         graph_id: str,
         graph: ActionGraph,
         run: GraphRun,
+        shelf: Shelf,
         stop_s: float = 5.0,
         log: GraphLog | None = None,
     ) -> None:
         self.graph_id = graph_id
+        self.shelf = shelf
         self._stop_s = stop_s
         self._log = log
         self._texts: list[str] = []  # of the transitions that are in the log alone

@@ -4,56 +4,44 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from rr_actors.base.errors import UsageError, shown
+from rr_actors.base.errors import ConfigError, GraphError, UsageError, shown
 from rr_actors.managers.actions.action import Action, check_isolation, name_of, signature_of_class
+from rr_actors.managers.actions.action_folder import ActionFolder, Kinds
 from rr_actors.managers.actions.graph_checks import Signature, completed, signature_of
 from rr_actors.managers.actions.graph_documents import parse_graph, read_graph, read_graph_bytes
 from rr_actors.managers.actions.graph_model import ActionGraph, wrong_graph
-from rr_actors.managers.planning.last_good import LastGood, Sources, may_block
+from rr_actors.managers.planning.last_good import LastGood, Sources, may_block, path_of
 from rr_actors.registrar.manager import Beginning
 
 
-class GraphLibrary:
-    """All of it is read and checked when it is made, so that a manager with a wrong graph does not start.
+class Shelf:
+    """The actions and graphs that are there at one time.
 
     Attributes:
         actions: the classes, by the names that graphs call them by.
         graphs: the graphs of the folder, with the parameters of their actions, by name.
+        misfits: why other graphs of the folder cannot run, by name.
     """
 
-    def __init__(
-        self,
-        actions: Sequence[type[Action]],
-        folder: str | os.PathLike[str] | None = None,
-        beginning: Beginning | None = None,
-    ) -> None:
-        """Read the graphs in the files ``*.json`` of a folder; after a crash take the last good ones.
-
-        Raises:
-            GraphError: a graph is wrong, or the folder cannot be read.
-            UsageError: one of `actions` is no subclass of Action, or has no run(), or two have the same name,
-                or `isolate` or `timeout_s` is wrong.
-        """
-        self.actions = _by_name(actions)
-        self._known_actions = {name: signature_of_class(kind) for name, kind in self.actions.items()}
-        self._known: dict[str, Signature] = self._known_actions
+    def __init__(self, actions: Kinds, unread: Mapping[str, ActionGraph], faults: Iterable[ConfigError] = ()) -> None:
+        """Complete the graphs. `faults`: of files with actions; the errors for unknown actions name them."""
+        self.actions = actions
         self.graphs: dict[str, ActionGraph] = {}
-        if folder is not None:
-            path = Path(folder).absolute()
-            self.graphs, self._known = LastGood(beginning, lambda: _read_folder(path), self._parsed).now
-
-    def _parsed(self, sources: Sources) -> tuple[dict[str, ActionGraph], dict[str, Signature]]:
-        self.graphs, self._known = {}, dict(self._known_actions)
-        unread = _parse_folder(sources)
+        self.misfits: dict[str, GraphError] = {}
+        self._faults = [str(fault) for fault in faults]
+        self._known: dict[str, Signature] = {name: signature_of_class(kind) for name, kind in actions.items()}
         for name in unread:
-            self._complete(name, unread, ())
-        return self.graphs, self._known
+            try:
+                self._complete(name, unread, ())
+            except GraphError as error:
+                self.misfits[name] = error
 
-    def _complete(self, name: str, unread: dict[str, ActionGraph], inside: tuple[str, ...]) -> None:
+    def _complete(self, name: str, unread: Mapping[str, ActionGraph], inside: tuple[str, ...]) -> None:
         """Complete a graph after its sub-graphs."""
         if name in self.graphs:
             return
@@ -73,7 +61,12 @@ class GraphLibrary:
         Raises:
             GraphError: it cannot run here.
         """
-        return completed(graph, self._known)
+        try:
+            return completed(graph, self._known)
+        except GraphError as error:
+            if not self._faults or not error.path.endswith(".name"):
+                raise
+            raise GraphError("; ".join([str(error), *self._faults]), **error.details) from error
 
     def find(self, graph: str | dict[str, Any], file: str = "") -> ActionGraph:
         """Return the graph of this name, or the one that this JSON object is, which was read in `file`.
@@ -83,6 +76,8 @@ class GraphLibrary:
         """
         if isinstance(graph, dict):
             return self.complete(read_graph(graph, file))
+        if graph in self.misfits:
+            raise self.misfits[graph]
         if graph not in self.graphs:
             known = ", ".join(sorted(self.graphs)) or "none"
             raise wrong_graph("", "graph", f"a graph: one of {known}", graph)
@@ -98,6 +93,77 @@ class GraphLibrary:
             known = ", ".join(sorted(self.actions)) or "none"
             raise wrong_graph("", "action", f"an action: one of {known}", name)
         return self.actions[name]
+
+
+class GraphLibrary:
+    """All of it is read and checked when it is made, so that a manager with a wrong graph does not start.
+
+    Attributes:
+        now: the actions and graphs that were there at the last look.
+    """
+
+    def __init__(
+        self,
+        actions: Sequence[type[Action]],
+        graphs: str | os.PathLike[str] | None = None,
+        action_folder: str | os.PathLike[str] | None = None,
+        beginning: Beginning | None = None,
+    ) -> None:
+        """Read the graphs in the files ``*.json`` of a folder, and the actions in the files ``*.py`` of another.
+
+        After a crash take the last good ones.
+
+        Raises:
+            GraphError: a graph is wrong, or its folder cannot be read.
+            ConfigError: a file with actions is wrong, or their folder cannot be read.
+            UsageError: one of `actions` is no subclass of Action, or has no run(), or two have the same name,
+                or `isolate` or `timeout_s` is wrong.
+        """
+        self._given: Kinds = _by_name(actions)
+        self._note = beginning.note if beginning is not None else _unnoted
+        self._looking = threading.Lock()
+        self._folder: ActionFolder | None = None
+        self._unread: Mapping[str, ActionGraph] = {}
+        self._problem = ""
+        if action_folder is not None:
+            self._folder = ActionFolder(path_of(action_folder, "Actions", "action_folder"), beginning, self._given)
+        self.now = self._filled()
+        if graphs is not None:
+            path = Path(graphs).absolute()
+            configuration = LastGood(beginning, lambda: _read_folder(path), self._parsed)
+            self._unread, self.now = configuration.now
+            if configuration.problem:
+                self._problem = f"goes on with its last good configuration: {configuration.problem}"
+        if self._folder is not None:
+            self._tell(self._folder)
+
+    def look(self) -> Shelf:
+        """Return what is there now: files with actions that have changed since the last look are run."""
+        with self._looking:
+            if self._folder is not None and self._folder.look():
+                self.now = self._filled()
+                self._tell(self._folder)
+            return self.now
+
+    def _tell(self, folder: ActionFolder) -> None:
+        """Have the console show what is wrong beside the manager."""
+        self._note("; ".join(filter(None, [self._problem, *map(str, folder.faults.values())])))
+
+    def _filled(self) -> Shelf:
+        if self._folder is None:
+            return Shelf(self._given, self._unread)
+        return Shelf({**self._given, **self._folder.kinds}, self._unread, self._folder.faults.values())
+
+    def _parsed(self, sources: Sources) -> tuple[Mapping[str, ActionGraph], Shelf]:
+        self._unread = _parse_folder(sources)
+        shelf = self._filled()
+        for misfit in shelf.misfits.values():
+            raise misfit
+        return self._unread, shelf
+
+
+def _unnoted(_text: str) -> None:
+    pass
 
 
 def is_action(given: object) -> bool:

@@ -21,10 +21,9 @@ from rr_actors.base.names import made_at
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.books import Book, Books, most_of
 from rr_actors.managers.budgets.gauge import Gauge
-from rr_actors.managers.budgets.measures import Measure, next_capacity
+from rr_actors.managers.budgets.measures import Measure, next_capacity, surplus
 from rr_actors.managers.budgets.planner import LEAST, Asked, Plan, plan, urgencies
 from rr_actors.managers.budgets.pools import Pool, check_amount, read_pools
-from rr_actors.managers.budgets.probes import probe_of
 from rr_actors.managers.budgets.requests import PoolInfo, Share, Supply, check_request
 from rr_actors.managers.budgets.reserves import Record, Reserves
 from rr_actors.managers.budgets.rings import Wait, one_to_refuse, without_ground
@@ -32,6 +31,7 @@ from rr_actors.managers.budgets.words import NAMED, Around, gives_way, has_room,
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.last_good import still_standing
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.probes import probe_of
 from rr_actors.managers.planning.setbacks import Setbacks
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
@@ -47,6 +47,7 @@ _HOLDS_S = 1.0  # a share that has waited for so long is passed over by nobody w
 _SAYS_S = 1.0  # those who are far behind hear so often that those ahead have changed
 _NEAR = 10  # the first ones hear at once
 _LOOKED_S = 30.0
+_TOO_MUCH = "there is too much"
 _CAPACITY = "pool %s: its probe %s; the capacity stays %g"
 
 
@@ -312,6 +313,7 @@ class Budgets(Manager):
         stay = [one for one in book.running(self._leaving) if not one.leaving]
         needed = [one for one in asked if one.id in self._waiting]
         others = own + book.given() - self._reserves.given(name, book)
+        self._reserves.carry_out_sinks(name, now)
         self._reserves.carry_out(name, made, lambda spares: urgencies(others, stay, needed, spares), book, total, now)
         told_at = self._say(books, name, made, now)
         times = [told_at, *(one.until for one in waiting), *(one.since + _HOLDS_S for one in waiting)]
@@ -385,13 +387,27 @@ class Budgets(Manager):
         self._planning.tell(functools.partial(self._take, pool, measure, reading))
 
     def _take(self, pool: str, measure: Measure, reading: float) -> None:
-        if self._problems[pool]:
-            logger.info("pool %s: its probe answers again", pool)
-            self._problems[pool] = ""
+        self._balance(pool, measure, reading)
         capacity = next_capacity(measure, self._capacity(pool), self._measured[pool], reading)
         if capacity != self._measured[pool]:
             self._measured[pool] = self._record.now.measured[pool] = capacity
             self._record.save()
+
+    def _balance(self, pool: str, measure: Measure, reading: float) -> None:
+        """Have sinks loaded or released, and say once that there is too much and no sink is left."""
+        more = surplus(measure, reading)
+        changes = more != 0 and self._reserves.want_sinks(pool, more)
+        problem = f"{_TOO_MUCH}: its probe reads {reading:g}, and no sink is left" if more > 0 and not changes else ""
+        before = self._problems[pool]
+        if before and not problem:
+            logger.info(
+                "pool %s: %s",
+                pool,
+                "it has not too much any more" if _is_surplus(before) else "its probe answers again",
+            )
+        elif problem and not _is_surplus(before):
+            logger.warning("pool %s: %s", pool, problem)
+        self._problems[pool] = problem
 
     def _troubled(self, pool: str, problem: str) -> None:
         """Keep the last measured capacity, and say once what is wrong. On the gauge's thread."""
@@ -402,6 +418,10 @@ class Budgets(Manager):
             self._problems[pool] = problem
             info = next((info for info in self._infos if info.name == pool), None)
             logger.warning(_CAPACITY, pool, problem, self._capacity(pool) if info is None else info.capacity)
+
+
+def _is_surplus(problem: str) -> bool:
+    return problem.startswith(_TOO_MUCH)
 
 
 def _settle(answer: asyncio.Future[None], error: Exception | None) -> None:

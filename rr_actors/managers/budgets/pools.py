@@ -12,11 +12,16 @@ A file has one table for each pool::
     request = "diesel"
     amount = 50
 
+    [[pool.sink]]                                        # what is loaded while there is too much
+    server = "heaters/boiler"
+
     [pool.measure]                                       # what the capacity follows; see measures.py
     probe = "psi:cpu"
     shed_at = 60
     restore_at = 30
     step = 5
+    surplus_at = 5
+    settled_at = 20
 """
 
 from __future__ import annotations
@@ -34,8 +39,8 @@ from rr_actors.base.names import parse_server_id
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.managers.budgets.measures import Measure, faults
 from rr_actors.managers.budgets.planner import Step
-from rr_actors.managers.budgets.probes import NoProbe, probe_of
 from rr_actors.managers.planning.last_good import last_good_file
+from rr_actors.managers.planning.probes import NoProbe, probe_of
 from rr_actors.registrar.manager import Beginning
 
 POLICY: tuple[Step, ...] = get_args(Step)
@@ -57,6 +62,21 @@ class Reserve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_on_s: float = 5.0
 
 
+class Sink(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A resource that is loaded while the pool's measure says that there is too much, and takes some of it.
+
+    Its load has the lowest priority, -1000: its share takes what is free, and gives way to all others.
+
+    Attributes:
+        request: as of a Reserve.
+        least_on_s: seconds for which it stays on at least.
+    """
+
+    server: str
+    request: Any = None
+    least_on_s: float = 5.0
+
+
 class Pool(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A quantity that resources share.
 
@@ -67,6 +87,7 @@ class Pool(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "supply": load a reserve. "preempt": revoke shares of lower priority. "wait": wait until others release
             theirs; what comes after it is done when the share may not wait any longer. What is left out is not done.
         reserve: what can be loaded to add to the capacity, the preferred first.
+        sink: what is loaded while there is too much, the first first; with a measure that has `surplus_at`.
         measure: how the capacity is measured.
     """
 
@@ -74,6 +95,7 @@ class Pool(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     capacity: float
     policy: tuple[Step, ...] = POLICY
     reserve: tuple[Reserve, ...] = ()
+    sink: tuple[Sink, ...] = ()
     measure: Measure | None = None
 
 
@@ -123,6 +145,11 @@ def _check_pool(file: str | None, key: str, pool: Pool) -> None:
         _check_server(file, f"{key}.reserve[{j}].server", reserve.server)
         check_amount(file, f"{key}.reserve[{j}].amount", reserve.amount)
         check_amount(file, f"{key}.reserve[{j}].least_on_s", reserve.least_on_s)
+    for j, sink in enumerate(pool.sink):
+        _check_server(file, f"{key}.sink[{j}].server", sink.server)
+        check_amount(file, f"{key}.sink[{j}].least_on_s", sink.least_on_s)
+    if pool.sink and (pool.measure is None or pool.measure.surplus_at is None):
+        raise wrong(file, f"{key}.sink", "a measure with surplus_at, or no sink", len(pool.sink), where="Budgets")
     if unknown := [step for step in pool.policy if step not in POLICY]:
         raise wrong(file, f"{key}.policy", f"of {', '.join(POLICY)}", unknown[0], where="Budgets")
     if again := [step for i, step in enumerate(pool.policy) if step in pool.policy[:i]]:
@@ -142,9 +169,11 @@ def _given(pools: object) -> Sequence[Pool]:
             raise wrong(None, f"pool[{i}]", "an rr_actors.managers.Pool", pool, where="Budgets")
         if not is_a(pool.name, str):
             raise wrong(None, f"pool[{i}].name", "a str", pool.name, where="Budgets")
-        for j, reserve in enumerate(pool.reserve):
-            if not is_a(reserve, Reserve):
-                raise wrong(None, f"pool[{i}].reserve[{j}]", "an rr_actors.managers.Reserve", reserve, where="Budgets")
+        for field, kind in (("reserve", Reserve), ("sink", Sink)):
+            for j, one in enumerate(getattr(pool, field)):
+                if not is_a(one, kind):
+                    expected = f"an rr_actors.managers.{kind.__name__}"
+                    raise wrong(None, f"pool[{i}].{field}[{j}]", expected, one, where="Budgets")
     return cast("Sequence[Pool]", pools)
 
 

@@ -1,5 +1,7 @@
 """Reserves: the resources that a Budgets manager loads when a pool needs more than it has. On the loop's thread.
 
+Its sinks are here, too: those that it loads while there is too much.
+
 A reserve gives by a supply whose row says what it is a part of. So what a reserve gives counts from the moment at which
 its supply is there, until its release begins.
 """
@@ -17,8 +19,8 @@ from rr_actors.base.errors import CatalogError, UnknownQuery, text_of
 from rr_actors.base.names import is_planned, made_at
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.books import Book
-from rr_actors.managers.budgets.planner import Plan, Spare
-from rr_actors.managers.budgets.pools import Pool, Reserve
+from rr_actors.managers.budgets.planner import LEAST, Plan, Spare
+from rr_actors.managers.budgets.pools import Pool, Reserve, Sink
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
 from rr_actors.managers.planning.setbacks import Setbacks
@@ -39,7 +41,7 @@ class Record(msgspec.Struct):
 
     capacities: dict[str, tuple[float, float]] = {}  # of the pool: the file's, and the one that was set in its place
     measured: dict[str, float] = {}  # the last measured capacity of the pool
-    reserves: dict[str, str] = {}  # "pool/number": the id of the query that holds it
+    reserves: dict[str, str] = {}  # "pool/number", of a sink "pool/sink/number": the id of the query that holds it
 
 
 class _On(msgspec.Struct):
@@ -51,7 +53,7 @@ class _On(msgspec.Struct):
 
 
 class Reserves:
-    """The reserves of all pools, by the keys "pool/number"."""
+    """The reserves of all pools, by the keys "pool/number", and their sinks, by "pool/sink/number"."""
 
     def __init__(
         self,
@@ -63,7 +65,12 @@ class Reserves:
     ) -> None:
         """Go on with those that are held. Release those that a crash has left before they were noted."""
         self._registrar, self._planning, self._record, self._grace_s = registrar, planning, record, grace_s
-        self._all = {f"{name}/{i}": one for name, pool in pools.items() for i, one in enumerate(pool.reserve)}
+        self._all: dict[str, Reserve] = {
+            f"{name}/{i}": one for name, pool in pools.items() for i, one in enumerate(pool.reserve)
+        }
+        self._sinks = {f"{name}/sink/{i}": one for name, pool in pools.items() for i, one in enumerate(pool.sink)}
+        self._both: dict[str, Reserve | Sink] = {**self._all, **self._sinks}
+        self._of_pool = {name: [f"{name}/sink/{i}" for i in range(len(pool.sink))] for name, pool in pools.items()}
         self._keys = {name: [f"{name}/{i}" for i in range(len(pool.reserve))] for name, pool in pools.items()}
         self._on: dict[str, _On] = {}
         self._limits: dict[str, float] = {}  # of the pool, while a reserve stops whose supply is not known
@@ -72,16 +79,17 @@ class Reserves:
         self._owed: dict[str, str] = {}  # queries to be released, by the keys of the steps
         self._refused: Setbacks[str] = Setbacks()  # releases that could not be begun: the disk is full
         held = {query.id: query for query in registrar.queries() if not query.parent}
-        kept = {key: id for key, id in record.now.reserves.items() if id in held and key in self._all}
+        kept = {key: id for key, id in record.now.reserves.items() if id in held and key in self._both}
         for key, id in kept.items():
             ran_s = max(0.0, time.time() - made_at(id))
             self._on[key] = _On(held[id], time.monotonic() - ran_s)
         if kept != record.now.reserves:
             record.now.reserves = kept
             record.save()
+        self._wanted = {name: sum(key in self._on for key in keys) for name, keys in self._of_pool.items()}
         for id in filter(is_planned, held.keys() - kept.values()):
             self._owed[f"query {id}"] = id
-        for server_id in sorted({reserve.server for reserve in self._all.values()}):
+        for server_id in sorted({one.server for one in self._both.values()}):
             registrar.on_status(server_id, self._hear)
 
     # -- for the books and the planner -----------------------------------------------------------------------------
@@ -143,7 +151,7 @@ class Reserves:
         on = [
             at
             for key, one in self._on.items()
-            for at in (one.since + _SETTLES_S, one.since + self._all[key].least_on_s)
+            for at in (one.since + _SETTLES_S, one.since + self._both[key].least_on_s)
         ]
         again = [one.next_at(now) or 0.0 for one in (self._failed, self._refused)]
         times = [*starts, *on, *self._fading.values(), *again]
@@ -186,16 +194,38 @@ class Reserves:
         if ended.error is not None:
             logger.warning("a reserve has not the priority %d: %s", priority, text_of(ended.error))
 
+    # -- sinks -----------------------------------------------------------------------------------------------------
+
+    def want_sinks(self, pool: str, more: int) -> bool:
+        """Want one sink more, or one less (-1). Return whether that is possible: False if all are on, or none is."""
+        before = self._wanted[pool]
+        self._wanted[pool] = min(max(0, before + more), len(self._of_pool[pool]))
+        return self._wanted[pool] != before
+
+    def carry_out_sinks(self, pool: str, now: float) -> None:
+        """Load or release a sink, if more or fewer are on than are wanted."""
+        keys = self._of_pool[pool]
+        on = [key for key in keys if key in self._on and key not in self._owed]
+        starting = [key for key in keys if ("start", key) in self._planning.in_flight]
+        if len(on) + len(starting) < self._wanted[pool]:
+            off = [key for key in keys if key not in self._on and key not in starting]
+            for key in [key for key in off if self._failed.may_try(key, now)][:1]:
+                self._start(key, LEAST)
+        elif len(on) > self._wanted[pool] and now >= self._on[on[-1]].since + self._sinks[on[-1]].least_on_s:
+            self._owed[on[-1]] = self._on[on[-1]].query.id
+
+    # -- both ------------------------------------------------------------------------------------------------------
+
     def _start(self, key: str, priority: int) -> None:
-        reserve = self._all[key]
+        reserve = self._both[key]
         request = NO_FIELDS if reserve.request is None else reserve.request
         priority = min(priority, self._registrar.config.max_priority)
         load = functools.partial(begin_planned, self._registrar, reserve.server, request)
         start = functools.partial(load, priority=priority, timeout_s=None)
-        started = functools.partial(self._started, key, reserve, priority)
+        started = functools.partial(self._started, key, priority)
         self._planning.begin(("start", key), key, start, started, limit_s=_RESERVE_S)
 
-    def _started(self, key: str, reserve: Reserve, priority: int, ended: Ended) -> None:
+    def _started(self, key: str, priority: int, ended: Ended) -> None:
         if ended.value is None:
             self._note_failure(key, text_of(ended.error) if ended.error is not None else f"not within {_RESERVE_S:g} s")
             return
@@ -211,7 +241,9 @@ class Reserves:
             self._give_up(key, "it was lost")
 
     def _note_failure(self, key: str, why: str) -> None:
-        logger.warning("pool %s: reserve %s cannot be loaded: %s", key.rpartition("/")[0], self._all[key].server, why)
+        pool, _, what = key.partition("/")
+        kind = "sink" if what.startswith("sink/") else "reserve"
+        logger.warning("pool %s: %s %s cannot be loaded: %s", pool, kind, self._both[key].server, why)
         self._failed.note(key, time.monotonic(), text=why)
 
     def _hear(self, status: Status) -> None:

@@ -26,12 +26,24 @@ from rr_actors.base.errors import (
     Unavailable,
     UnknownQuery,
     UnknownServer,
+    UsageError,
+    shown,
 )
-from rr_actors.base.names import new_id
+from rr_actors.base.names import new_id, short_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import wrong
 from rr_actors.managers.choices.addresses import Addresses
 from rr_actors.managers.choices.alternatives import Alternative, check_rings, read_alternatives
+from rr_actors.managers.choices.by_hand import (
+    ByHand,
+    ChoiceInfo,
+    ChoicesRecord,
+    ChosenByHand,
+    find_choice,
+    find_key,
+    first,
+)
+from rr_actors.managers.choices.choice_search import ChoiceSearch, breaks_first, loading_of
 from rr_actors.managers.choices.chosen import Choose, Chosen, Held, held_choice
 from rr_actors.managers.choices.labelled import Labelled
 from rr_actors.managers.choices.offers import Offers, nothing_left
@@ -42,36 +54,21 @@ from rr_actors.managers.planning.hedging import HEDGE_S
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import SOON_S, Retries
-from rr_actors.managers.planning.searches import Loading, Search, groups, release_soon, strays
+from rr_actors.managers.planning.searches import Loading, groups, release_soon, strays
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOWEST, Phase, State
 from rr_actors.registrar.queries import Query, Status, StatusCallback
-from rr_actors.registrar.registrar import NO_FIELDS, Registrar, begin_planned
+from rr_actors.registrar.registrar import begin_planned
 from rr_actors.registrar.servers.callback_context import current
 
 logger = Log("rr_actors.managers.choices")
 
-_TAKE = "returns to "  # and the key of an alternative: the message of a status that a choice gets from its own manager
+# messages of a status that a choice gets from its own manager
+_TAKE = "returns to "  # and the key of an alternative
+_FIXED = "takes what is chosen by hand"
 _AGAIN = "chooses again, as a crash came in between"
 _FIRST_HEDGE_S = 5.0  # nobody uses anything that has failed yet, and devices are slow to start
-
-
-class _Broken(msgspec.Struct):
-    """The choices whose part has been released before another one was loaded in its place."""
-
-    choices: list[str] = []
-
-
-class _Search(Search[Alternative]):
-    """A search for what a choice is to have in the place of `part`; None: it has no part."""
-
-    def __init__(
-        self, registrar: Registrar, retries: Retries[str], held: Held, part: Query | None, tried: Sequence[str]
-    ) -> None:
-        super().__init__(registrar, retries, _key, _key, lambda what: "; ".join((*self.tried, what)))
-        self.held, self.part = held, part
-        self.tried += tried
 
 
 class Choices(Manager):
@@ -130,8 +127,9 @@ class Choices(Manager):
         with self._changed:
             held = dict(self._held)
             self._begun = new_id()
+            self._by_hand.keep_only(held)
         self._restore_relays(held)
-        for id in list(self._broken.now.choices):
+        for id in list(self._record.now.choices):
             if id in held:
                 self.registrar.send_status(id, Status(State.UPDATE, _AGAIN))
             else:
@@ -142,6 +140,75 @@ class Choices(Manager):
         """End the thread of the trials, and close the relays."""
         self._trials.stop()
         self._addresses.stop()
+
+    # -- messages --------------------------------------------------------------------------------------------------
+
+    def choose(self, choice: str, alternative: str, *, by: str = "", dry_run: bool = False) -> ChoiceInfo:
+        """Fix which alternative a choice has, until choose_freely(). The choice goes over to it soon.
+
+        It is before all others then. If it fails, another one serves until it is well again. One with `break_first` is
+        not tried again by itself. What was chosen is on disk.
+
+        Args:
+            choice: the choice's id, the beginning or end of that, or a kind that only one choice has.
+            alternative: its key, as choices() says it, or its server if it is the only one of that.
+            by: who chooses, for people.
+            dry_run: change nothing, and return what is meant.
+
+        Raises:
+            NotFound: there is no such choice, or it allows no such alternative. `.id`, `.known`
+            UsageError: several are meant.
+            Unavailable: the disk refuses it. Nothing has changed.
+        """
+        with self._changed:
+            id = find_choice(choice, self._held)
+            held = self._held[id]
+            key = find_key(alternative, [one.key for one in self._offers.allowed_now(held.request)])
+            if not dry_run:
+                self._by_hand.set(id, ByHand(key, str(by), time.time()))
+        if not dry_run:
+            logger.info("%s: %s is chosen by hand%s", held.request.kind, key, f", by {by}" if by else "")
+            self._tell(id, held, _FIXED)
+        return self._info(id, held)
+
+    def choose_freely(self, choice: str, *, dry_run: bool = False) -> ChoiceInfo:
+        """Take back what was chosen by hand. The choice returns to what is best when that has been well for a while.
+
+        Raises:
+            RrError: as choose(); or UsageError: nothing was chosen for it by hand.
+        """
+        with self._changed:
+            id = find_choice(choice, self._held)
+            held = self._held[id]
+            if not self._by_hand.key(id):
+                raise UsageError(f"choice {short_id(id)} ({held.request.kind}): nothing is chosen for it by hand")
+            if not dry_run:
+                self._by_hand.set(id, None)
+        self._trials.look()
+        return self._info(id, held)
+
+    def choices(self) -> list[ChoiceInfo]:
+        """Return all choices as they are now."""
+        with self._changed:
+            held = dict(self._held)
+        return [self._info(id, one) for id, one in held.items()]
+
+    def on_receive(self, message: Any) -> list[dict[str, Any]]:
+        """Answer what `rr-actors choices` and `rr-actors choose` ask."""
+        match message:
+            case {"choices": None}:
+                found = self.choices()
+            case {"choose": choice, "alternative": None, "dry_run": bool(dry_run)}:
+                found = [self.choose_freely(choice, dry_run=dry_run)]
+            case {"choose": choice, "alternative": alternative, "by": str(by), "dry_run": bool(dry_run)}:
+                found = [self.choose(choice, alternative, by=by, dry_run=dry_run)]
+            case _:
+                raise UsageError(f"{self.registrar.name}: expected a question to Choices, got {shown(message)}")
+        return [msgspec.structs.asdict(info) for info in found]
+
+    def _info(self, id: str, held: Held) -> ChoiceInfo:
+        with self._changed:
+            return self._by_hand.info(id, held, [one.key for one in self._allowed_now(id, held)])
 
     # -- the server ------------------------------------------------------------------------------------------------
 
@@ -163,7 +230,7 @@ class Choices(Manager):
             return self._try(search, group, search.as_part, take, failed, hedge_s=_FIRST_HEDGE_S)
 
         try:
-            chosen = next(filter(None, map(tried, groups(self._in_turn(best, ()), _breaks_first))), None)
+            chosen = next(filter(None, map(tried, groups(self._in_turn(best, ()), breaks_first))), None)
         except BaseException:
             self._addresses.close(search.id)
             raise
@@ -230,6 +297,10 @@ class Choices(Manager):
             status.handled()
             if held is not None:
                 self._choose_again(id, held, status)
+        elif status.message == _FIXED:
+            status.handled()
+            if held is not None:
+                self._take_by_hand(id, held, status)
         elif status.message.startswith(_TAKE):
             status.handled()
             if held is not None:
@@ -253,9 +324,33 @@ class Choices(Manager):
             held.moving = False
             self._trials.look()
 
+    def _take_by_hand(self, id: str, held: Held, status: Status) -> None:
+        """Put what was chosen by hand in the place of the one in use."""
+        with self._changed:
+            key = self._by_hand.key(id)
+        one, present = self._offers.find(key, held.request.kind), self._in_use(held)
+        parts = self.registrar.children(id)
+        if (
+            key == held.present
+            or one is None
+            or not parts
+            or not (one.break_first or (present and present.break_first))
+        ):
+            self._return(id, held, key, status)
+            return
+        held.moving = False
+        self._break(id, parts[0])
+        search = self._search(held)
+        if not self._fill(search, status, ()):
+            self._give_up(search, status)
+        self._trials.look()
+
     def _replace(self, id: str, held: Held, status: Status, part: Query) -> None:
         """Put the next best alternative in the place of one that has failed; give up if there is none."""
         failed, said = held.present, status.message or str(status.state)
+        with self._changed:
+            if failed == self._by_hand.key(id):
+                said += "; it was chosen by hand, and takes its place back when it is well"
         is_own = is_own_failure(status)
         if is_own and (one := self._in_use(held)) is not None:
             self._offers.lower(one, status.resource_id)
@@ -263,7 +358,7 @@ class Choices(Manager):
         search = self._search(held, part, [f"{failed}: {said}"])
         if self._fill(search, status, {failed}):
             logger.warning("%s: %s takes the place of %s: %s", held.request.kind, held.present, failed, said)
-        elif self._is_broken(id) or (status.state is State.FATAL and status.reason != "revoked"):
+        elif id in self._record.now.choices or (status.state is State.FATAL and status.reason != "revoked"):
             self._give_up(search, status)
         else:  # with ERROR it may be of some use still; a part that is revoked takes the choice with it
             held.failing = True
@@ -281,23 +376,24 @@ class Choices(Manager):
 
     def _search(
         self, held: Held, part: Query | None = None, tried: Sequence[str] = (), retries: Retries[str] | None = None
-    ) -> _Search:
-        return _Search(self.registrar, retries or self._trials.retries, held, part, tried)
+    ) -> ChoiceSearch:
+        return ChoiceSearch(self.registrar, retries or self._trials.retries, held, part, tried)
 
-    def _fill(self, search: _Search, status: Status, without: Collection[str]) -> bool:
+    def _fill(self, search: ChoiceSearch, status: Status, without: Collection[str]) -> bool:
         """Put the first alternative that can be had in the place of the part. Return whether there was one."""
 
         def one_pass() -> bool | None:
             with self._changed:  # else what fails meanwhile is tried once more
                 search.decided_at = time.monotonic()
-                allowed = self._offers.allowed_now(search.held.request)
-                in_turn = self._in_turn(allowed, without, self._trials.well_beside(search.id))
-            return any(self._fill_from(search, status, group) for group in groups(in_turn, _breaks_first)) or None
+                allowed = self._allowed_now(search.id, search.held)
+                fixed = {one.key for one in allowed[:1]} & {self._by_hand.key(search.id)}
+                in_turn = self._in_turn(allowed, without, fixed or self._trials.well_beside(search.id))
+            return any(self._fill_from(search, status, group) for group in groups(in_turn, breaks_first)) or None
 
         with search.telling(SOON_S, "the next one is being loaded"):
             return search.until_had(one_pass) is not None
 
-    def _fill_from(self, search: _Search, status: Status, group: Sequence[Alternative]) -> bool:
+    def _fill_from(self, search: ChoiceSearch, status: Status, group: Sequence[Alternative]) -> bool:
         present = self._in_use(search.held)
         if search.part is not None and (group[0].break_first or (present is not None and present.break_first)):
             self._break(search.id, search.part)
@@ -316,7 +412,7 @@ class Choices(Manager):
 
     def _try(
         self,
-        search: _Search,
+        search: ChoiceSearch,
         group: Sequence[Alternative],
         begin: Callable[[Loading], Reply[Query]],
         take: Callable[[Alternative, Query], Chosen],
@@ -332,7 +428,7 @@ class Choices(Manager):
             self._trials.used(one.key)
             return chosen
 
-        return search.first(group, lambda one: begin(_loading(one)), use, failed, check=check, hedge_s=hedge_s)
+        return search.first(group, lambda one: begin(loading_of(one)), use, failed, check=check, hedge_s=hedge_s)
 
     def _load_part(self, load: Loading) -> Reply[Query]:
         """Load the part of a choice that has none, and wait for it: a load that a crash left would be one too many."""
@@ -340,15 +436,15 @@ class Choices(Manager):
         loaded.set(self.registrar.load(load.server, load.request, timeout_s=load.timeout_s))
         return loaded
 
-    def _swap(self, search: _Search, status: Status, one: Alternative) -> Chosen:
+    def _swap(self, search: ChoiceSearch, status: Status, one: Alternative) -> Chosen:
         made = functools.partial(self._addresses.made, search.id, search.held, one)
-        chosen = search.swap(status, search.part, _loading(one), made)
+        chosen = search.swap(status, search.part, loading_of(one), made)
         search.held.present, search.held.failing = one.key, False
         self._use(search, chosen)
         self._trials.used(one.key)
         return chosen
 
-    def _put(self, search: _Search, status: Status, one: Alternative, query: Query) -> Chosen:
+    def _put(self, search: ChoiceSearch, status: Status, one: Alternative, query: Query) -> Chosen:
         """Use what is loaded as the part of a choice that has none now."""
         chosen = self._addresses.made(search.id, search.held, one, query)
         self.registrar.update_response(search.id, chosen, f"{one.key} takes the place of another one")
@@ -357,13 +453,13 @@ class Choices(Manager):
         self._use(search, chosen)
         return chosen
 
-    def _use(self, search: _Search, chosen: Chosen) -> None:
+    def _use(self, search: ChoiceSearch, chosen: Chosen) -> None:
         """Note that a choice has this part now."""
         self._addresses.point(search.id, chosen)
         with self._changed:
             self._held[search.id] = search.held
 
-    def _give_up(self, search: _Search, status: Status) -> None:
+    def _give_up(self, search: ChoiceSearch, status: Status) -> None:
         text = nothing_left(search.held.request, search.tried)
         logger.warning("%s", text)
         self.registrar.send_status(search.id, Status(State.FATAL, text))  # this process may be ending: it is not lost
@@ -373,20 +469,16 @@ class Choices(Manager):
     def _break(self, id: str, part: Query) -> None:
         """Release the part. It is on disk before that the choice has none, and so a crash does not leave it so."""
         with self._changed:
-            self._broken.now.choices.append(id)
-            self._broken.save()
+            self._record.now.choices.append(id)
+            self._record.save()
         self._addresses.point(id, None)
         self._release(part)
 
-    def _is_broken(self, id: str) -> bool:
-        with self._changed:
-            return id in self._broken.now.choices
-
     def _mend(self, id: str) -> None:
         with self._changed:
-            if id in self._broken.now.choices:
-                self._broken.now.choices = [other for other in self._broken.now.choices if other != id]
-                self._broken.save()
+            if id in self._record.now.choices:
+                self._record.now.choices = [other for other in self._record.now.choices if other != id]
+                self._record.save()
 
     def _release(self, part: Query) -> None:
         try:
@@ -416,6 +508,11 @@ class Choices(Manager):
         except (msgspec.ValidationError, ConfigError, LoadFailed):
             return []
 
+    def _allowed_now(self, id: str, held: Held) -> list[Alternative]:
+        """Return what a choice allows now, the best first, and what was chosen by hand before all. With the lock."""
+        by_key = {one.key: one for one in self._offers.allowed_now(held.request)}
+        return [by_key[key] for key in first(self._by_hand.key(id), [*by_key])]
+
     def _in_turn(
         self, best: Sequence[Alternative], without: Collection[str], loaded: Collection[str] = ()
     ) -> list[Alternative]:
@@ -423,7 +520,7 @@ class Choices(Manager):
         by_key = {one.key: one for one in best}
         return [by_key[key] for key in order]
 
-    def _not_loaded(self, search: _Search, one: Alternative, error: Exception) -> None:
+    def _not_loaded(self, search: ChoiceSearch, one: Alternative, error: Exception) -> None:
         """Note that an alternative cannot be loaded. Only a fault of its own lowers its reliability, and once."""
         is_own = is_own_fault(error)
         counts = self._trials.failed(one.key, began=search.decided_at, is_own=is_own)
@@ -437,10 +534,10 @@ class Choices(Manager):
     # -- for the trials --------------------------------------------------------------------------------------------
 
     def _choices(self) -> dict[str, Choice]:
-        return {id: self._choice(held) for id, held in self._held.items()}
+        return {id: self._choice(id, held) for id, held in self._held.items()}
 
-    def _choice(self, held: Held) -> Choice:
-        allowed = self._offers.allowed_now(held.request)
+    def _choice(self, id: str, held: Held) -> Choice:
+        allowed = self._allowed_now(id, held)
         present = self._in_use(held)
         breaks = present is not None and present.break_first
         fixed = frozenset(one.key for one in allowed if breaks or one.break_first)
@@ -451,7 +548,7 @@ class Choices(Manager):
         one = self._offers.find(key)
         if one is None:
             raise UnknownServer(f"{key}: its server is not there any more", server=key, known=())
-        server, request, limit_s = _loading(one)
+        server, request, limit_s = loading_of(one)
         trial = begin_planned(self.registrar, server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
         return trial.get()
 
@@ -462,10 +559,15 @@ class Choices(Manager):
             if held is None or held.moving:
                 return
             held.moving = True
+        self._tell(id, held, _TAKE + key)
+
+    def _tell(self, id: str, held: Held, what: str) -> None:
+        """Tell a choice of this manager what to do, in its status callback."""
+        held.moving = True
         try:
-            self.registrar.send_status(id, Status(State.UPDATE, _TAKE + key))
+            self.registrar.send_status(id, Status(State.UPDATE, what))
         except RrError as error:
-            logger.info("%s: does not return to %s: %s", held.request.kind, key, error)
+            logger.info("%s: %s, and cannot: %s", held.request.kind, what, error)
             held.moving = False
 
     # -- what is known ---------------------------------------------------------------------------------------------
@@ -475,6 +577,7 @@ class Choices(Manager):
         with self._changed:
             self._held.pop(id, None)
             self._mend(id)
+            self._by_hand.keep_only(self._held)
         if self._trials.standings():
             self._trials.look()
 
@@ -497,17 +600,9 @@ class Choices(Manager):
         return Addresses(self.registrar.directory, self._relay_hosts)
 
     @functools.cached_property
-    def _broken(self) -> KeptRecord[_Broken]:
-        return KeptRecord(self.registrar.directory / "choices.json", _Broken)
+    def _by_hand(self) -> ChosenByHand:
+        return ChosenByHand(self._record)
 
-
-def _loading(one: Alternative) -> Loading:
-    return Loading(one.server, NO_FIELDS if one.request is None else one.request, one.timeout_s)
-
-
-def _key(one: Alternative) -> str:
-    return one.key
-
-
-def _breaks_first(one: Alternative) -> bool:
-    return one.break_first
+    @functools.cached_property
+    def _record(self) -> KeptRecord[ChoicesRecord]:
+        return KeptRecord(self.registrar.directory / "choices.json", ChoicesRecord)

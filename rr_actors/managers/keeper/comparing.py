@@ -22,6 +22,7 @@ FAILING = "failing"
 ALL_FAILING = "all failing"
 LOADING = "loading"
 UNLOAD_FAILED = "unload failed"
+NO_READING = "no reading"
 _HINDERED = (NONE_REGISTERED, OVER_CAPACITY, FAILING, ALL_FAILING, UNLOAD_FAILED)
 
 
@@ -97,7 +98,8 @@ class Report(msgspec.Struct, frozen=True):
     """How one kind of thing is: how many replicas are wanted and ready, and why others are not.
 
     `why` is "" if all are ready; `detail` is the text of the first failure. `is_hindered`: a failure is the reason, and
-    not only that time has to pass.
+    not only that time has to pass. `least`, `most`: of what scales, how many may be wanted; `scaled`: the reason of the
+    last change of that.
     """
 
     name: str
@@ -106,6 +108,9 @@ class Report(msgspec.Struct, frozen=True):
     why: str = ""
     detail: str = ""
     is_hindered: bool = False
+    least: int | None = None
+    most: int | None = None
+    scaled: str = ""
 
 
 def compare(wanted: Sequence[Wanted], seen: Iterable[Seen], failures: Mapping[Slot, Setback], now: float) -> Steps:

@@ -10,6 +10,17 @@ A file has a table for each kind of thing that is kept::
     priority = 5
     after = ["power"]                    # loaded when all replicas of these are ready
 
+    [[keep]]
+    name = "worker"
+    server = "workers/worker"
+    request = "{instance}"
+    min = 1                              # as many as `scale_on` says; see scaling.py
+    max = 8
+
+    [keep.scale_on]
+    usage = "cpu"
+    target = 0.7
+
     [[group]]                            # "keeper/group" loads all of its members, in this order
     name = "navigation"
 
@@ -22,6 +33,7 @@ from __future__ import annotations
 
 import graphlib
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, cast
 
 import msgspec
@@ -30,11 +42,15 @@ from rr_actors.base.errors import ConfigError, InvalidName, did_you_mean, few, s
 from rr_actors.base.names import parse_server_id
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.base.values.canonical import encode
+from rr_actors.managers.keeper import scaling
 from rr_actors.managers.keeper.comparing import Wanted
+from rr_actors.managers.keeper.scaling import Range, ScaleOn
+from rr_actors.managers.planning.probes import NoProbe, probe_of
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 
 INSTANCE = "{instance}"
 MOST_REPLICAS = 10_000
+NO_COUNTS: Mapping[str, int] = MappingProxyType({})
 Request = Any
 """A request of any server: plain data, as TOML has it. None: the server's request with all of its defaults."""
 
@@ -47,6 +63,8 @@ class Keep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         server: "registrar/server".
         request: its texts may contain {instance}, the number of the replica.
         replicas: how many are wanted, from 0.
+        min, max, scale_on: how many are wanted at least and at most, and what decides between them. Without `min` it is
+            1. Where these are given, `replicas` is not.
         priority: of each replica, from -1000 to 1000.
         standby: whether the replicas are held on standby, without a priority.
         after: names of what must be ready before a replica is loaded. What is loaded already stays.
@@ -59,6 +77,21 @@ class Keep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     priority: int = 0
     standby: bool = False
     after: tuple[str, ...] = ()
+    min: int | None = None
+    max: int | None = None
+    scale_on: ScaleOn | None = None
+
+    @property
+    def range_(self) -> Range | None:
+        """Within which the number of replicas changes; None: it is fixed."""
+        if self.scale_on is None or self.max is None:
+            return None
+        return Range(1 if self.min is None else self.min, self.max, self.scale_on)
+
+    @property
+    def least(self) -> int:
+        """How many replicas there are at least."""
+        return self.replicas if self.range_ is None else self.range_.least
 
 
 class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,12 +135,17 @@ class Desired(msgspec.Struct, frozen=True):
     keeps: dict[str, Keep] = {}
     groups: dict[str, Group] = {}
 
-    def replicas(self, group_server: str) -> list[tuple[Wanted, Replica]]:
-        """Return all replicas that are wanted; `group_server` is the id of the server of groups."""
+    def replicas(self, group_server: str, counts: Mapping[str, int] = NO_COUNTS) -> list[tuple[Wanted, Replica]]:
+        """Return all replicas that are wanted.
+
+        Args:
+            group_server: the id of the server of groups.
+            counts: how many are wanted of what scales, by its name. Without, the least.
+        """
         found: list[tuple[Wanted, Replica]] = []
         for keep in self.keeps.values():
             priority = None if keep.standby else keep.priority
-            for i in range(keep.replicas):
+            for i in range(counts.get(keep.name, keep.least)):
                 request = numbered(keep.request, i)
                 members = self.members(request, group_server) if keep.server == group_server else ()
                 replica = Replica(keep.name, i, keep.server, request, members)
@@ -175,19 +213,45 @@ class _Checks:
             seen.add(name)
 
     def keep(self, key: str, keep: Keep) -> None:
-        replicas = min(max(keep.replicas, 1), MOST_REPLICAS)
+        most = keep.replicas if keep.max is None else keep.max
+        replicas = min(max(most, 1), MOST_REPLICAS)
         self.loads(key, keep.server, [numbered(keep.request, i) for i in range(replicas)])
         self._within(f"{key}.replicas", keep.replicas, 0, MOST_REPLICAS)
+        self._scale(key, keep)
         self._within(f"{key}.priority", keep.priority, LOWEST, HIGHEST)
         if keep.standby and keep.priority:
             self._wrong(f"{key}.priority", "none, as what is on standby has no priority", keep.priority)
-        if keep.replicas > 1 and numbered(keep.request, 0) == keep.request:
-            expected = f"a request with {INSTANCE}, so that the {keep.replicas} replicas differ"
+        if most > 1 and numbered(keep.request, 0) == keep.request:
+            expected = f"a request with {INSTANCE}, so that the {most} replicas differ"
             self._wrong(f"{key}.request", expected, keep.request)
         for i, name in enumerate(keep.after):
             if name not in self._keeps:
                 said = f"{shown(name)}{did_you_mean(name, self._keeps)}"
                 self._wrong(f"{key}.after[{i}]", f"one of {few(self._keeps)}", name, said)
+
+    def _scale(self, key: str, keep: Keep) -> None:
+        """Check what decides how many replicas there are."""
+        on = keep.scale_on
+        if on is None:
+            for field, limit in (("min", keep.min), ("max", keep.max)):
+                if limit is not None:
+                    self._wrong(f"{key}.{field}", "none without scale_on", limit)
+            return
+        if keep.max is None:
+            self._wrong(f"{key}.max", "how many replicas there are at most, as scale_on decides", None)
+        else:
+            self._within(f"{key}.max", keep.max, 1, MOST_REPLICAS)
+            least = 1 if on.usage else 0  # where there is none, no usage says that one is needed
+            self._within(f"{key}.min", 1 if keep.min is None else keep.min, least, max(keep.max, 1))
+        if keep.replicas != 1:
+            self._wrong(f"{key}.replicas", "none, as scale_on decides", keep.replicas)
+        for field, expected in scaling.faults(on):
+            self._wrong(f"{key}.scale_on.{field}", expected, getattr(on, field))
+        if on.probe is not None:
+            try:
+                probe_of(on.probe)
+            except NoProbe as error:
+                self._wrong(f"{key}.scale_on.probe", error.expected, on.probe, error.found)
 
     def loads(self, key: str, server: str, requests: Sequence[Request]) -> None:
         """Check what a table loads; of a group, that there is one."""

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import os
 import time
+from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from typing import Any
 
@@ -36,6 +37,8 @@ from rr_actors.base.values.canonical import encode
 from rr_actors.managers.keeper import comparing
 from rr_actors.managers.keeper.comparing import Report, Seen, Slot, Steps, Wanted
 from rr_actors.managers.keeper.desired import Desired, Replica, Request, changes, parse_desired
+from rr_actors.managers.keeper.scaler import KeptScales, Scaler
+from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.last_good import LastGood, Sources, one_file, path_of
 from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
 from rr_actors.managers.planning.setbacks import BACKOFF, Setbacks
@@ -43,8 +46,9 @@ from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import Phase, State
 from rr_actors.registrar.queries import Query, ResourceInfo, Status
-from rr_actors.registrar.registrar import NO_FIELDS
+from rr_actors.registrar.registrar import NO_FIELDS, Registrar
 from rr_actors.supervision.core.specs import Backoff
+from rr_actors.system.registrar_lookup import registrar_in
 
 logger = Log("rr_actors.managers.keeper")
 
@@ -55,20 +59,26 @@ _GROUP_CHANGED = "the group has other members by now: load it anew"
 _PART_S = 5.0  # so long the release of a replica waits for that of its part; if it takes longer, it is owed
 
 
-class Kept(msgspec.Struct, frozen=True):
+class Kept(msgspec.Struct, frozen=True, repr_omit_defaults=True):
     """The response: how what is kept under a name is. It changes with each UPDATE.
 
     Attributes:
         name: the name in the file.
         wanted, ready: how many replicas.
         why: why others are not ready: "none registered", "over capacity", "failing", "all failing", "waits for NAME",
-            "loading", "unload failed", or several of them; "" if all are.
+            "loading", "unload failed", or several of them; "" if all are. "no reading": what decides how many there are
+            cannot be read, so that number stays.
+        min, max: how many replicas may be wanted; None: the number is fixed.
+        scaled: the reason of the last change of `wanted`, "2 -> 3: cpu is 0.93, the target 0.7".
     """
 
     name: str
     wanted: int
     ready: int
     why: str = ""
+    min: int | None = None
+    max: int | None = None
+    scaled: str = ""
 
 
 class Keeper(Manager):
@@ -92,6 +102,8 @@ class Keeper(Manager):
         self._group_server = f"{name}/group"
         self._configuration = LastGood(beginning, lambda: one_file(path), self._parse)
         self._loop: PlanningLoop[Slot | str, Wanted | None] = PlanningLoop("keeper", self._look, self._failed)
+        record = None if beginning is None else KeptRecord(beginning.directory / "scales.json", KeptScales)
+        self._scaler = Scaler(self._loop, record, self._parts_of, self._registrar_of)
         self._backoff = backoff
         self._failures: Setbacks[Slot] = Setbacks(backoff)
         self._not_before: dict[str, float] = {}
@@ -103,7 +115,7 @@ class Keeper(Manager):
         self._lost: set[str] = set()
         self._is_full = False  # something of the last look could not be written
         self._what: dict[str, bytes] = {}  # by query, as its replica does not change
-        self._wanted: tuple[Desired, list[tuple[Wanted, Replica]]] | None = None
+        self._wanted: tuple[Desired, dict[str, int], list[tuple[Wanted, Replica]]] | None = None
         self._reports: dict[str, Report] | None = None
 
     def on_start(self) -> None:
@@ -220,25 +232,35 @@ class Keeper(Manager):
         """Compare once, and begin the steps; return when to look again, None if all is well."""
         desired = self._desired
         infos = self.registrar.resources()
-        if self._wanted is None or self._wanted[0] is not desired:
-            self._wanted = desired, desired.replicas(self._group_server)
-            self._tell_groups(infos, desired)
-        replicas = self._wanted[1]
-        wanted, requests = [one for one, _ in replicas], {one.slot: replica for one, replica in replicas}
         seen = list(self._seen(infos, now))
+        held = Counter(one.keep for one in seen if one.phase == "held")
+        counts = self._scaler.counts(desired.keeps.values(), held, now)
+        if self._wanted is None or self._wanted[0] is not desired:
+            self._tell_groups(infos, desired)
+        if self._wanted is None or self._wanted[0] is not desired or self._wanted[1] != counts:
+            self._wanted = desired, counts, desired.replicas(self._group_server, counts)
+        replicas = self._wanted[2]
+        wanted, requests = [one for one, _ in replicas], {one.slot: replica for one, replica in replicas}
         self._failures.keep_only(requests)
         self._note_losses(seen, now)
         steps = comparing.compare(wanted, seen, self._failures, now)
         self._is_full = False
         self._carry_out(steps, requests)
-        self._reports = reports = comparing.report(desired.keeps, wanted, seen, self._failures)
+        ready: dict[str, list[str]] = {}
+        for one in seen:
+            if one.is_ready:
+                ready.setdefault(one.keep, []).append(one.id)
+        read_at = self._scaler.begin(ready, now)
+        found = comparing.report(desired.keeps, wanted, seen, self._failures)
+        self._reports = reports = {name: self._scaler.told(name, one) for name, one in found.items()}
         self._tell(infos, reports)
+        times = [time_ for time_ in (steps.next_at, read_at) if time_ is not None]
         if any(info.server == "kept" and info.phase is Phase.LOADING for info in infos):
-            return now + _SOON_S
-        if steps.next_at is not None:
-            return min(now + _LOOK_S, steps.next_at)
+            times.append(now + _SOON_S)
         is_behind = self._is_full or bool(steps.release) or any(one.why for one in reports.values())
-        return now + _LOOK_S if is_behind or any(isinstance(key, str) for key in self._loop.in_flight) else None
+        if steps.next_at is not None or is_behind or any(isinstance(key, str) for key in self._loop.in_flight):
+            times.append(now + _LOOK_S)
+        return min(times, default=None)
 
     # -- what is there ---------------------------------------------------------------------------------------------
 
@@ -306,7 +328,7 @@ class Keeper(Manager):
             self._loop.withdraw(one.slot)
         for one in steps.release:
             if one.state is State.FATAL or self._mark_lost(one):
-                self._release(one, self._parts(one))
+                self._release(one, [part.id for part in reversed(self._parts_of(one.id))])
         for one, priority in steps.prioritise:
             with self._unless_full(), contextlib.suppress(UsageError):  # gone, or the registrar has a `max_priority`
                 self.registrar.set_priority(one.id, priority)
@@ -335,12 +357,15 @@ class Keeper(Manager):
             return True
         return False
 
-    def _parts(self, one: Seen) -> list[str]:
-        """Return the queries of a replica's parts, the last of them first."""
+    def _parts_of(self, id: str) -> list[Query]:
+        """Return a replica's parts, in their order."""
         try:
-            return [part.id for part in reversed(self.registrar.children(one.id))]
+            return self.registrar.children(id)
         except UnknownQuery:  # it has just gone
             return []
+
+    def _registrar_of(self, name: str) -> Registrar:
+        return registrar_in(self._node, name, patient=False, owner=self)
 
     def _release(self, one: Seen, parts: Sequence[str]) -> None:
         """Release a replica after its parts. If one cannot be unloaded, it may be running still, and stays a part."""
@@ -434,7 +459,7 @@ def _reason_of(error: BaseException) -> str:
 
 
 def _kept(report: Report) -> Kept:
-    return Kept(report.name, report.wanted, report.ready, report.why)
+    return Kept(report.name, report.wanted, report.ready, report.why, report.least, report.most, report.scaled)
 
 
 def _said(report: Report) -> str:

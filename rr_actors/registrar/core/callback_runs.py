@@ -266,3 +266,18 @@ def refusal_over(decision: Decision, over: RefusalOver) -> None:
         decision.cause(SetTimer(run.id, refused_for_s(run.deaths), RefusalOver(run.id)))
     else:
         decision.drop(run)
+
+
+# -- what waits until on_start has returned ----------------------------------------------------------------------------
+
+MOVE, LEAVE, RELOAD, REST = "move", "leave", "reload", "rest"
+"""How a resource goes on when on_start has returned."""
+
+
+def waits_for_start(decision: Decision, resource: Resource, what: str) -> bool:
+    """Return whether on_start has not returned yet; the resource then goes on with `what` when it has."""
+    if "" not in decision.catalog.early:
+        return False
+    if resource.id not in decision.catalog.early:
+        decision.note(decision.catalog.early, resource.id, what)
+    return True

@@ -115,9 +115,10 @@ _ENDS: dict[str, Callable[[Decision, c.CallbackEnded], None]] = {
     "load": loading.load_ended,
     "unload": _unload_ended,
     "recover": recovery.recover_ended,
+    "reload": recovery.reload_ended,
     "status": status_delivery.status_ended,
-    "pause": recovery.pause_ended,
-    "resume": recovery.resume_ended,
+    "pause": loading.pause_ended,
+    "resume": loading.resume_ended,
     "health": recovery.run_ended,
     "usage": recovery.run_ended,
 }
@@ -149,6 +150,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.SetResponse: status_changes.set_response,
     c.Swap: status_changes.swap,
     c.ForceUnload: unloading.force_unload,
+    c.Reload: loading.reload,
     c.Revoke: status_changes.revoke,
     c.GraceOver: unloading.grace_over,
     c.AskProvider: holding.ask,
@@ -196,6 +198,7 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure
                 | c.SetResponse()
                 | c.Swap()
                 | c.ForceUnload()
+                | c.Reload()
                 | c.Revoke()
                 | c.Unregister()
                 | c.SetPriority()

@@ -1,4 +1,4 @@
-"""The decisions of a provider about loads.
+"""The decisions of a provider about loads and reloads, and about the ends of pauses and resumptions.
 
 A resource's life, by phase::
 
@@ -19,10 +19,13 @@ from msgspec.structs import replace
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core.callback_runs import (
     acquit,
+    awaits_trial,
     end_limit,
     end_trial,
     forget_request,
     limit_load,
+    note_begun,
+    note_ended,
     refused_for_s,
     request_id,
     run_id,
@@ -33,13 +36,22 @@ from rr_actors.registrar.core.holding import break_ring
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
 from rr_actors.registrar.core.priorities import touch
 from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, withdraw
-from rr_actors.registrar.core.status_changes import is_busy
+from rr_actors.registrar.core.status_changes import is_busy, spread
 from rr_actors.registrar.core.status_delivery import start_deferred
-from rr_actors.registrar.core.unloading import answers_to_owners, balance, retire, settle
+from rr_actors.registrar.core.unloading import (
+    answer_wholes,
+    answers_to_owners,
+    balance,
+    begin_unload,
+    refuse_waiting,
+    retire,
+    settle,
+    stop_waiting,
+)
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog, Decision
-from rr_actors.registrar.model.commands import CallbackEnded, CallbackOverdue
-from rr_actors.registrar.model.effects import Effect, Happened, SendReply, SetTimer
+from rr_actors.registrar.model.catalog import Catalog, Decision, Server
+from rr_actors.registrar.model.commands import CallbackEnded, CallbackOverdue, Reload
+from rr_actors.registrar.model.effects import AnswerCall, Effect, Happened, SendReply, SetTimer, StartCallback
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.registrar.model.rows import (
     LOADED,
@@ -50,8 +62,10 @@ from rr_actors.registrar.model.rows import (
     PENDING,
     QUEUED,
     RESTING,
+    RESUMING,
     STANDBY,
     UNLOADING,
+    CallbackRun,
     Resource,
     ServedQuery,
     State,
@@ -340,3 +354,202 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
         held = catalog.held[held_id]
         if held.hold is PENDING:
             decision.request(held.registrar, Probe(held.id, message.waiter, message.blocked, ring))
+
+
+# -- reloads: a resource is loaded again for the same request, and its holders keep it ---------------------------------
+#
+# After a crash a server with recovery="reload" has its resources loaded again, by its load callback. On demand, the
+# unload callback runs before (role "reload"). Then the parts of the last load are released, as they are when a resource
+# is unloaded: some, like shares of a budget, cannot be there twice. The load callback asks for them again. Meanwhile
+# the resource is in `recovering`: loads and unloads of it wait.
+#
+# On disk, a row "reload:ID" of callback_runs says that a reload on demand has begun. When the unload callback has
+# returned, a row "recover:ID" is beside it. After a crash, the reload goes on with the callback that was interrupted.
+
+
+def reload(decision: Decision, command: Reload) -> None:
+    """Begin to reload a resource on demand; answer the owner when it is loaded again."""
+    catalog = decision.catalog
+    resource = catalog.find(command.target)
+    if resource is None:
+        decision.cause(AnswerCall(command.ticket, failures.unknown_target(catalog, command.target)))
+    elif why := _why_not(catalog, resource):
+        decision.cause(AnswerCall(command.ticket, failures.not_reloaded(catalog, resource, why)))
+    else:
+        stop_waiting(decision, resource)
+        decision.forget(catalog.early, resource.id)
+        decision.note(catalog.recovering, resource.id, ())
+        decision.note(catalog.reloads, resource.id, command.ticket)
+        if resource.phase is PAUSED:
+            resource = replace(resource, phase=LOADED)
+            decision.put(resource)
+        decision.cause(Happened("reloading", resource, "", kept=True))
+        run_unload_first(decision, resource)
+
+
+def _why_not(catalog: Catalog, resource: Resource) -> str:
+    """Return why a resource cannot be reloaded now; "" if it can."""
+    if is_reloaded(catalog, resource.id):
+        return "is being reloaded already"
+    if resource.id in catalog.recovering:
+        return "is recovering"
+    if resource.id in catalog.revocations:
+        return "is revoked"
+    if resource.phase not in (LOADED, PAUSED):
+        return f"is {resource.phase}"
+    if resource.phase is PAUSED and catalog.priority_of(resource.id) > STANDBY:
+        return "is about to be resumed"
+    if resource.state is State.FATAL:
+        return "is FATAL: its holders have heard that it is lost; release it, and load it anew"
+    if resource.server not in catalog.servers:
+        return failures.waits_for_server(catalog, resource)
+    if resource.server in catalog.leaving:
+        return "is being unloaded, with its server"
+    return "will be unloaded, as its registrar is being closed" if catalog.shut else ""
+
+
+def is_reloaded(catalog: Catalog, resource_id: str) -> bool:
+    """Return whether a reload of the resource has begun on demand, and has not ended."""
+    return bool(catalog.callback_runs) and run_id("reload", resource_id) in catalog.callback_runs
+
+
+def recover_in_turn(decision: Decision, resource: Resource, server: Server) -> None:
+    """Run the callback that the recovery or reload of a resource goes on with, unless it has to wait for its turn."""
+    role = _role_of(decision.catalog, resource.id)
+    if awaits_trial(decision, role, resource.id):
+        return
+    if role == "reload":
+        run_unload_first(decision, resource)
+    else:
+        run_recover(decision, resource, server)
+
+
+def _role_of(catalog: Catalog, resource_id: str) -> str:
+    run = catalog.callback_runs.get(run_id("reload", resource_id))
+    return "recover" if run is None or run_id("recover", resource_id) in catalog.callback_runs else "reload"
+
+
+def run_unload_first(decision: Decision, resource: Resource) -> None:
+    """Run the unload callback of a resource that is reloaded."""
+    note_begun(decision, "reload", resource.id)
+    decision.cause(StartCallback("reload", resource))
+
+
+def end_unload_first(decision: Decision, resource_id: str) -> None:
+    """Write that the unload callback of a resource that is reloaded has ended; the row of the reload stays."""
+    id = run_id("reload", resource_id)
+    acquit(decision, id)
+    end_trial(decision, id)
+    decision.put(CallbackRun(id))
+
+
+def run_recover(decision: Decision, resource: Resource, server: Server) -> None:
+    """Run the recover callback; without one, load the resource again, when the parts of its last load are released."""
+    note_begun(decision, "recover", resource.id)
+    if server.has_recover and not is_reloaded(decision.catalog, resource.id):
+        decision.cause(StartCallback("recover", resource))
+    else:
+        resource = replace(resource, attempt=resource.attempt + 1, phase=LOADED)
+        decision.put(resource)
+        again = StartCallback("recover", resource, reload=True)
+        release_parts(decision, resource.id, (again,), keep_attempt=resource.attempt)
+    if server.recover_timeout_s is not None:
+        failure = failures.recover_overdue(decision.catalog, resource, server.recover_timeout_s)
+        overdue = CallbackOverdue("recover", resource.id, resource.attempt, failure)
+        decision.cause(SetTimer("recover:" + resource.id, server.recover_timeout_s, overdue))
+
+
+def end_reload(decision: Decision, resource_id: str, failure: Failure | None) -> None:
+    """Write that a reload on demand has ended, if there is one, and answer the owner."""
+    run = decision.catalog.callback_runs.get(run_id("reload", resource_id))
+    if run is not None:
+        decision.drop(run)
+    ticket = decision.forget(decision.catalog.reloads, resource_id)
+    if ticket is not None:
+        decision.cause(AnswerCall(ticket, failure))
+
+
+# -- the ends of pauses and resumptions; unloading.py has how they begin -----------------------------------------------
+
+
+def pause_ended(decision: Decision, ended: CallbackEnded) -> None:
+    """Note that the resource is paused; it is resumed if it is needed by now. If the callback raised, it runs on.
+
+    An idle one that nobody holds is unloaded then; one on standby is not paused again before it was needed once.
+    """
+    resource = running(decision.catalog, ended.resource_id, PAUSING, ended.run)
+    if resource is None:
+        return
+    note_ended(decision, "pause", resource.id)
+    if ended.failure is not None:
+        decision.cause(Happened("pause_failed", resource, ended.failure.message, kept=True))
+        runs_on(decision, resource)
+        return
+    touch(decision, resource.id)
+    resource = replace(resource, phase=PAUSED)
+    decision.put(resource)
+    decision.cause(Happened("paused", resource, ""))
+    if resource.id not in decision.catalog.holders:
+        retire(decision, resource)
+    else:
+        _answer_owners(decision, resource)
+
+
+def runs_on(decision: Decision, resource: Resource) -> None:
+    """Let a resource run on that could not be paused."""
+    catalog = decision.catalog
+    resource = replace(resource, phase=LOADED)
+    decision.put(resource)
+    decision.note(catalog.idle, resource.id, True)  # no timer is set before it was needed
+    _answer_loads(decision, resource)
+    if resource.id not in catalog.holders:
+        begin_unload(decision, resource)
+
+
+def resume_ended(decision: Decision, ended: CallbackEnded) -> None:
+    """Answer all that wait for a resource that runs again; one that could not be resumed is lost."""
+    catalog = decision.catalog
+    resource = running(catalog, ended.resource_id, RESUMING, ended.run)
+    if resource is None:
+        return
+    note_ended(decision, "resume", resource.id)
+    if ended.failure is not None:
+        not_resumed(decision, resource, ended.event, ended.failure)
+        return
+    touch(decision, resource.id)
+    resource = replace(resource, phase=LOADED)
+    decision.put(resource)
+    decision.cause(Happened("resumed", resource, ""))
+    if ended.response is not None and ended.response != resource.response:
+        source = catalog.origin_of(resource)
+        spread(decision, resource, ended.event, State.UPDATE, "resumed with a new response", source, ended.response)
+        resource = catalog.resources[resource.id]
+    _answer_loads(decision, resource)
+    if resource.id not in catalog.holders:
+        retire(decision, resource)
+
+
+def _answer_loads(decision: Decision, resource: Resource) -> None:
+    catalog = decision.catalog
+    for query in catalog.queries_of(resource.id):
+        if decision.forget(catalog.waiting, query.id) is not None:
+            decision.cause(SendReply(query.origin, loaded(catalog, query.id, resource)))
+    answer_wholes(decision, resource)
+    _answer_owners(decision, resource)
+
+
+def _answer_owners(decision: Decision, resource: Resource) -> None:
+    """Answer an owner who has unloaded the resource: who holds it came after that, unless it is revoked."""
+    catalog = decision.catalog
+    if resource.id in catalog.holders and resource.id not in catalog.revocations:
+        decision.effects += answers_to_owners(decision, resource, None)
+
+
+def not_resumed(decision: Decision, resource: Resource, event: str, failure: Failure) -> None:
+    """Refuse the loads that wait for a resource, and send its other holders a FATAL status."""
+    catalog = decision.catalog
+    resource = replace(resource, phase=LOADED)
+    decision.put(resource)
+    refuse_waiting(decision, resource, failure)
+    _answer_loads(decision, resource)
+    spread(decision, resource, event, State.FATAL, failure.message, catalog.origin_of(resource))

@@ -11,12 +11,18 @@ An interrupted load whose resource nobody holds any more does not run again. Its
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from msgspec.structs import replace
 
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.callback_runs import (
     ATTEMPTS,
+    LEAVE,
+    MOVE,
+    RELOAD,
+    REST,
     awaits_trial,
     deaths_of,
     deaths_of_load,
@@ -30,24 +36,30 @@ from rr_actors.registrar.core.callback_runs import (
     note_ended,
     refuse_for_a_while,
     run_id,
-    running,
     start_load,
     start_queued,
+    waits_for_start,
 )
-from rr_actors.registrar.core.loading import load, loaded
+from rr_actors.registrar.core.loading import (
+    end_reload,
+    end_unload_first,
+    is_reloaded,
+    load,
+    not_resumed,
+    recover_in_turn,
+    run_recover,
+    run_unload_first,
+    runs_on,
+)
 from rr_actors.registrar.core.notices import refuse_all
-from rr_actors.registrar.core.priorities import touch
-from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.core.status_changes import is_busy, limit_grace, spread, start_own
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import (
-    answer_wholes,
-    answers_to_owners,
     balance,
     begin_unload,
     condemned,
     go_on,
-    refuse_waiting,
+    remove,
     retire,
     run_unload,
     unheld,
@@ -67,7 +79,7 @@ from rr_actors.registrar.model.commands import (
     TrialOver,
     Unregister,
 )
-from rr_actors.registrar.model.effects import Acquitted, Died, Happened, SendReply, SetTimer, StartCallback
+from rr_actors.registrar.model.effects import Acquitted, Died, SetTimer, StartCallback
 from rr_actors.registrar.model.messages import Load, Unload
 from rr_actors.registrar.model.rows import (
     NOT_BEGUN,
@@ -192,7 +204,7 @@ def register(decision: Decision, command: Register) -> None:
             continue
         match resource.phase:
             case Phase.LOADING | Phase.QUEUED | Phase.UNLOADING:
-                if not _waits_for_start(decision, resource, _MOVE):
+                if not waits_for_start(decision, resource, MOVE):
                     _move_again(decision, resource)
             case Phase.UNLOAD_FAILED:
                 pass
@@ -218,17 +230,6 @@ def _move_again(decision: Decision, resource: Resource) -> None:
 
 
 # -- what waits until on_start has returned ----------------------------------------------------------------------------
-
-_MOVE, _LEAVE, _RELOAD, _REST = "move", "leave", "reload", "rest"
-
-
-def _waits_for_start(decision: Decision, resource: Resource, what: str) -> bool:
-    """Return whether on_start has not returned yet; the resource then goes on with `what` when it has."""
-    if "" not in decision.catalog.early:
-        return False
-    if resource.id not in decision.catalog.early:
-        decision.note(decision.catalog.early, resource.id, what)
-    return True
 
 
 def begin_serving(decision: Decision, command: BeginServing) -> None:
@@ -271,11 +272,11 @@ def _begin_early(decision: Decision, resource_id: str, event: str) -> None:
     server = None if resource is None else catalog.servers.get(resource.server)
     if what is None or resource is None or server is None:
         return
-    if what == _RELOAD and resource_id in catalog.recovering:
-        _recover_in_turn(decision, resource, server)
-    elif what == _MOVE and resource.phase in (Phase.LOADING, Phase.QUEUED, Phase.UNLOADING):
+    if what == RELOAD and resource_id in catalog.recovering:
+        recover_in_turn(decision, resource, server)
+    elif what == MOVE and resource.phase in (Phase.LOADING, Phase.QUEUED, Phase.UNLOADING):
         _move_again(decision, resource)
-    elif what == _LEAVE and resource.id not in catalog.holders:
+    elif what == LEAVE and resource.id not in catalog.holders:
         _leave(decision, resource, server)
     elif resource.id not in catalog.recovering:
         _rest(decision, resource, event)
@@ -355,49 +356,50 @@ def _to_recover(catalog: Catalog, server: Server) -> list[Resource]:
 def _recover(decision: Decision, resource: Resource, server: Server, event: str) -> None:
     has_recover, policy = server.has_recover, server.recovery
     if resource.id not in decision.catalog.holders:
-        if not _waits_for_start(decision, resource, _LEAVE):
+        if not waits_for_start(decision, resource, LEAVE):
             _leave(decision, resource, server)
     elif resource.state is State.FATAL:
         return  # parts of an interrupted reload stay with it until its holders release it
     elif role := next((it for it in ("recover", "health") if is_given_up(decision.catalog, it, resource.id)), None):
         why = failures.not_run_again(decision.catalog, resource, role, deaths_of(decision.catalog, role, resource.id))
         spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
+    elif is_reloaded(decision.catalog, resource.id):
+        _reload_again(decision, resource, server, event)
     elif has_recover or policy == "reload":
         decision.note(decision.catalog.recovering, resource.id, ())
-        if has_recover or not _waits_for_start(decision, resource, _RELOAD):
-            _recover_in_turn(decision, resource, server)
+        if has_recover or not waits_for_start(decision, resource, RELOAD):
+            recover_in_turn(decision, resource, server)
     elif policy == "lost":
         why = "lost: its manager was restarted"
         spread(decision, resource, event, State.FATAL, why, decision.catalog.origin_of(resource))
 
 
+def _reload_again(decision: Decision, resource: Resource, server: Server, event: str) -> None:
+    """Go on with a reload that a crash has interrupted, unless three processes have died in its unload callback.
+
+    Then it is recovered as after any crash. If it is only kept, it may be unloaded in part: its holders hear ERROR.
+    """
+    catalog = decision.catalog
+    deaths = deaths_of(catalog, "reload", resource.id)
+    if deaths < ATTEMPTS:
+        decision.note(catalog.recovering, resource.id, ())
+        if not waits_for_start(decision, resource, RELOAD):
+            recover_in_turn(decision, resource, server)
+        return
+    end_reload(decision, resource.id, None)
+    if server.has_recover or server.recovery != "keep":
+        _recover(decision, resource, server, event)
+    else:
+        why = failures.not_run_again(catalog, resource, "reload", deaths)
+        spread(decision, resource, event, State.ERROR, why, catalog.origin_of(resource))
+
+
 def _leave(decision: Decision, resource: Resource, server: Server) -> None:
     """Unload a resource that nobody holds. It may be lost, unless it is kept: then it is kept warm, too."""
-    if server.has_recover or server.recovery != "keep":
+    if server.has_recover or server.recovery != "keep" or is_reloaded(decision.catalog, resource.id):
         begin_unload(decision, resource)
     else:
         retire(decision, resource)
-
-
-def _recover_in_turn(decision: Decision, resource: Resource, server: Server) -> None:
-    if not awaits_trial(decision, "recover", resource.id):
-        _run_recover(decision, resource, server)
-
-
-def _run_recover(decision: Decision, resource: Resource, server: Server) -> None:
-    """Run the recover callback; without one, load the resource again, when the parts of its last load are released."""
-    note_begun(decision, "recover", resource.id)
-    if server.has_recover:
-        decision.cause(StartCallback("recover", resource))
-    else:
-        resource = replace(resource, attempt=resource.attempt + 1, phase=Phase.LOADED)
-        decision.put(resource)
-        again = StartCallback("recover", resource, reload=True)
-        release_parts(decision, resource.id, (again,), keep_attempt=resource.attempt)
-    if server.recover_timeout_s is not None:
-        failure = failures.recover_overdue(decision.catalog, resource, server.recover_timeout_s)
-        overdue = CallbackOverdue("recover", resource.id, resource.attempt, failure)
-        decision.cause(SetTimer("recover:" + resource.id, server.recover_timeout_s, overdue))
 
 
 # -- pauses ------------------------------------------------------------------------------------------------------------
@@ -407,11 +409,12 @@ def _rest_again(decision: Decision, resource: Resource, event: str) -> None:
     """Go on with a pause or resumption that a crash has interrupted, and with the time of an idle resource."""
     catalog = decision.catalog
     idles = resource.phase is Phase.LOADED and catalog.priority_of(resource.id) <= STANDBY
-    if (idles or resource.phase in RESTING) and not _waits_for_start(decision, resource, _REST):
+    if (idles or resource.phase in RESTING) and not waits_for_start(decision, resource, REST):
         _rest(decision, resource, event)
 
 
 def _rest(decision: Decision, resource: Resource, event: str) -> None:
+    """Do what _rest_again() does, as on_start has returned."""
     catalog = decision.catalog
     if resource.phase in (Phase.LOADED, PAUSED) and resource.id not in catalog.holders:
         retire(decision, resource)
@@ -423,94 +426,11 @@ def _rest(decision: Decision, resource: Resource, event: str) -> None:
             return
         why = failures.not_run_again(catalog, resource, role, deaths)
         if role == "pause":
-            _runs(decision, resource)
+            runs_on(decision, resource)
         else:
-            _not_resumed(decision, resource, event, Failure("LoadFailed", why, {}))
+            not_resumed(decision, resource, event, Failure("LoadFailed", why, {}))
     else:
         balance(decision, resource.id)
-
-
-def pause_ended(decision: Decision, ended: CallbackEnded) -> None:
-    """Note that the resource is paused; it is resumed if it is needed by now. If the callback raised, it runs on.
-
-    An idle one that nobody holds is unloaded then; one on standby is not paused again before it was needed once.
-    """
-    resource = running(decision.catalog, ended.resource_id, PAUSING, ended.run)
-    if resource is None:
-        return
-    note_ended(decision, "pause", resource.id)
-    if ended.failure is not None:
-        decision.cause(Happened("pause_failed", resource, ended.failure.message, kept=True))
-        _runs(decision, resource)
-        return
-    touch(decision, resource.id)
-    resource = replace(resource, phase=PAUSED)
-    decision.put(resource)
-    decision.cause(Happened("paused", resource, ""))
-    if resource.id not in decision.catalog.holders:
-        retire(decision, resource)
-    else:
-        _answer_owners(decision, resource)
-
-
-def _runs(decision: Decision, resource: Resource) -> None:
-    """Let a resource run on that could not be paused."""
-    catalog = decision.catalog
-    resource = replace(resource, phase=Phase.LOADED)
-    decision.put(resource)
-    decision.note(catalog.idle, resource.id, True)  # no timer is set before it was needed
-    _answer_loads(decision, resource)
-    if resource.id not in catalog.holders:
-        begin_unload(decision, resource)
-
-
-def resume_ended(decision: Decision, ended: CallbackEnded) -> None:
-    """Answer all that wait for a resource that runs again; one that could not be resumed is lost."""
-    catalog = decision.catalog
-    resource = running(catalog, ended.resource_id, RESUMING, ended.run)
-    if resource is None:
-        return
-    note_ended(decision, "resume", resource.id)
-    if ended.failure is not None:
-        _not_resumed(decision, resource, ended.event, ended.failure)
-        return
-    touch(decision, resource.id)
-    resource = replace(resource, phase=Phase.LOADED)
-    decision.put(resource)
-    decision.cause(Happened("resumed", resource, ""))
-    if ended.response is not None and ended.response != resource.response:
-        source = catalog.origin_of(resource)
-        spread(decision, resource, ended.event, State.UPDATE, "resumed with a new response", source, ended.response)
-        resource = catalog.resources[resource.id]
-    _answer_loads(decision, resource)
-    if resource.id not in catalog.holders:
-        retire(decision, resource)
-
-
-def _answer_loads(decision: Decision, resource: Resource) -> None:
-    catalog = decision.catalog
-    for query in catalog.queries_of(resource.id):
-        if decision.forget(catalog.waiting, query.id) is not None:
-            decision.cause(SendReply(query.origin, loaded(catalog, query.id, resource)))
-    answer_wholes(decision, resource)
-    _answer_owners(decision, resource)
-
-
-def _answer_owners(decision: Decision, resource: Resource) -> None:
-    """Answer an owner who has unloaded the resource: who holds it came after that, unless it is revoked."""
-    catalog = decision.catalog
-    if resource.id in catalog.holders and resource.id not in catalog.revocations:
-        decision.effects += answers_to_owners(decision, resource, None)
-
-
-def _not_resumed(decision: Decision, resource: Resource, event: str, failure: Failure) -> None:
-    """Refuse the loads that wait for a resource, and send its other holders a FATAL status."""
-    catalog = decision.catalog
-    resource = replace(resource, phase=Phase.LOADED)
-    decision.put(resource)
-    refuse_waiting(decision, resource, failure)
-    _answer_loads(decision, resource)
-    spread(decision, resource, event, State.FATAL, failure.message, catalog.origin_of(resource))
 
 
 # -- health and usage callbacks: the disk has their runs, as the process may die in them ------------------------------
@@ -557,8 +477,10 @@ def begin_trial(decision: Decision, command: BeginTrial) -> None:
             _interrupted(decision, resource)
         case "unload" if resource.phase is Phase.UNLOADING:
             run_unload(decision, resource)
+        case "reload" if id in catalog.recovering:
+            run_unload_first(decision, resource)
         case "recover" if id in catalog.recovering:
-            _run_recover(decision, resource, server)
+            run_recover(decision, resource, server)
         case "pause" | "resume" if resource.phase in (PAUSING, RESUMING):
             go_on(decision, resource)
         case "health" | "usage":
@@ -583,13 +505,38 @@ def recover_ended(decision: Decision, ended: CallbackEnded) -> None:
     resource = _asked_after(decision, ended.resource_id, ended.run)
     if resource is None:
         return
-    source = decision.catalog.origin_of(resource)
+    source, reloaded = decision.catalog.origin_of(resource), is_reloaded(decision.catalog, resource.id)
     if ended.failure is not None:
         spread(decision, resource, ended.event, State.FATAL, ended.failure.message, source)
-    elif ended.response is not None and ended.response != resource.response:
-        text = "recovered with a new response"
+    elif reloaded or (ended.response is not None and ended.response != resource.response):
+        text = "reloaded" if reloaded else "recovered with a new response"
         spread(decision, resource, ended.event, State.UPDATE, text, source, ended.response)
+    end_reload(decision, resource.id, ended.failure)
     _go_on(decision, resource.id)
+
+
+def reload_ended(decision: Decision, ended: CallbackEnded) -> None:
+    """Load a resource again whose unload callback has returned. If that raised, the resource stays, and is ERROR.
+
+    One that was taken from its holders meanwhile is gone: it is not loaded again.
+    """
+    catalog = decision.catalog
+    resource = _asked_after(decision, ended.resource_id, ended.run)
+    if resource is None:
+        return
+    end_unload_first(decision, resource.id)
+    if ended.failure is not None:
+        source = catalog.origin_of(resource)
+        spread(decision, resource, ended.event, State.ERROR, ended.failure.message, source)
+        end_reload(decision, resource.id, ended.failure)
+        _go_on(decision, resource.id)
+    elif condemned(decision, resource):
+        end_reload(decision, resource.id, failures.not_reloaded(catalog, resource, "was taken from its holders"))
+        parked = decision.forget(catalog.recovering, resource.id)
+        remove(decision, resource)
+        _decide_parked(decision, parked)
+    else:
+        run_recover(decision, resource, catalog.servers[resource.server])
 
 
 def recover_overdue(decision: Decision, overdue: CallbackOverdue) -> None:
@@ -601,6 +548,7 @@ def recover_overdue(decision: Decision, overdue: CallbackOverdue) -> None:
     event = f"overdue:{resource.id}:{decision.catalog.epoch}"
     source = decision.catalog.origin_of(resource)
     spread(decision, resource, event, State.FATAL, overdue.failure.message, source)
+    end_reload(decision, resource.id, overdue.failure)
     _go_on(decision, resource.id)
 
 
@@ -622,11 +570,15 @@ def _go_on(decision: Decision, resource_id: str) -> None:
         decision.cause(SetTimer("recover:" + resource_id, None, None))
     if condemned(decision, resource):
         begin_unload(decision, resource)
+    _decide_parked(decision, parked)
+    if (left := catalog.resources.get(resource_id)) is not None:
+        _rest_again(decision, left, f"rest:{resource_id}:{catalog.epoch}")
+    start_deferred(decision, resource_id)
+
+
+def _decide_parked(decision: Decision, parked: Sequence[Load | Unload]) -> None:
     for message in parked:
         if isinstance(message, Load):
             load(decision, message)
         else:
             unload(decision, message)
-    if (left := catalog.resources.get(resource_id)) is not None:
-        _rest_again(decision, left, f"rest:{resource_id}:{catalog.epoch}")
-    start_deferred(decision, resource_id)

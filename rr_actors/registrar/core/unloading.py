@@ -149,6 +149,8 @@ def linger_over(decision: Decision, over: LingerOver) -> None:
     resource = catalog.resources.get(over.resource_id)
     if resource is None or resource.phase not in (LOADED, PAUSED) or catalog.priority_of(resource.id) > STANDBY:
         return
+    if resource.id in catalog.recovering:  # the time begins anew when it is reloaded
+        return
     server = catalog.servers.get(resource.server)
     if resource.phase is LOADED and server is not None and server.pauses and _may_pause(decision, resource):
         decision.put(replace(resource, phase=PAUSING))
@@ -191,18 +193,19 @@ def balance(decision: Decision, resource_id: str) -> None:
         if _may_pause(decision, resource) and not (paused and resource.id in catalog.holders):
             _wait(decision, resource)
         elif paused:
-            _stop_waiting(decision, resource)
+            stop_waiting(decision, resource)
     elif paused:
-        _stop_waiting(decision, resource)
+        stop_waiting(decision, resource)
         if resource.state is State.FATAL:  # nobody is given it any more, so it does not run again
             return
         decision.put(replace(resource, phase=RESUMING))
         go_on(decision, catalog.resources[resource.id])
     elif server.pauses:
-        _stop_waiting(decision, resource)
+        stop_waiting(decision, resource)
 
 
-def _stop_waiting(decision: Decision, resource: Resource) -> None:
+def stop_waiting(decision: Decision, resource: Resource) -> None:
+    """Cancel the timer that pauses or unloads an idle resource."""
     if decision.forget(decision.catalog.idle, resource.id):
         decision.cause(SetTimer("linger:" + resource.id, None, None))
 
@@ -268,7 +271,7 @@ def run_unload(decision: Decision, resource: Resource) -> None:
     """Run the unload callback, unless it has ended the process too often, or is not to run before its turn."""
     decision.forget(decision.catalog.early, resource.id)
     if resource.id in decision.catalog.unread:  # the callback cannot run without its request and response
-        _remove(decision, resource)
+        remove(decision, resource)
     elif is_given_up(decision.catalog, "unload", resource.id):
         deaths = deaths_of(decision.catalog, "unload", resource.id)
         _keep(decision, resource, failures.unload_given_up(decision.catalog, resource, deaths))
@@ -289,10 +292,11 @@ def unload_ended(decision: Decision, ended: CallbackEnded) -> None:
         note_ended(decision, "unload", resource.id)
         _keep(decision, resource, ended.failure)
     elif resource is not None:
-        _remove(decision, resource)
+        remove(decision, resource)
 
 
-def _remove(decision: Decision, resource: Resource) -> None:
+def remove(decision: Decision, resource: Resource) -> None:
+    """Remove a resource that is unloaded, release its parts, and answer all that wait for its end."""
     after: list[Effect] = []
     for query in decision.catalog.queries_of(resource.id):
         drop_query(decision, query)
@@ -361,7 +365,7 @@ def force_unload(decision: Decision, command: ForceUnload) -> None:
     decision.note(decision.catalog.owners, resource.id, (*waiting, command.ticket))
     if command.clears and is_given_up(decision.catalog, "unload", resource.id):
         _take_away(decision, resource, command.event, command.why)
-        _remove(decision, resource)
+        remove(decision, resource)
     else:
         _evict(decision, resource, command.event, command.why)
 
@@ -390,7 +394,7 @@ def _clear(decision: Decision, command: Unregister) -> None:
             decision.effects += refuse_all(decision, resource, failures.load_failed(decision.catalog, resource, why))
         else:
             _take_away(decision, resource, command.event, why)
-        _remove(decision, resource)
+        remove(decision, resource)
     decision.cause(AnswerCall(command.ticket, None))
 
 

@@ -333,6 +333,11 @@ class RegistrarActor(RegistrarBase):
         self.post(c.ForceUnload(target, new_id(), waiter, clears=True))
 
     @on_loop
+    def reload(self, target: str, waiter: UnloadWaiter) -> None:
+        """Unload a resource and load it again; `waiter` hears how that ended."""
+        self.post(c.Reload(target, waiter))
+
+    @on_loop
     def revoke(self, target: str, why: str, grace_ms: int, waiter: UnloadWaiter) -> None:
         """Have all holders let a resource go; `waiter` hears how that ended."""
         self.post(c.Revoke(target, new_id(), why, grace_ms, waiter))

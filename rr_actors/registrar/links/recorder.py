@@ -64,7 +64,10 @@ class Recorder:
         self._add(message_entry(at, event, self._path, self._pid, registrar, peer, message))
 
     def callback(self, event: str, server: str, role: str, resource: str, detail: str = "") -> None:
-        """Record that a callback of "registrar/server" "began" or "ended"; `detail` is the error that ended it."""
+        """Record that a callback of "registrar/server" "began" or "ended".
+
+        `detail`: "attempt 2" of one that a crash has interrupted before, and the error that ended it.
+        """
         registrar = server.partition("/")[0]
         where = (self._path, self._pid, registrar)
         self._add(Entry(time.time(), event, 0, *where, "", role, "", resource, "", server, detail))

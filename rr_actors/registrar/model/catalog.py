@@ -124,7 +124,8 @@ class Catalog:
       before its answer. `consumers`: the origins that have fetched their queries over a link that is still open.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: queries whose Load was refused
       lately. `unanswered`: queries whose Unload has come over the present link and has not been answered.
-    - `recovering`: resources whose recover callback runs, with the messages parked until it has returned.
+    - `recovering`: resources whose recover callback runs, or that are reloaded, with the messages parked until that is
+      done. `reloads`: tickets of the owner's calls that wait for a reload.
     - `early`: resources whose callbacks go on with work of before a crash when on_start has returned, and how
       (recovery.py). "" is in it until then.
     - `accused`: ids of the callback runs in which the process before has died, until they have ended without that.
@@ -207,6 +208,7 @@ class Catalog:
         self.refused: dict[str, Failure] = {}
         self.unanswered: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
+        self.reloads: dict[str, Any] = {}
         self.early: dict[str, str] = {}
         self.accused: dict[str, bool] = {}
         self.closings: dict[str, Closing] = {}

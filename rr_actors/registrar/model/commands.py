@@ -215,6 +215,13 @@ class ForceUnload(Command, frozen=True):
     clears: bool = False
 
 
+class Reload(Command, frozen=True):
+    """Unload a resource and load it again, while its holders keep it. `target`: its id, or that of a query on it."""
+
+    target: str
+    ticket: Any
+
+
 class Revoke(Command, frozen=True):
     """Have all holders let a resource go, the highest first. `target`: its id, or that of a query on it.
 

@@ -143,6 +143,7 @@ Happening = Literal[
     "status",
     "priority",
     "revoked",
+    "reloading",
     "paused",
     "pause_failed",
     "resumed",

@@ -62,6 +62,14 @@ def not_revoked(resource: Resource, what: str) -> Failure:
     return Failure("UsageError", f"revoke: expected a resource that is loaded, got {resource.id}, which {what}")
 
 
+def not_reloaded(catalog: Catalog, resource: Resource, what: str) -> Failure:
+    """Return the failure of reload() for a resource that cannot be loaded again now."""
+    text = (
+        f"reload: expected a resource that is loaded, got {resource.id} of {catalog.origin_of(resource)}, which {what}"
+    )
+    return Failure("UsageError", text)
+
+
 def not_swapped(catalog: Catalog, resource_id: str, part: str) -> Failure:
     """Return the failure of a swap of a part that its resource does not hold any more."""
     text = f"query {shortened(part)}: resource {resource_id} of {catalog.name!r} does not hold this part any more"
@@ -103,7 +111,7 @@ def not_run_again(catalog: Catalog, resource: Resource, role: str, deaths: int) 
 
 _BECOMES = {
     "recover": "the resource is lost",
-    "reload": "the resource is lost",
+    "reload": "the resource is not reloaded, and may be unloaded in part",
     "health": "the resource is lost",
     "usage": "what the resource uses is not known",
     "pause": "the resource runs on, or is unloaded if nobody holds it",

@@ -54,10 +54,11 @@ UPGRADE = Role("upgrade", _BOTH)
 USAGE = Role("usage", _BOTH, patient=True, counted=True, on_demand=True)
 HEALTH = Role("health", _BOTH, patient=True, counted=True, on_demand=True, field="probe")
 PAUSE = Role("pause", _BOTH, PAUSING, patient=True, alone=True, counted=True)
+RELOAD = Role("reload", _BOTH, LOADED, patient=True, alone=True, counted=True, field="unload")
 RESUME = Role("resume", _BOTH, RESUMING, "new response", patient=True, counted=True)
 
 ROLES = {role.option: role for role in (LOAD, UNLOAD, STATUS, RECOVER, UPGRADE, USAGE, HEALTH, PAUSE, RESUME)}
-"""All roles, by their fields in ServerSpec."""
+"""All roles that have a callback of their own, by its field in ServerSpec. RELOAD runs that of UNLOAD."""
 
-BEGUN = {role.name: role for role in (LOAD, RECOVER, STATUS, UNLOAD, PAUSE, RESUME, HEALTH, USAGE)}
+BEGUN = {role.name: role for role in (LOAD, RECOVER, STATUS, UNLOAD, PAUSE, RESUME, HEALTH, USAGE, RELOAD)}
 """The roles whose callbacks decisions begin, by name: all but the upgrade, which runs before any."""

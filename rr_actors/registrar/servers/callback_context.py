@@ -12,6 +12,7 @@ from contextvars import ContextVar
 
 import msgspec
 
+from rr_actors.actors.messaging.ask_cycles import asker
 from rr_actors.base.errors import UsageError
 from rr_actors.base.names import named
 from rr_actors.base.values.canonical import text_of_value
@@ -24,12 +25,17 @@ from rr_actors.streams.publisher import Publisher
 
 
 class Current(msgspec.Struct, frozen=True):
-    """The call of a callback, as the callback may know it.
+    """The call of a callback, as the callback may know it; or the message that a handler of an actor handles.
+
+    Of a message it has `origin` alone, "" or False is in the other attributes, and `attempt` is 1.
 
     Attributes:
         resource_id: the resource that the callback loads, unloads, or hears about.
         attempt: 1 at first; more if a crash interrupted an earlier attempt.
-        origin: the name of the registrar that holds the resource: of its present holders, the one that asked first.
+        origin: the name of the registrar that holds the resource: of its present holders, the one that asked first. Of
+            a message: who asks, an actor whose handler waits for the answer, "client.NAME" as ClientRegistrar.ask()
+            says, or "client.pid-4711" of another client. "" for a tell(), an ask without waiting, and for code of no
+            handler.
         server: the server's name, as it was registered.
         interrupted: in an unload callback, whether the load callback never returned; the response is None then. The
             load was withdrawn or given up after a crash. Nothing, a part or all of the resource may have been loaded.
@@ -42,7 +48,7 @@ class Current(msgspec.Struct, frozen=True):
     attempt: int
     origin: str
     server: str
-    _registrar: RegistrarBase
+    _registrar: RegistrarBase | None  # None: of a message
     _role: Role
     _run: int
     interrupted: bool = False
@@ -52,7 +58,11 @@ class Current(msgspec.Struct, frozen=True):
     @property
     def name(self) -> str:
         """The resource's name for people, its server and its request, shortened: `cameras/camera "/dev/video7"`."""
-        return named(f"{self._registrar.name}/{self.server}", text_of_value(self._request))
+        return named(self._place, text_of_value(self._request)) if self._registrar is not None else ""
+
+    @property
+    def _place(self) -> str:
+        return f"{serving(self).name}/{self.server}"
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Report how far the load has come, in its load or recover callback, from any thread.
@@ -69,10 +79,10 @@ class Current(msgspec.Struct, frozen=True):
         """
         number, words = checked(fraction, text)
         if not self._role.reports:
-            what = f"{self._registrar.name}/{self.server}: progress() in its {self._role.name} callback"
+            what = f"{self._place}: progress() in its {self._role.name} callback"
             allowed = " and ".join(role.name for role in ROLES.values() if role.reports)
             raise UsageError(f"{what}: only {allowed} callbacks report it")
-        self._registrar.progress.report(self.resource_id, number, words)
+        serving(self).progress.report(self.resource_id, number, words)
 
     @property
     def stopping(self) -> threading.Event:
@@ -90,9 +100,9 @@ class Current(msgspec.Struct, frozen=True):
         """
         phase = self._role.phase
         if phase is None or not self._role.reports:
-            what = f"{self._registrar.name}/{self.server}: stopping in its {self._role.name} callback"
+            what = f"{self._place}: stopping in its {self._role.name} callback"
             raise UsageError(f"{what}: only load and recover callbacks have it")
-        return self._registrar.stop_event(self.resource_id, phase, self._run)
+        return serving(self).stop_event(self.resource_id, phase, self._run)
 
     @property
     def loaded(self) -> threading.Event:
@@ -105,9 +115,9 @@ class Current(msgspec.Struct, frozen=True):
             UsageError: this is another callback.
         """
         if not self._role.reports:
-            what = f"{self._registrar.name}/{self.server}: loaded in its {self._role.name} callback"
+            what = f"{self._place}: loaded in its {self._role.name} callback"
             raise UsageError(f"{what}: only load and recover callbacks have it")
-        return self._registrar.load_over(self.resource_id)
+        return serving(self).load_over(self.resource_id)
 
     def open_stream(self, name: str = "stream") -> Publisher:
         """Open a stream of the resource, in its load or recover callback: its holders read it with Query.stream().
@@ -124,26 +134,31 @@ class Current(msgspec.Struct, frozen=True):
         """
         if not self._role.reports or _current.get() is not self:
             place = "outside" if self._role.reports else "in"
-            what = f"{self._registrar.name}/{self.server}: open_stream() {place} its {self._role.name} callback"
+            what = f"{self._place}: open_stream() {place} its {self._role.name} callback"
             raise UsageError(f"{what}: only load and recover callbacks open streams, while they run")
-        once = "" if self._runs_again else f"{self._registrar.name}/{self.server}"
-        return self._registrar.publishers.open(self.resource_id, name, once)
+        once = "" if self._runs_again else self._place
+        return serving(self).publishers.open(self.resource_id, name, once)
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
 
 
+_MESSAGE = Role("message", ())
+
+
 def current() -> Current:
-    """Return the context of the callback that this code runs in.
+    """Return the context of the callback that this code runs in, or of the message that it handles.
 
     Raises:
-        UsageError: this code does not run in a callback.
+        UsageError: this code runs in neither.
     """
     context = _current.get()
-    if context is None:
-        expected = "expected to be called in a load, unload, status or recover callback, or in one for usage"
-        raise UsageError(f"rr.current(): {expected}")
-    return context
+    if context is not None:
+        return context
+    if (origin := asker()) is not None:
+        return Current("", 1, origin, "", None, _MESSAGE, 0)
+    callbacks = ", ".join(role.name for role in ROLES.values())
+    raise UsageError(f"rr.current(): expected to be called in a callback ({callbacks}), or by a handler of messages")
 
 
 current_or_none: Callable[[], Current | None] = _current.get
@@ -151,8 +166,15 @@ current_or_none: Callable[[], Current | None] = _current.get
 
 
 def serving(current: Current) -> RegistrarBase:
-    """Return the actor of the registrar that runs the callback."""
-    return current._registrar  # pyright: ignore[reportPrivateUsage]  # same file
+    """Return the actor of the registrar that runs the callback.
+
+    Raises:
+        UsageError: it is the context of a message, which is of no resource.
+    """
+    registrar = current._registrar  # pyright: ignore[reportPrivateUsage]  # same file
+    if registrar is None:
+        raise UsageError("rr.current(): expected that of a callback, got that of a message, which has no resource")
+    return registrar
 
 
 def _run_of(current: Current) -> int:

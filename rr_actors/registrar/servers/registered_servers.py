@@ -20,7 +20,7 @@ from rr_actors.registrar.engine.server import Callback, ServerSpec
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import Described
-from rr_actors.registrar.model.roles import BEGUN, UNLOAD
+from rr_actors.registrar.model.roles import BEGUN, RELOAD, UNLOAD
 from rr_actors.registrar.model.rows import Resource
 from rr_actors.registrar.servers.server_actor import Message, ServerActor
 from rr_actors.registrar.servers.server_base import OnDemandRun
@@ -182,7 +182,7 @@ class GatedServer(ServerActor):
         if isinstance(message, OnDemandRun):
             return True
         role = BEGUN[message.role]
-        return not (role.in_order or role.on_demand) and (role is not UNLOAD or self.spec.unload is not None)
+        return not (role.in_order or role.on_demand) and (role not in (UNLOAD, RELOAD) or self.spec.unload is not None)
 
     def _wait(self, message: Message) -> None:
         self.registrar.outside.add(_key_of(message))

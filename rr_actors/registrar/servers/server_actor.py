@@ -37,7 +37,7 @@ from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.commands import CallbackEnded
 from rr_actors.registrar.model.effects import StartCallback
 from rr_actors.registrar.model.messages import Load
-from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, STATUS, UNLOAD, USAGE, Role
+from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, RELOAD, RESUME, STATUS, UNLOAD, USAGE, Role
 from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
 from rr_actors.registrar.servers.callback_context import Current, enter
 from rr_actors.registrar.servers.on_demand_callbacks import HealthCallbacks, UsageCallbacks
@@ -102,6 +102,7 @@ class ServerActor(TurnActor):
     Attributes:
         facts: what decisions know of it.
         usage, health: these two callbacks.
+        inside: the callbacks that run now, each with the name of its role. From any thread.
         digest: of the types of requests and responses.
 
     Raises:
@@ -116,6 +117,7 @@ class ServerActor(TurnActor):
         "digest",
         "facts",
         "health",
+        "inside",
         "load_times",
         "origin",
         "registrar",
@@ -152,6 +154,7 @@ class ServerActor(TurnActor):
         self.health = HealthCallbacks(self)
         self._on_demand = {USAGE.name: self.usage, HEALTH.name: self.health}
         self.load_times = LoadTimes()
+        self.inside: dict[int, str] = {}
 
     def add(self, role: Role, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]) -> None:
         """Run callbacks of a role from now on.
@@ -164,9 +167,11 @@ class ServerActor(TurnActor):
             InvalidSpec: the callback has attributes that cannot be read.
         """
         what = f"{self.origin}: {role.option}"
-        callback = getattr(self.spec, role.option) or nothing
+        callback = getattr(self.spec, role.option)
         try:
-            taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
+            taking = nothing
+            if callback is not None:
+                taking = checked_callback(callback, role, self.spec.request_type, f"server {self.spec.name!r}")
             self._runs[role] = self._wrapped(taking, arguments, result)
         except Exception as error:
             expected = "a callable whose attributes can be read"
@@ -259,7 +264,7 @@ class ServerActor(TurnActor):
         heard = None if effect.notice is None else self._received(effect.notice, repeated=effect.repeated)
         number = resource.tries if role is UNLOAD else resource.attempt
         run = Run(role, effect, number, heard, time.monotonic())
-        if role in (UNLOAD, STATUS) and getattr(self.spec, role.option) is None:
+        if role in (UNLOAD, RELOAD, STATUS) and getattr(self.spec, role.option) is None:
             self._run_ended(run, None, None)
             return
         if not self.registrar.serving:  # it may end this process during its start
@@ -313,7 +318,7 @@ class ServerActor(TurnActor):
             self.registrar.callback_failures += 1
         self._streams_after(run, failed=error is not None)
         failure = None if error is None else failure_of_callback(role, self.origin, resource, error)
-        event = new_id() if role.answer and role is not LOAD else ""
+        event = new_id() if role in (RECOVER, RELOAD, RESUME) else ""
         handled = run.heard is not None and run.heard.is_handled
         end = role.name, resource.id, run.number, failure, None if error is not None else response, event
         stopped = role is LOAD and type(error) is Raised and error.details.was_stopped
@@ -325,7 +330,7 @@ class ServerActor(TurnActor):
         if run.role.reports and not failed:
             if publishers.streams:  # most registrars have none
                 publishers.let_in(id, functools.partial(tell_stream, self, run.effect.resource))
-        elif (run.role.reports and failed) or (run.role is UNLOAD and not failed):
+        elif (run.role.reports and failed) or (run.role in (UNLOAD, RELOAD) and not failed):
             publishers.close(id)
 
     # -- how callbacks run -------------------------------------------------------------------------------------------
@@ -391,12 +396,12 @@ class ServerActor(TurnActor):
                 try:
                     answer = result(await self._heeding(role, resource, begun or callback(*arguments(resource), *more)))
                 except BaseException as error:
-                    begun, again = None, self._runs_once_more(role, resource, error)
+                    begun, again = None, self._runs_once_more(current, role, resource, error)
                     if again:
                         continue
                     raised = await described_error(error, self._describe if again is None else self._describe_stopped)
                 else:
-                    self._end_run(role, resource)
+                    self._end_run(current, role, resource)
                     return answer
                 raise raised from None
             return None
@@ -410,11 +415,11 @@ class ServerActor(TurnActor):
                         return closing(answer, run_async(current, role, resource, *more, begun=answer))
                     answer = result(answer)
                 except BaseException as error:
-                    again = self._runs_once_more(role, resource, error)
+                    again = self._runs_once_more(current, role, resource, error)
                     if not again:
                         raise Raised(error, self._describe if again is None else self._describe_stopped) from None
                 else:
-                    self._end_run(role, resource)
+                    self._end_run(current, role, resource)
                     return answer
             return None
 
@@ -422,8 +427,10 @@ class ServerActor(TurnActor):
 
     def _enter_context(self, current: Current, role: Role, resource: Resource) -> None:
         enter(current)
+        self.inside[id(current)] = role.name
         if self.registrar.node.watched.level[0] > 1:
-            self.registrar.recorder.callback("began", self.origin, role.name, resource.id)
+            again = f"attempt {current.attempt}" if current.attempt > 1 else ""
+            self.registrar.recorder.callback("began", self.origin, role.name, resource.id, again)
 
     def _describe(self, error: BaseException) -> CallbackFailure:
         """Describe a callback's error. In the thread that ran the callback."""
@@ -441,9 +448,9 @@ class ServerActor(TurnActor):
         self.registrar.stop_event(resource.id, role.phase, resource.attempt, cancel)
         return await answer
 
-    def _runs_once_more(self, role: Role, resource: Resource, error: BaseException) -> bool | None:
+    def _runs_once_more(self, current: Current, role: Role, resource: Resource, error: BaseException) -> bool | None:
         """Note that a run has ended by an error. If it was told to stop, return whether its result is needed again."""
-        again = self._end_run(role, resource)
+        again = self._end_run(current, role, resource)
         if not again:
             return again
         if not isinstance(error, asyncio.CancelledError):
@@ -453,7 +460,8 @@ class ServerActor(TurnActor):
                 task.uncancel()
         return True
 
-    def _end_run(self, role: Role, resource: Resource) -> bool | None:
+    def _end_run(self, current: Current, role: Role, resource: Resource) -> bool | None:
+        self.inside.pop(id(current), None)
         if role.phase is None or not role.reports:
             return None
         return self.registrar.end_run(resource.id, role.phase, resource.attempt)

@@ -50,16 +50,24 @@ def said(error: BaseException) -> str:
     return error.text if type(error) is Raised else text_of(error)
 
 
+_LEFT_BY = {
+    "unload": ("is kept as unload_failed", "unloaded"),
+    "reload": ("is not loaded again, as its unload callback raised", "reloaded"),
+}
+"""By role: what an unload callback that raised leaves behind, and what may be tried again."""
+
+
 def failure_of_callback(role: Role, origin: str, resource: Resource, error: BaseException) -> Failure | None:
     """Log the error of a callback, and return the failure that decisions get; None: what waits goes on all the same."""
     match role.name:
         case "load":
             return load_failure(error, origin)
-        case "unload":
+        case "unload" | "reload":
             text = readable(f"{origin}: {said(error)}")
             trace = error.details.trace if type(error) is Raised else failure_of(error, origin).trace
-            log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
-            text += "; the resource is kept as unload_failed, and may be unloaded again"
+            becomes, again = _LEFT_BY[role.name]
+            log_raised(logger, error, "%s; resource %s %s", text, resource.id, becomes)
+            text += f"; the resource {becomes}, and may be {again} again"
             return Failure("UnloadFailed", text, {"resource_id": resource.id, "server": origin}, trace)
         case "pause":
             text = readable(f"{origin}: pause: {said(error)}")

@@ -41,6 +41,7 @@ PRELOAD = (
     "rr_actors.supervision.child_main",
     "rr_actors.system.system",
     "rr_actors.system.console.connected_client",
+    "rr_actors.system.recording.stream_recordings",
     "rr_actors.actors.timers",
     "multiprocessing.resource_tracker",
     "tempfile",

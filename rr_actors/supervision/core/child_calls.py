@@ -33,6 +33,7 @@ from rr_actors.base.errors import (
     RrError,
     TooManyChildren,
     shown,
+    with_article,
 )
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, check_significant
@@ -347,7 +348,7 @@ def check_kept_id(id: str, tree: SupervisorState) -> None:
 
 def _wrong_type(who: str, field: str, expected: str, got: object) -> InvalidSpec:
     # The text has the type, not the repr: this runs on the loop, and a user's repr may do anything.
-    text = f"{who}: expected {expected}, got a {type(got).__name__}"
+    text = f"{who}: expected {expected}, got {with_article(type(got).__name__)}"
     return InvalidSpec(text, field=field, expected=expected, got=got)
 
 

@@ -1,29 +1,49 @@
-"""The queries of a client: the news of them that the system sends, and how they end with it."""
+"""The queries of a client: the news of them that the system sends, how they end with it, and how they come back.
+
+A thread of each registrar waits for statuses. When the system ends, the thread ends the registrar's queries. With
+`rr.connect(reconnect=True)` it opens the registrar in the next run of the system, and has its queries loaded again.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
 import inspect
 import threading
+import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rr_actors.base.errors import NotRunning, RrError, UnknownQuery, shortened
+from msgspec.structs import replace
+
+from rr_actors.base.errors import (
+    NotRunning,
+    ResourceLost,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UnknownRegistrar,
+    UnknownServer,
+    shortened,
+)
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Response, Status, StatusCallback, StatusCallbacks, end, hear, received
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.user_loop import CallersLoop
-from rr_actors.system.console.console_client import GREETING_S, Connections, ConsoleClient
-from rr_actors.system.console.console_messages import Dropped, Heard
+from rr_actors.system.console.console_client import GREETING_S, Connections, ConsoleClient, find_console
+from rr_actors.system.console.console_commands import OpenRegistrar
+from rr_actors.system.console.console_messages import Dropped, Heard, Holding, Welcome
 
 logger = Log("rr_actors")
 
-ENDED = "ended"
-"""The reason of the last status of a client's query, when the system has ended."""
+ENDED, AGAIN = "ended", "reconnected"
+"""The reasons of the statuses of a client's query when the system has ended, and when its next run holds it."""
 
 _ANSWER_S = 60.0  # for a request that has no time limit of its own
 
@@ -31,32 +51,40 @@ _ANSWER_S = 60.0  # for a request that has no time limit of its own
 class SystemConnections(Connections):
     """The connections to one run of a system. When it has ended, each call says so in the same words.
 
+    Args:
+        run_dir: of the run.
+        reconnects: connect to the next run when this one has ended.
+
     Attributes:
-        ended: the error that says that the system has ended, once that is known.
+        welcome: what the system has said of itself; None before the first connection.
+        ended: the error that says that the system has ended, once that is known, and until there is a next run.
     """
 
-    def __init__(self, run_dir: Path) -> None:
-        super().__init__(lambda: run_dir, _ANSWER_S)
+    def __init__(self, run_dir: Path, *, reconnects: bool) -> None:
         self._state_dir = run_dir.parent.parent
-        self._was_there = False
+        super().__init__(functools.partial(find_console, self._state_dir) if reconnects else lambda: run_dir, _ANSWER_S)
+        self.reconnects = reconnects
+        self.welcome: Welcome | None = None
         self.ended: NotRunning | None = None
 
     def open(self, greeting_s: float = GREETING_S) -> ConsoleClient:
         """Return a new connection, as Connections.open() does."""
-        if self.ended is not None and not self.is_closed:
+        if self.ended is not None and not (self.is_closed or self.reconnects):
             raise self.has_ended()
         try:
             opened = super().open(greeting_s)
         except NotRunning as error:
-            if not self._was_there or self.is_closed:
+            if self.welcome is None or self.is_closed:
                 raise
             raise self.has_ended() from error
-        self._was_there = True
+        self.welcome, self.ended = opened.welcome, None
         return opened
 
     @contextmanager
     def lent(self, greeting_s: float = GREETING_S) -> Generator[ConsoleClient]:
         """Lend a connection, as Connections.lent() does."""
+        if self.reconnects:
+            self.drop_ended()
         try:
             with super().lent(greeting_s) as client:
                 yield client
@@ -67,7 +95,8 @@ class SystemConnections(Connections):
 
     def has_ended(self) -> NotRunning:
         """Return the error that says that the system has ended, and note that it has."""
-        self.ended = NotRunning(f"the system in {self._state_dir} has ended: connect to its next run")
+        then = "this client waits for its next run" if self.reconnects else "connect to its next run"
+        self.ended = NotRunning(f"the system in {self._state_dir} has ended: {then}")
         return self.ended
 
 
@@ -75,20 +104,28 @@ class ClientQuery(Query[Response]):
     """A client's hold on one resource: a Query. As a context manager it is released at the end.
 
     Statuses reach it a moment later than a query of the application. A class in a response of which no type is known
-    is read as a dict.
+    is read as a dict. After a restart of the system, a client that reconnects holds the resource again, or one that was
+    loaded for the same request: `id` stays, `resource_id` and `response` are the new ones.
     """
 
-    __slots__ = ("_lost",)
+    __slots__ = ("_asked", "_given", "_held_as", "_lost")
 
-    _lost: NotRunning | None
+    _lost: RrError | None
 
-    def __init__(self, *place: Any) -> None:
+    def __init__(self, place: tuple[Any, ...], given: bytes, asked: LoadOptions) -> None:
         super().__init__(*place)
+        self._held_as = self.id
+        self._given, self._asked = given, asked
         self._lost = None
 
-    def _lose(self, error: NotRunning) -> None:
-        """Note that the system has ended: what waits for a status or a frame raises the error."""
+    def _lose(self, error: RrError | None) -> None:
+        """Note that the system has ended: what waits for a frame raises the error. None: it is held again."""
         self._lost = error
+
+    def _hold_again(self, held: Holding) -> None:
+        """Note that the system's next run holds it."""
+        self._held_as, self.resource_id = held.query_id, held.resource_id
+        self._lose(None)
 
     def _silence(self) -> RrError:
         return super()._silence() if self._lost is None else self._lost
@@ -112,11 +149,22 @@ _EARLY = 1000
 
 # For this package's own modules. As private names they stay out of an editor's list of names.
 lose = ClientQuery._lose  # pyright: ignore[reportPrivateUsage]  # same file
+hold_again = ClientQuery._hold_again  # pyright: ignore[reportPrivateUsage]
 
 
 def is_lost(query: ClientQuery) -> bool:
-    """Return whether the system has ended while the query was held."""
+    """Return whether the system has ended while the query was held, and its next run does not hold it."""
     return query._lost is not None  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def asked_with(query: ClientQuery) -> tuple[bytes, LoadOptions]:
+    """Return the request's canonical bytes, and the options of the load."""
+    return query._given, query._asked  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def held_as(query: ClientQuery) -> str:
+    """Return the id by which the system's present run holds the query."""
+    return query._held_as  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 class ClientViews:
@@ -134,6 +182,7 @@ class ClientViews:
         self._lock = threading.Lock()
         self._held: dict[str, ClientQuery] = {}
         self.callbacks = StatusCallbacks(self._hears, set())
+        self._again: dict[str, ClientQuery] = {}  # those held after a restart of the system, by their new ids
         self._loads = 0  # in flight
         self._early: dict[str, list[Heard | Dropped]] = {}  # of loads whose answers have not been read yet
 
@@ -164,6 +213,16 @@ class ClientViews:
         """Return the query of this id that is held; None else."""
         return self._held.get(query_id)
 
+    def held_as(self, query_id: str) -> str:
+        """Return the id by which the system's present run holds a query."""
+        query = self._held.get(query_id)
+        return query_id if query is None else held_as(query)
+
+    def reprioritized(self, query_id: str, priority: int | None) -> None:
+        """Note the priority of a query, for the load after a restart."""
+        if (query := self._held.get(query_id)) is not None:
+            query._asked = replace(query._asked, priority=priority)  # pyright: ignore[reportPrivateUsage]  # same file
+
     def set_callback(self, query_id: str, callback: StatusCallback | None, loop: CallersLoop | None) -> None:
         """Replace the status callback of a query.
 
@@ -183,6 +242,7 @@ class ClientViews:
             gone = [one for one in held if query_id in ("", one.id) and server in ("", one.server_id)]
             for query in gone:
                 del self._held[query.id]
+                self._again.pop(held_as(query), None)
                 self.callbacks.drop(query.id)
         for query in gone:
             end(query)
@@ -190,7 +250,7 @@ class ClientViews:
     def hear(self, heard: Heard | Dropped) -> None:
         """Pass a status on to its query, and to the callbacks; or end a query that its registrar has released."""
         with self._lock:
-            held = self._held.get(heard.query_id)
+            held = self._held.get(heard.query_id) or self._again.get(heard.query_id)
             if held is None:
                 if self._loads:
                     self._early.setdefault(heard.query_id, []).append(heard)
@@ -198,21 +258,71 @@ class ClientViews:
                         del self._early[next(iter(self._early))]
                 return
         if isinstance(heard, Dropped):
-            self.forget(heard.query_id, "")
+            self.forget(held.id, "")
         else:
-            self._tell(held, status_heard(heard), heard.response, released=heard.released)
+            own = replace(heard, query_id=held.id)
+            self._tell(held, status_heard(own), heard.response, released=heard.released)
 
-    def lost(self, error: NotRunning) -> None:
+    def lost(self, error: RrError) -> None:
         """End all queries, as the system has ended: each hears FATAL, and its calls raise the error."""
-        with self._lock:
-            held = list(self._held.values())
-        for query in held:
-            place = {"resource_id": query.resource_id, "query_id": query.id, "source": query.server_id}
-            status = Status(State.FATAL, error.message, repeated=False, **place)
-            status.reason = ENDED
+        for query in self._all():
+            self.give_up(query, error)
+
+    def give_up(self, query: ClientQuery, error: RrError) -> None:
+        """End a query that the system's next run does not hold, if there is one: it hears FATAL."""
+        lose(query, error)
+        self._say(query, State.FATAL, error.message, ENDED, released=True)
+        self.forget(query.id, "")
+
+    def away(self, error: NotRunning) -> None:
+        """Have all queries wait for the system's next run: each hears ERROR, and its loops raise the error."""
+        for query in self._all():
             lose(query, error)
-            self._tell(query, status, None, released=True)
-        self.forget("", "")
+            self._say(query, State.ERROR, error.message, ENDED)
+
+    def all_away(self) -> list[ClientQuery]:
+        """Return the queries that wait for the system's next run, the oldest first."""
+        return list(filter(is_lost, self._all()))
+
+    def is_away(self, query_id: str) -> bool:
+        """Return whether a query waits for the system's next run."""
+        return (query := self._held.get(query_id)) is not None and is_lost(query)
+
+    def hold_again(self, query: ClientQuery, held: Holding) -> bool:
+        """Note that the system's next run holds a query, which hears so.
+
+        Return False if the query was released meanwhile, or is held by an earlier call.
+        """
+        with self._lock:
+            if self._held.get(query.id) is not query or not is_lost(query):
+                return False
+            self._again.pop(held_as(query), None)
+            hold_again(query, held)
+            self._again[held.query_id] = query
+            early = self._early.pop(held.query_id, [])
+        self._say(query, held.state, "the system has been started again, and holds it", AGAIN, held.response)
+        for heard in early:
+            self.hear(heard)
+        return True
+
+    def _all(self) -> list[ClientQuery]:
+        with self._lock:
+            return list(self._held.values())
+
+    def _say(
+        self,
+        query: ClientQuery,
+        state: State,
+        text: str,
+        reason: str,
+        response: bytes | None = None,
+        *,
+        released: bool = False,
+    ) -> None:
+        place = {"resource_id": query.resource_id, "query_id": query.id, "source": query.server_id}
+        status = Status(state, text, repeated=False, **place)
+        status.reason = reason
+        self._tell(query, status, response, released=released)
 
     def _tell(self, query: ClientQuery, status: Status, response: bytes | None, *, released: bool) -> None:
         hear(query, received(status, self.find), response, released=released)
@@ -237,30 +347,168 @@ def status_heard(heard: Heard) -> Status:
     return status
 
 
-def listen(
-    lifeline: ConsoleClient, name: str, connections: SystemConnections, views_of: Callable[[], ClientViews | None]
-) -> None:
-    """Pass on the statuses of a registrar, until it is closed or nobody has it any more. In a thread of its own."""
-    ended = False
+async def _await(answer: Awaitable[object]) -> None:
+    await answer
+
+
+# -- the connection of a registrar, and the one after a restart ------------------------------------------------------
+
+_RETRY_S = 0.1  # between two looks for the next run, or for a manager that starts
+_AT_ONCE = 8  # loads of one registrar after a restart
+
+Load = Callable[[ClientQuery], None]
+"""Loads the resource of a query again."""
+
+
+class Lifeline:
+    """The connection by which a registrar is open in the system; another one after each restart.
+
+    Args:
+        wanted: the name that the registrar is opened with.
+
+    Attributes:
+        name: the registrar's name in the system.
+    """
+
+    def __init__(self, connections: SystemConnections, wanted: str) -> None:
+        self.connections = connections
+        self._wanted = wanted
+        self._closed = threading.Event()
+        self._is_away = False
+        self.name = ""
+        self.client = self._opened()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the registrar was closed here."""
+        return self._closed.is_set() or self.connections.is_closed
+
+    def is_open(self) -> bool:
+        """Return whether the system's side is open, too."""
+        return self.client.is_open()
+
+    def check_here(self) -> None:
+        """Raise NotRunning while the registrar waits for the next run of the system."""
+        if self._is_away:
+            raise self.connections.has_ended()
+
+    def reopened(self) -> bool:
+        """Wait for the next run of the system, and open the registrar there. Return False if it was closed here.
+
+        Raises:
+            RrError: the next run refuses it: another client has the name, say.
+        """
+        self._is_away = True
+        while not self._closed.wait(_RETRY_S) and not self.connections.is_closed:
+            try:
+                self.client = self._opened()
+            except Unavailable:  # NotRunning is one
+                continue
+            self._is_away = False
+            if self._closed.is_set():
+                self.client.close()
+                break
+            return True
+        return False
+
+    def close(self) -> None:
+        """Close the registrar, whose queries are released a moment later. A second close does nothing."""
+        self._closed.set()
+        self.client.close()
+
+    def _opened(self) -> ConsoleClient:
+        opened = self.connections.open()
+        try:
+            self.name = opened.ask(OpenRegistrar(self._wanted)).facts["registrar"]
+        except BaseException:
+            opened.close()
+            raise
+        return opened
+
+
+def listen(lifeline: Lifeline, views_of: Callable[[], ClientViews | None], load_of: Callable[[], Load | None]) -> None:
+    """Pass on the statuses of a registrar, until it is closed or nobody has it any more. In a thread of its own.
+
+    Args:
+        views_of, load_of: return None once nobody has the registrar.
+    """
+    while (ended := _until_its_end(lifeline, views_of)) is not None:
+        if (views := views_of()) is None or not views.is_open():
+            break
+        if not lifeline.connections.reconnects:
+            views.lost(ended)
+            break
+        views.away(ended)
+        del views
+        try:
+            if not lifeline.reopened():
+                break
+        except RrError as refused:
+            if (views := views_of()) is not None:
+                views.lost(refused)
+            break
+        if (load := load_of()) is not None:
+            _load_again(views_of, load)
+        del load
+    if (views := views_of()) is not None:
+        views.forget("", "")
+
+
+def _until_its_end(lifeline: Lifeline, views_of: Callable[[], ClientViews | None]) -> NotRunning | None:
+    """Pass on statuses until the system ends, and return the error that says so; None: the registrar was closed."""
     try:
         while True:
-            statuses = lifeline.wait_statuses(name)
+            statuses = lifeline.client.wait_statuses(lifeline.name)
             views = views_of()
             if views is None:
-                return
+                return None
             for heard in statuses:
                 views.hear(heard)
             del views  # while it waits, the registrar may be collected
     except NotRunning as error:
-        ended = not connections.is_closed
-        logger.debug("registrar %s hears no more statuses: %s", name, error)
+        logger.debug("registrar %s hears no more statuses: %s", lifeline.name, error)
+        return None if lifeline.is_closed else lifeline.connections.has_ended()
     except RrError as error:  # the registrar was closed in the system
-        logger.debug("registrar %s hears no more statuses: %s", name, error)
-    if (views := views_of()) is not None:
-        if ended and views.is_open():
-            views.lost(connections.has_ended())
-        views.forget("", "")
+        logger.debug("registrar %s hears no more statuses: %s", lifeline.name, error)
+        return None
 
 
-async def _await(answer: Awaitable[object]) -> None:
-    await answer
+def _load_again(views_of: Callable[[], ClientViews | None], load: Load) -> None:
+    """Have threads load all that the registrar held, the oldest first."""
+    views = views_of()
+    if views is None:
+        return
+
+    def one(query: ClientQuery) -> None:
+        try:
+            _patiently(load, query)
+        except NotRunning:
+            return  # it has ended again: the thread that listens waits for the run after that
+        except RrError as error:
+            text = f"{query.server_id}: it cannot be loaded again after a restart of the system: {error.message}"
+            views.give_up(query, ResourceLost(text, query_id=query.id, resource_id=query.resource_id))
+
+    left = deque(views.all_away())
+
+    def work() -> None:
+        with contextlib.suppress(IndexError):  # none is left
+            while True:
+                one(left.popleft())
+
+    for _ in range(min(_AT_ONCE, len(left))):
+        threading.Thread(target=work, name="rr-reconnect", daemon=True).start()
+
+
+def _patiently(load: Load, query: ClientQuery) -> None:
+    """Load, also if the manager is not there yet: the system may still be starting."""
+    limit_s = asked_with(query)[1].timeout_s
+    deadline = None if limit_s is None else time.monotonic() + limit_s
+    while True:
+        try:
+            return load(query)
+        except NotRunning:
+            raise
+        except (UnknownRegistrar, UnknownServer, Unavailable):
+            if deadline is not None and time.monotonic() > deadline:
+                raise
+        time.sleep(_RETRY_S)

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from rr_actors.base.errors import NameTaken, RrError, UnknownQuery, UnknownRegistrar, shown
+from rr_actors.base.names import CLIENTS
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.model.rows import State
@@ -32,7 +33,15 @@ _CLOSED_S = 10.0  # so long a name may wait for the end of the registrar before
 
 
 class Caller(Protocol):
-    """The connection by which a request came. What a client opens lives as long."""
+    """The connection by which a request came. What a client opens lives as long.
+
+    Attributes:
+        client: what all connections of one client have in common.
+        pid: the id of the client's process.
+    """
+
+    client: object
+    pid: int
 
     @property
     def is_gone(self) -> bool:
@@ -179,6 +188,18 @@ class ClientRegistrars:
             logger.debug("query %s: released by its client or with its registrar", query_id)
         except RrError:
             logger.exception("query %s: its client has gone, and it is not released", query_id)
+
+    def asking(self, caller: Caller, name: str) -> str:
+        """Return the name by which a client asks: of a registrar that it has opened, or with "" that of its process.
+
+        Raises:
+            UnknownRegistrar: it has not opened the registrar.
+        """
+        if not name:
+            return f"{CLIENTS}pid-{caller.pid}"
+        if self.named(name).owner.client != caller.client:
+            raise UnknownRegistrar(f"registrar {shown(name)}: another client has opened it", registrar=name)
+        return name
 
     def named(self, name: str, owner: object = None) -> ClientsRegistrar:
         """Return a client's registrar; with `owner`, only if this connection has opened it.

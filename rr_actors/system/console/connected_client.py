@@ -18,6 +18,7 @@ from typing import Any, Self, TypeVar, cast
 
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.base.errors import (
+    InvalidRequest,
     LoadTimeout,
     NotRunning,
     NotSerializable,
@@ -49,9 +50,17 @@ from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, Remot
 from rr_actors.runtime.time_limits import deadline_of, left_until, time_limit
 from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.client_queries import ClientQuery, ClientViews, SystemConnections, listen
+from rr_actors.system.console.client_queries import (
+    ClientQuery,
+    ClientViews,
+    Lifeline,
+    Load,
+    SystemConnections,
+    asked_with,
+    listen,
+)
 from rr_actors.system.console.console_client import GREETING_S, find_console
-from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, OpenRegistrar, Release
+from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, Release
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
 from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
 
@@ -67,25 +76,30 @@ class Client:
     """A client of a running system. connect() makes it; as a context manager it is closed at the end. From any thread.
 
     When the system ends, each query of its registrars hears FATAL with the reason "ended", and calls raise NotRunning.
+    With `reconnect=True` it hears ERROR, and calls raise NotRunning until the system's next run.
 
     Attributes:
         system: the system's name.
         state_dir: its state directory.
-        pid: the id of the system's process.
     """
 
-    def __init__(self, run_dir: Path) -> None:
-        self._connections = SystemConnections(run_dir)
+    def __init__(self, run_dir: Path, *, reconnect: bool = False) -> None:
+        self._connections = SystemConnections(run_dir, reconnects=reconnect)
         with self._connections.lent() as client:
             welcome = client.welcome
         self.system = welcome.system
         self.state_dir = Path(welcome.state_dir)
-        self.pid = welcome.pid
+
+    @property
+    def pid(self) -> int:
+        """The id of the system's process, or of the last one that this client has met."""
+        assert self._connections.welcome is not None
+        return self._connections.welcome.pid
 
     @property
     def ended(self) -> NotRunning | None:
         """The error that says that the system has ended; None while it runs, or if this client was closed first."""
-        if self._connections.ended is None:
+        if self._connections.ended is None or self._connections.reconnects:
             try:
                 self._connections.open().close()
             except NotRunning:
@@ -110,17 +124,18 @@ class Client:
     def ask(self, actor: str, message: Any, *, timeout_s: float | None = 30.0) -> Any:
         """Ask an actor of the system, and return its answer. Both are plain data, as requests are (docs/values.md).
 
+        The handler sees who asks as `rr.current().origin`: "client.pid-" and the number of this process.
+
         Args:
             actor: its id or its path, as for System.ref().
 
         Raises:
             NotFound: there is no such actor.
             NotSerializable: the message or the answer is no plain data, or too long (as for load()).
-            RrError: the actor did not answer, or its handler raised.
+            AskFailed: its handler raised; an error of this package keeps its class.
+            Unavailable: it has not answered in time, or is being started again.
         """
-        limit_s = _limit(timeout_s)
-        command = AskActor(actor, _encoded(message, f"message to {actor}"), limit_s)
-        return Codec(None, "answer").show(self._connections.ask(command, limit_s + _GRACE_S).answer)
+        return _asked(self._connections, actor, message, timeout_s)
 
     def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
         """Have the system back itself up to a directory of its machine, as System.backup() does, with its errors."""
@@ -159,9 +174,10 @@ NOT_FOR_CLIENTS = {
 class _ClientCalls(RemoteCalls):
     """The calls of a client's registrar: requests to the system's console, of plain data, never pickles."""
 
-    def __init__(self, connections: SystemConnections, name: str, views: ClientViews) -> None:
-        super().__init__(name)
-        self.connections = connections
+    def __init__(self, lifeline: Lifeline, views: ClientViews) -> None:
+        super().__init__(lifeline.name)
+        self.connections = lifeline.connections
+        self.check_here = lifeline.check_here
         self.views = views
 
     def send(self, reply: Reply[Any], method: str, *args: Any, **options: Any) -> None:
@@ -173,7 +189,10 @@ class _ClientCalls(RemoteCalls):
         _refuse(self.name, "force", options.get("force", False))
         limit_s = _limit(options["timeout_s"])
         query_id, server = ("", *args, "")[:2] if method == "unload_client" else ("".join(args), "")
-        self.connections.ask(Release(self.name, query_id, server, limit_s), limit_s + _GRACE_S)
+        if not self.views.is_away(query_id):  # else the system has released it as it ended
+            self.check_here()
+            held_as = self.views.held_as(query_id)
+            self.connections.ask(Release(self.name, held_as, server, limit_s), limit_s + _GRACE_S)
         self.views.forget(query_id, server)
 
     def overdue(self, timeout_s: float | None) -> RrError:
@@ -190,7 +209,8 @@ class _ClientCalls(RemoteCalls):
         def has_all() -> bool:
             if not asked:
                 asked.append(Reply())
-                in_thread(asked[0], lambda: self.connections.ask(HasAllStreams(self.name, query.id)))
+                held_as = self.views.held_as(query.id)
+                in_thread(asked[0], lambda: self.connections.ask(HasAllStreams(self.name, held_as)))
             return asked[0].done() and asked[0].exception() is None and asked[0].get().are_open
 
         return has_all
@@ -227,14 +247,15 @@ class _ClientLoads(RemoteLoads):
     def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
         client, limit_s = self._client, _limit(options.timeout_s)
         deadline = deadline_of(limit_s + _GRACE_S)
+        client.check_here()
         command = Hold(client.name, str(target), bytes(request), limit_s, options.priority)
         query: ClientQuery | None = None
         try:
             # If the connection ends before keep(), the system releases the query.
             with client.views.loading(), client.connections.lent(min(GREETING_S, limit_s + _GRACE_S)) as connection:
                 held = connection.ask(command, left_until(deadline))
-                place = held.query_id, target, request, "", client.name, self.holder
-                query = ClientQuery(*place, _shown_types, client.all_streams)
+                place = held.query_id, target, request, "", client.name, self.holder, _shown_types, client.all_streams
+                query = ClientQuery(place, bytes(request), options)
                 if options.codec is not None:
                     read_as(query, options.codec)
                 loaded_directly(query, held.resource_id, held.response, held.state)
@@ -249,6 +270,21 @@ class _ClientLoads(RemoteLoads):
             if query is not None:
                 threading.Thread(target=self.release, args=(query,), name="rr-undo").start()
             raise
+
+    def load_again(self, query: ClientQuery) -> None:
+        """Load the resource of a query in the system's next run, if it is still wanted.
+
+        Raises:
+            RrError: it cannot be loaded.
+        """
+        client, (request, options) = self._client, asked_with(query)
+        limit_s = _limit(options.timeout_s)
+        command = Hold(client.name, query.server_id, request, limit_s, options.priority)
+        with client.views.loading(), client.connections.lent() as connection:
+            if client.views.is_away(query.id):
+                held = connection.ask(command, limit_s + _GRACE_S)
+                if client.views.hold_again(query, held):
+                    connection.keep()
 
     def _load_all(self, requests: Sequence[LoadWanted], options: LoadOptions) -> Queries:
         sent: list[Reply[Query]] = []
@@ -280,7 +316,6 @@ def _raise_of(one: Reply[Query], requests: Sequence[LoadWanted], place: int) -> 
 
 def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
     """Have a new thread make a call, and set the reply. The application's executor may be full of other calls."""
-
     threading.Thread(target=_make, args=(reply, call), name="rr-client", daemon=True).start()
 
 
@@ -306,21 +341,14 @@ class ClientRegistrar(Consumer):
 
     def __init__(self, connections: SystemConnections, name: str) -> None:
         self._connections = connections
-        self._lifeline = connections.open()
-        self._closed = threading.Event()
-        try:
-            done = self._lifeline.ask(OpenRegistrar(name))
-        except BaseException:
-            self._lifeline.close()
-            raise
-        self._name: str = done.facts["registrar"]
-        closed = self._closed
-        self._views = ClientViews(lambda: not (closed.is_set() or connections.is_closed), self._lifeline.is_open)
-        calls = _ClientCalls(connections, self._name, self._views)
+        self._lifeline = lifeline = Lifeline(connections, name)
+        self._name = lifeline.name
+        self._views = ClientViews(lambda: not lifeline.is_closed, lifeline.is_open)
+        calls = _ClientCalls(lifeline, self._views)
         self._client_loads = _ClientLoads(calls, self)
         self._unload_ways = RemoteUnloads(calls)
-        weakref.finalize(self, self._lifeline.close)  # else the thread would keep it open for ever
-        listens = self._lifeline, self._name, connections, weakref.ref(self._views)
+        weakref.finalize(self, lifeline.close)  # else the thread would keep it open for ever
+        listens = lifeline, weakref.ref(self._views), _loader(weakref.ref(self._client_loads))
         threading.Thread(target=listen, args=listens, name="rr-statuses", daemon=True).start()
 
     @property
@@ -358,6 +386,11 @@ class ClientRegistrar(Consumer):
         given.value = value
         return given
 
+    def ask(self, actor: str, message: Any, *, timeout_s: float | None = 30.0) -> Any:
+        """Ask an actor of the system as Client.ask() does. `rr.current().origin` of its handler is this registrar."""
+        self._lifeline.check_here()
+        return _asked(self._connections, actor, message, timeout_s, self._name)
+
     def set_on_status(self, query_or_id: Query | str, callback: StatusCallback | None) -> None:
         """Replace the status callback of a query of this registrar, as `query.on_status(callback)` does.
 
@@ -381,6 +414,7 @@ class ClientRegistrar(Consumer):
             NotRunning: the system has ended.
             Unavailable: the registrar does not answer.
         """
+        self._lifeline.check_here()
         with self._connections.lent() as client:
             found = client.queries(self.name)
         if found.notes:
@@ -412,13 +446,16 @@ class ClientRegistrar(Consumer):
             UsageError: as for Registrar.set_priority().
             UnknownQuery, NotRunning, Unavailable: as for fetch_state().
         """
-        given = checked_priority(priority, "set_priority")
-        self._connections.ask(GivePriority(self._row(target_id(query_or_id)).id, given))
+        given, id = checked_priority(priority, "set_priority"), target_id(query_or_id)
+        self._connections.ask(GivePriority(self._row(id).id, given))
+        self._views.reprioritized(id, given)
 
     def _row(self, id: str) -> QueryRow:
-        found = self._connections.ask(Find(id, self.name))
+        self._lifeline.check_here()
+        held_as = self._views.held_as(id)
+        found = self._connections.ask(Find(held_as, self.name))
         for row in found.queries:
-            if row.id == id and row.hold != "owed":
+            if row.id == held_as and row.hold != "owed":
                 return row
         if found.notes:
             raise Unavailable(f"query {id}: nothing is known of it: {'; '.join(found.notes)}")
@@ -426,7 +463,6 @@ class ClientRegistrar(Consumer):
 
     def close(self) -> None:
         """Close the registrar, whose queries are released a moment later. A second close does nothing."""
-        self._closed.set()
         self._lifeline.close()
 
     def __enter__(self) -> Self:
@@ -437,6 +473,14 @@ class ClientRegistrar(Consumer):
 
     def __repr__(self) -> str:
         return f"<ClientRegistrar {self.name}>"
+
+
+def _loader(loads_of: Callable[[], _ClientLoads | None]) -> Callable[[], Load | None]:
+    def load() -> Load | None:
+        loads = loads_of()
+        return None if loads is None else loads.load_again
+
+    return load
 
 
 class _ShownPlain(Codec):
@@ -455,12 +499,17 @@ def _shown_types(_server_id: str) -> tuple[Codec, Codec]:
     return _plain, _plain
 
 
-def connect(state_dir: str | os.PathLike[str] | None = None, *, wait_s: float | None = 0.0) -> Client:
+def connect(
+    state_dir: str | os.PathLike[str] | None = None, *, wait_s: float | None = 0.0, reconnect: bool = False
+) -> Client:
     """Return a client of a running system of this user, in this process or another.
 
     Args:
         state_dir: the system's state directory; None: the one that RR_STATE names, or else of the one running system.
         wait_s: how many seconds to wait for a system that does not run yet, or is being started again; None: no limit.
+        reconnect: when the system has ended, wait for its next run. The registrars are opened there, and their queries
+            load again. Each hears ERROR with the reason "ended". Later it hears a status with the reason "reconnected".
+            If it cannot be loaded again, it hears FATAL, with a message that says why.
 
     Raises:
         NotRunning: no system runs, or it has no console, also not within `wait_s`.
@@ -473,11 +522,27 @@ def connect(state_dir: str | os.PathLike[str] | None = None, *, wait_s: float | 
     deadline = None if limit_s is None else time.monotonic() + limit_s
     while True:
         try:
-            return Client(find_console(None if place is None else state_path(place)))
+            return Client(find_console(None if place is None else state_path(place)), reconnect=reconnect)
         except NotRunning:
             if deadline is not None and time.monotonic() >= deadline:
                 raise
         time.sleep(_RETRY_S)
+
+
+def _asked(connections: SystemConnections, actor: str, message: Any, timeout_s: float | None, asker: str = "") -> Any:
+    limit_s, what = _limit(timeout_s), f"message to {actor}"
+    try:
+        data = _encoded(message, what)
+        _any.decode(data, what, "message")
+    except (NotSerializable, InvalidRequest) as error:
+        if "limit" in error.details:
+            raise
+        got = error.message.rpartition("got ")[2].partition(", which only")[0]
+        text = "an actor that is asked from outside knows no classes: send the fields of an object, in a dict, say"
+        plain = "numbers, strings, bytes, lists, dicts and the like"
+        raise NotSerializable(f"{what}: expected {plain}, got {got}; {text}", path=what) from error
+    command = AskActor(actor, data, limit_s, asker)
+    return Codec(None, "answer").show(connections.ask(command, limit_s + _GRACE_S).answer)
 
 
 def _limit(timeout_s: float | None) -> float:
@@ -495,7 +560,7 @@ def _encoded(value: Any, what: str) -> bytes:
     data = encode(value, what)
     if len(data) > VALUE_LIMIT_BYTES:
         text = f"{what}: {len(data)} bytes is over a client's limit of {VALUE_LIMIT_BYTES}"
-        raise NotSerializable(f"{text}; give the name of a file, say", path=what)
+        raise NotSerializable(f"{text}; give the name of a file, say", path=what, limit=VALUE_LIMIT_BYTES)
     return data
 
 

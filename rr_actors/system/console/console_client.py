@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import select
 import socket
 import sys
 import threading
@@ -188,11 +189,13 @@ class ConsoleClient:
 
     def is_open(self) -> bool:
         """Return whether neither side has closed the connection; the thread that waits for answers asks between two."""
+        look = select.poll()
         try:
-            return bool(self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
+            look.register(self._socket, select.POLLIN)
+            return not look.poll(0) or bool(self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
         except BlockingIOError:
             return True
-        except OSError:  # closed here
+        except (OSError, ValueError):  # closed here
             return False
 
     def fileno(self) -> int:
@@ -385,6 +388,14 @@ class Connections:
         deadline = deadline_of(self._timeout_s if timeout_s is None else timeout_s)
         with self.lent(GREETING_S if timeout_s is None else min(GREETING_S, timeout_s)) as client:
             return client.ask(request, left_until(deadline))
+
+    def drop_ended(self) -> None:
+        """Close the idle connections that the system has closed."""
+        with self._lock:
+            ended = [client for client in self._idle if not client.is_open()]
+            self._idle = [client for client in self._idle if client not in ended]
+        for client in ended:
+            client.close()
 
     def close(self, why: str) -> None:
         """Close all connections. Calls in flight and later ones raise NotRunning. A second close does nothing."""

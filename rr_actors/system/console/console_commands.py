@@ -9,9 +9,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from rr_actors.actors.mailbox_refs import MailboxRef
+from rr_actors.actors.messaging.ask_cycles import asking_as
 from rr_actors.actors.messaging.mailbox_looks import MailboxInfo
+from rr_actors.actors.refs import Timeout
 from rr_actors.base.errors import (
     ActorUnavailable,
+    AskFailed,
     NotFound,
     NotSerializable,
     RrError,
@@ -19,10 +22,12 @@ from rr_actors.base.errors import (
     UnknownQuery,
     UsageError,
     few,
+    name_of_class,
     shown,
     text_of,
 )
 from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id, short_ids
+from rr_actors.base.reporting.tracebacks import raised_elsewhere
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.values.failure import error_of
 from rr_actors.registrar.arguments import LoadOptions
@@ -31,6 +36,7 @@ from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.registrar.queries import Status, response_bytes
 from rr_actors.registrar.registrar import load_bytes
+from rr_actors.runtime.callback_errors import traceback_of
 from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.runtime.processes.process import signal_name
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
@@ -225,6 +231,29 @@ class Revoke(Command[c.Done], frozen=True):
         return c.Done(f"revoked {text}", facts)
 
 
+class Reload(Command[c.Done], frozen=True):
+    """Unload a resource and load it again for the same request, in its owner's name; its holders keep it.
+
+    `id` may also be a part of its id, its name, or a query's id.
+    """
+
+    id: c.Text
+    timeout_s: c.Seconds = 30.0
+    dry_run: bool = False
+
+    def _carry_out(self, view: View, caller: Caller) -> c.Done:
+        resource = _only_resource(self.id, view.find(self.id).resources)
+        holders = resource.held_by or "nobody"
+        more = resource.holder_count - len(resource.holders)
+        text = f"{resource.name} ({short_id(resource.id)}), held by {holders}{f' and {more} more' if more else ''}"
+        facts = {"resource_id": resource.id, "server": resource.server, "holders": resource.holder_count}
+        if self.dry_run:
+            return c.Done(f"would reload {text}", facts)
+        registrar = view.registrar(resource.server.partition("/")[0])
+        registrar.reload(resource.id, timeout_s=self.timeout_s)
+        return c.Done(f"reloaded {text}", facts)
+
+
 def _only_resource(id: str, resources: list[ResourceRow]) -> ResourceRow:
     if len(resources) > 1:
         ids = short_ids(row.id for row in resources)
@@ -310,7 +339,13 @@ class Restart(Command[c.Done], frozen=True):
     dry_run: bool = False
 
     def _carry_out(self, view: View, caller: Caller) -> c.Done:
-        path, supervisor, child = _child(view, self.child)
+        try:
+            path, supervisor, child = _child(view, self.child)
+        except (NotFound, UsageError) as error:
+            if not (found := _resources_of(view, self.child)):
+                raise
+            text = f"{shown(self.child)}: expected a child of the tree, got a resource, {found[0].name}"
+            raise UsageError(f"{text}; `rr-actors reload {found[0].id}` unloads it and loads it again") from error
         spec = supervisor.get_childspec(child.id)
         is_dynamic = supervisor.describe()["strategy"] == "simple_one_for_one"
         if spec.restart == "temporary" or (is_dynamic and child.state != "stopped"):
@@ -322,6 +357,14 @@ class Restart(Command[c.Done], frozen=True):
             supervisor.terminate_child(child.id)
         supervisor.restart_child(child.id)
         return c.Done(f"started {path} again", facts | {"pid": supervisor.which_child(child.id).pid})
+
+
+def _resources_of(view: View, id: str) -> list[ResourceRow]:
+    """Return the resources that an id may mean; none if it is no id of any."""
+    try:
+        return view.find(id).resources
+    except (NotFound, UsageError):
+        return []
 
 
 class StartChild(Command[c.Done], frozen=True):
@@ -506,24 +549,38 @@ class AwaitStatuses(Command[c.Statuses], frozen=True):
 
 
 class AskActor(Command[c.Replied], frozen=True):
-    """Ask an actor of the tree, by its path or id; the message is plain data, as canonical bytes."""
+    """Ask an actor of the tree, by its path or id; the message is plain data, as canonical bytes.
+
+    `asker`: the name that the actor's handler sees, a registrar of this client or "client.pid-" and its process.
+    """
 
     actor: c.Text
     message: c.Value
     timeout_s: c.Seconds = 30.0
+    asker: c.Text = ""
 
     def _carry_out(self, view: View, caller: Caller) -> c.Replied:
-        message = _message.decode(self.message, self.actor, "message")
-        reply = view.system.ref(self.actor).ask(message, block=False)
+        message = ANY.decode(self.message, self.actor, "message")
+        ref = view.system.ref(self.actor)
+        name = view.clients.asking(caller, self.asker)
         try:
-            error = reply.exception(self.timeout_s)
-        except TimeoutError as late:
-            reply.cancel()
+            with asking_as(name):
+                answer = ref.ask(message, timeout=self.timeout_s)
+        except Timeout as late:
             text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
             raise Unavailable(text) from late
-        if error is not None and not isinstance(error, RrError):  # raised by the actor's handler
-            raise RrError(f"{self.actor}: {text_of(error)}") from error
-        return c.Replied(encode(reply.get(), f"answer of {self.actor}"))
+        except Exception as error:
+            raise self._failed(error) from error
+        return c.Replied(encode(answer, f"answer of {self.actor}"))
+
+    def _failed(self, error: Exception) -> RrError:
+        """Return the error for the client: one of this package stays of its class, and another is described."""
+        raised = {"actor": self.actor, "traceback": raised_elsewhere(error) or traceback_of(error)}
+        if isinstance(error, RrError):
+            if raised["traceback"]:  # by the handler, not on the way to it
+                error.details = raised | error.details
+            return error
+        return AskFailed(f"{self.actor}: {text_of(error)}", error=name_of_class(type(error)), **raised)
 
 
-_message = Codec(None, "message")
+ANY = Codec(None, "message")

@@ -14,14 +14,14 @@ from rr_actors.registrar.pages import LOAD_ORDERS, RESOURCE_ORDERS, STREAM_ORDER
 from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.client_registrars import Caller
-from rr_actors.system.console.console_view import Verb, View, room_for
+from rr_actors.system.console.console_view import Look, Verb, View, room_for
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.snapshots import ask_each
 
 _A = TypeVar("_A")
 
 
-class Listing(Verb[_A], frozen=True):
+class Listing(Look[_A], frozen=True):
     """A page of the rows that have the text `match` in them: at most `limit`, and as many as have room in an answer."""
 
     match: c.Text = ""
@@ -78,7 +78,7 @@ class ListResources(ListRows[c.Resources], frozen=True):
         return c.Resources(found.total, found.resources[: room_for(found.resources, notes)], notes)
 
 
-class ListServers(Verb[c.Servers], frozen=True):
+class ListServers(Look[c.Servers], frozen=True):
     """The servers of all registrars: how many resources of each are in each state, and what these hold elsewhere."""
 
     def _carry_out(self, view: View, caller: Caller) -> c.Servers:

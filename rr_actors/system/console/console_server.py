@@ -26,7 +26,7 @@ from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_commands import AwaitStatuses, Hold, OpenRegistrar
 from rr_actors.system.console.console_feed import Feed, Reader
 from rr_actors.system.console.console_protocol import REQUESTS, decoder_of
-from rr_actors.system.console.console_view import Command, Verb, View, Viewed
+from rr_actors.system.console.console_view import Command, Look, Verb, View, Viewed
 from rr_actors.system.console.running_systems import ListedSystem
 from rr_actors.system.event_subscribers import Subscribers
 from rr_actors.system.recording.event_memory import EventMemory
@@ -151,15 +151,20 @@ class Console:
         try:
             if not isinstance(request, Verb):
                 raise UsageError(f"{name}: this connection has said Hello already")
-            if self.stopping and isinstance(request, Command):
-                raise Unavailable(f"system {self.node.info.name!r} is stopping")
-            answer = cast("Verb[c.Message]", request).carry_out(self.view, caller)
+            verb = cast("Verb[c.Message]", request)
+            self._check_stopping(verb, Command, Look)
+            answer = verb.carry_out(self.view, caller)
+            self._check_stopping(verb, Look)  # a part of it may have been taken apart meanwhile
             frame = framed(answer, c.ANSWER_LIMIT_BYTES, "the longest answer of a console")
             return frame, answer.query_id if isinstance(answer, c.Holding) else ""
         except Exception as error:
             if not isinstance(error, RrError):
                 logger.exception("console: %s failed", name)
             return refusal(error), ""
+
+    def _check_stopping(self, request: Verb[Any], *refused: type[Verb[Any]]) -> None:
+        if self.stopping and isinstance(request, refused):
+            raise Unavailable(f"system {self.node.info.name!r} is stopping")
 
     def missed(self, count: int, seq: int) -> bytes:
         """Return the frame for a reader that was too slow. In a worker."""
@@ -187,7 +192,8 @@ class Connection(asyncio.Protocol):
         self._looks = False  # whether the loop will look for the client
         self._reader: Reader | None = None
         self._has_registrars = False
-        self._client: object = ""
+        self.client: object = ""  # what all connections of one client have in common
+        self.pid = 0
         self._unheard: tuple[str, ...] = ()  # the registrar and query of the last answer, until Keep
 
     @property
@@ -211,6 +217,7 @@ class Connection(asyncio.Protocol):
         """Accept the console, if it is this user's and there is room."""
         self._transport = cast("asyncio.Transport", transport)
         peer = peer_of(transport)
+        self.pid = peer.pid
         if not peer.trusted:
             self._console.refusals.note(f"console: refused {peer}, of user {peer.uid}")
             self._transport.abort()
@@ -283,7 +290,7 @@ class Connection(asyncio.Protocol):
         self._requests.clear()
         if self in self._console.connections:
             self._console.connections.remove(self)
-            self._console.counted(self._client, -1)
+            self._console.counted(self.client, -1)
         if self._reader is not None:
             self._console.feed.remove(self._reader)
         self._release_unheard()
@@ -347,7 +354,7 @@ class Connection(asyncio.Protocol):
             return
         self._console.counted("", -1)
         self._console.counted(client, 1)
-        self._client = client
+        self.client = client
         self._greeted = True
         self._transport.write(framed(self._console.welcome, c.ANSWER_LIMIT_BYTES))
         self._next()

@@ -431,5 +431,9 @@ class Verb(c.Message, Generic[_A], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> _A: ...
 
 
+class Look(Verb[_A], frozen=True):
+    """A question about the rows of a tree or of registrars. A system that is stopping refuses it: they fall apart."""
+
+
 class Command(Verb[_A], frozen=True):
     """A verb that changes something. A system that is stopping refuses it."""

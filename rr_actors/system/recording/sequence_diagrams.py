@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from rr_actors.actors.messaging.message_notes import REPLIES
+from rr_actors.actors.messaging.message_notes import MESSAGES, REPLIES
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.timings import ANSWERS
 
@@ -17,7 +17,7 @@ _MOST = 1000  # arrows; a browser draws no more
 def sequence_of(entries: Sequence[Entry]) -> str:
     """Return a diagram of these entries, which are in the order of their time.
 
-    The arrow of a message that never arrived, as its receiver was killed, ends in a cross.
+    The arrow of a message that is not known to have arrived, as its receiver was killed, ends in a cross.
     """
     names = _participants(entries)
     lines = ["sequenceDiagram"]
@@ -38,7 +38,8 @@ def sequence_of(entries: Sequence[Entry]) -> str:
             lines.append(_arrow(entry, names, lost=number in lost, at=at))
         elif entry.event == "began":
             since[entry.server, entry.resource, entry.name] = entry.at
-            lines.append(f"    Note over {me}: {_text(f'{at}: {entry.name} {entry.server} begins')}")
+            what = f"{at}: {entry.name} {entry.server} begins"
+            lines.append(f"    Note over {me}: {_text(', '.join(filter(None, (what, entry.detail))))}")
         elif entry.event == "ended":
             start = since.pop((entry.server, entry.resource, entry.name), None)
             took = "" if start is None else f" after {(entry.at - start) * 1000:.1f} ms"
@@ -66,7 +67,7 @@ def _arrow(entry: Entry, names: dict[str, str], *, lost: bool, at: str) -> str:
     source, target = (me, other) if entry.event == "sent" else (other, me)
     arrow = ("--" if entry.name in ANSWERS else "-") + ("x" if lost else ">>")
     what = " ".join(text for text in (entry.name, entry.server, entry.detail) if text)
-    end = " (did not arrive)" if lost else ""
+    end = "" if not lost else " (did not arrive)" if entry.name in MESSAGES else " (no record of its arrival)"
     return f"    {source}{arrow}{target}: {_text(f'{at}: {what}')}{end}"
 
 
@@ -82,6 +83,7 @@ def _arrivals(entries: Sequence[Entry]) -> tuple[set[int], set[int]]:
             waiting.popleft()
             paired.add(number)
     lost = {number for waiting in sent.values() for number in waiting} - _answered(entries)
+    lost = set(_without_effect(entries, lost))
     return paired, {number for number in lost if entries[number].name not in REPLIES}  # a future's answer is noted once
 
 
@@ -106,6 +108,24 @@ def _answered(entries: Sequence[Entry]) -> set[int]:
                 found.add(number)
             has_answer[key] = False
     return found
+
+
+def _without_effect(entries: Sequence[Entry], lost: set[int]) -> Iterator[int]:
+    """Yield the sendings of which the receiver has shown no effect before they were sent again.
+
+    A receiver that is killed takes its last entries with it. Its next process reads the request from the catalog, and
+    its callback runs: so the request has arrived.
+    """
+    effects: set[tuple[str, str, str]] = set()  # of the entries after this one: where, which callback, for what
+    for number in range(len(entries) - 1, -1, -1):
+        entry = entries[number]
+        if entry.event in ("began", "ended"):
+            effects |= {(entry.registrar, entry.name, id) for id in (entry.query, entry.resource) if id}
+        elif entry.event == "sent":
+            shown = {(entry.peer, entry.name.lower(), id) for id in (entry.query, entry.resource) if id}
+            if number in lost and not effects & shown:
+                yield number
+            effects -= shown
 
 
 def _text(text: str) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from rr_actors.registrar.pages import ServerRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.console_client import read_pages
@@ -28,6 +29,7 @@ class Figures:
         curve: the CPU of the last five minutes.
         counts, loads: of its registrar: the counts, and the loads a second.
         registrar: the registrar; None for a child.
+        parts: if they were asked for, its registrar and the servers of that.
     """
 
     row: c.ChildRow
@@ -37,6 +39,7 @@ class Figures:
     counts: Mapping[str, int]
     loads: float | None
     registrar: c.RegistrarRow | None = None
+    parts: tuple[Figures, ...] = ()
 
     @property
     def cpu(self) -> str:
@@ -92,7 +95,7 @@ class TreeTables:
         narrow = ("cpu", "memory", "restarts", "mailbox", "resources", "loads/s", "cpu, last 5 min")
         self.children = Table(
             "children", _COLUMNS, self._children, _child, narrow,
-            named=lambda of: of.row.path, facts=lambda of: facts_of(of.row),
+            named=lambda of: of.row.path, facts=lambda of: facts_of(of.row), below=lambda of: of.parts,
         )  # fmt: skip
         self.registrars = Table("registrars", _COLUMNS, self._registrars, _registrar, narrow)
 
@@ -104,9 +107,11 @@ class TreeTables:
             }
         if key := _KEYS.get(look.sort):
             everyone = [row for page in read_pages(asks.ask, questions.ListChildren(look.match)) for row in page.rows]
-            return look.cut(sorted(self.figures(everyone, counts, as_path=True), key=key, reverse=True))
-        page = asks.ask(questions.ListChildren(look.match, look.offset, look.limit))
-        return Rows(page.total, self.figures(page.rows, counts, as_path=bool(look.match)))
+            rows = look.cut(sorted(self.figures(everyone, counts, as_path=True), key=key, reverse=True))
+        else:
+            page = asks.ask(questions.ListChildren(look.match, look.offset, look.limit))
+            rows = Rows(page.total, self.figures(page.rows, counts, as_path=bool(look.match)))
+        return Rows(rows.total, _with_parts(asks, rows.rows)) if look.parts else rows
 
     def figures(
         self, rows: Sequence[c.ChildRow], counts: Mapping[str, Mapping[str, int]], *, as_path: bool
@@ -133,6 +138,44 @@ class TreeTables:
             Figures(_NO_CHILD, "", None, "", row.counts, self._rate(row.name, row.counts), row) for row in page.rows
         ]
         return Rows(page.total, rows)
+
+
+def _with_parts(asks: Asks, children: Sequence[Figures]) -> list[Figures]:
+    """Return the children, each with its parts: its registrar and the servers of that."""
+    registrars = {row.name: row for page in read_pages(asks.ask, questions.ListRegistrars()) for row in page.rows}
+    servers: dict[str, list[ServerRow]] = {}
+    for server in asks.ask(questions.ListServers()).rows:
+        servers.setdefault(server.server.partition("/")[0], []).append(server)
+    shown: list[Figures] = []
+    for child in children:
+        registrar = registrars.get(child.row.id) if child.row.type != "supervisor" else None
+        rows = [] if registrar is None else _parts(child.row, registrar, servers.get(registrar.name, ()))
+        as_path = child.name == child.row.path
+        names = [row.path if as_path else "  " * row.depth + row.id for row in rows]
+        parts = [Figures(row, name, None, "", _NONE, None) for row, name in zip(rows, names, strict=True)]
+        shown.append(replace(child, parts=tuple(parts)))
+    return shown
+
+
+def _parts(child: c.ChildRow, registrar: c.RegistrarRow, servers: Sequence[ServerRow]) -> list[c.ChildRow]:
+    path, state = f"{child.path}/registrar", "running" if registrar.status == "up" else registrar.status
+    waiting = registrar.counts.get("mailbox", 0)
+    note = registrar.error or (f"{waiting} wait" if waiting else "")
+    rows = [c.ChildRow(path, child.depth + 1, "registrar", state, note=note)]
+    for server in servers:
+        if "/" in server.server:  # else it is the registrar itself
+            place = f"{path}/servers/{server.server.partition('/')[2]}"
+            rows.append(c.ChildRow(place, child.depth + 2, "server", state, note=_doing(server)))
+    return rows
+
+
+def _doing(server: ServerRow) -> str:
+    """Return what a server does now, for people."""
+    count = sum(server.states.values())
+    resources = f"{count} resource{'' if count == 1 else 's'}" if count else ""
+    runs = ", ".join(f"{count} {role}" for role, count in sorted(server.runs.items()))
+    waiting = f"{server.waiting} wait" if server.waiting else ""
+    return "; ".join(filter(None, (f"runs {runs}" if runs else "", waiting, resources)))
 
 
 def _child(of: Figures, has_columns: bool) -> Row:

@@ -111,6 +111,10 @@ RESOURCE_COMMANDS = (
         "revoke", "R", "revoke {}", _no_resource, lambda row: commands.Revoke(row.resource, "revoked by hand"),
         "Its holders have 5 s to release it.",
     ),
+    RowCommand(
+        "reload", "l", "reload {}", _no_resource, lambda row: commands.Reload(row.resource),
+        "It does not work until it is loaded again.",
+    ),
 )  # fmt: skip
 ROW_COMMANDS = (*CHILD_COMMANDS, *QUERY_COMMANDS, *RESOURCE_COMMANDS)
 KEYS = {one.key: one.label for one in ROW_COMMANDS if one.name != "start"}

@@ -68,7 +68,7 @@ SHEETS = (
         "children", "ps",
         "Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its start) and memory.",
         "ps --json | jq '.[] | select(.state != \"running\")'", "Only children with this text in their paths.",
-        "1", _tree, options=(), in_verb=1, title="tree",
+        "1", _tree, options=("parts",), in_verb=1, title="tree",
     ),
     Sheet(
         "resources", "resources", "List the resources of the running system, and who holds each.",

@@ -93,6 +93,7 @@ class Look:
         sort: the head of the column that sorts them; "": as they are there.
         registrar, states, holder: only rows of this registrar, in one of these states, held by this registrar.
         live: whether the figures are wanted that only `top` has.
+        parts: whether each manager's parts are wanted below it: its registrar, and the servers of that.
     """
 
     match: str = ""
@@ -103,6 +104,7 @@ class Look:
     states: tuple[str, ...] = ()
     holder: str = ""
     live: bool = False
+    parts: bool = False
 
     def cut(self, rows: Sequence[_Row]) -> Rows[_Row]:
         """Return the part that is asked for, of all rows."""
@@ -131,6 +133,10 @@ class Rows(Generic[_Row]):
     notes: Sequence[str] = ()
 
 
+def _none(_row: object) -> tuple[()]:
+    return ()
+
+
 def _itself(row: Any) -> Any:
     return row
 
@@ -149,6 +155,7 @@ class Table(Generic[_Row]):
         caption: returns what stands above it on a page, for so many rows.
         named: returns the name of a row that commands take.
         facts: returns a row for programs.
+        below: returns the rows that stand below a row where all are read at once, and do not count.
         page_sort: the head of the column that sorts it on a page, until the reader chooses another one.
     """
 
@@ -161,6 +168,7 @@ class Table(Generic[_Row]):
     caption: Callable[[int], str] = str
     named: Callable[[_Row], str] = str
     facts: Callable[[_Row], Any] = _itself
+    below: Callable[[_Row], Sequence[_Row]] = _none
     page_sort: str = ""
 
     def shown_in(self, view: str) -> list[Column[_Row]]:
@@ -187,13 +195,14 @@ class Table(Generic[_Row]):
 
     def read(self, asks: Asks, look: Look, limit: int) -> Rows[_Row]:
         """Ask for one part after another, until there are `limit` rows or no more."""
-        rows, notes = list[_Row](), dict[str, None]()
+        rows, notes, count = list[_Row](), dict[str, None](), 0
         while True:
-            part = self.look(asks, replace(look, offset=len(rows), limit=min(limit - len(rows), c.PAGE_LIMIT)))
-            rows += part.rows
+            part = self.look(asks, replace(look, offset=count, limit=min(limit - count, c.PAGE_LIMIT)))
+            count += len(part.rows)
+            rows += [shown for row in part.rows for shown in (row, *self.below(row))]
             notes |= dict.fromkeys(part.notes)
-            if not part.rows or len(rows) >= min(part.total, limit):
-                return Rows(part.total, rows, list(notes))
+            if not part.rows or count >= min(part.total, limit):
+                return Rows(part.total + len(rows) - count, rows, list(notes))
 
 
 def tables_of(module: ModuleType) -> tuple[Table[Any], ...]:

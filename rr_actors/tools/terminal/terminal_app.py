@@ -79,8 +79,8 @@ _KEYS = """\
  K  t        kills the chosen child; stops it; each after a question: y is yes
  r           restarts the chosen child, or starts it if it is stopped
  u  p        unloads the query of the chosen row; gives it a priority
- U  R        takes the chosen resource away from all its holders; revokes it;
-             each after a question
+ U  R  l     takes the chosen resource away from all its holders; revokes it;
+             reloads it; each after a question
  q           leaves
 
  CPU is that since the last look. Of several children in one process the first

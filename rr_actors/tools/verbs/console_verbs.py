@@ -318,6 +318,18 @@ def revoke(
     carry_out(state, commands.Revoke(id, why, grace_s, dry_run), as_json, grace_s + _UNLOAD_S)
 
 
+@app.command(epilog="Example: rr-actors reload 'cameras/camera \"/dev/video0\"'")
+def reload(
+    id: Annotated[str, typer.Argument(help=f"The resource's id, {_PART}.", autocompletion=completing(list_resources))],
+    timeout_s: Timeout = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Unload a resource and load it again for the same request; its holders keep it, and hear the new response."""
+    carry_out(state, commands.Reload(id, timeout_s, dry_run), as_json, timeout_s)
+
+
 @app.command(epilog="Example: rr-actors kill cameras --signal SIGSTOP")
 def kill(
     child: ChildArgument,

@@ -42,6 +42,10 @@ _OPTIONS: dict[str, Any] = {
     "status": Annotated[
         list[str] | None, typer.Option(help="Only those in this state, OK or loading for instance; may be repeated.")
     ],
+    "parts": Annotated[
+        bool,
+        typer.Option("--parts", help="Below each manager its registrar and the servers of that, and what these do."),
+    ],
     "holder": Annotated[
         str, typer.Option(help="Only those that this registrar holds.", autocompletion=completing(list_registrars))
     ],
@@ -69,6 +73,7 @@ def _verb(sheet: Sheet) -> Callable[..., None]:
         limit: int | None = None,
         status: list[str] | None = None,
         holder: str = "",
+        parts: bool = False,
         sort_by: str | None = None,
         wide: bool = False,
         output: str | None = None,
@@ -79,7 +84,9 @@ def _verb(sheet: Sheet) -> Callable[..., None]:
         known = {one.lower() for one in CONDITIONS}
         if wrong := [one for one in status or () if one.lower() not in known]:
             raise UsageError(f"--status: expected one of {', '.join(reversed(CONDITIONS))}, got {shown(wrong[0])}")
-        look = Look(match, sort=sort_by or "", registrar=registrar, states=tuple(status or ()), holder=holder)
+        look = Look(
+            match, sort=sort_by or "", registrar=registrar, states=tuple(status or ()), holder=holder, parts=parts
+        )
         form = "json" if as_json else output or ("wide" if wide else "")
         shown_again(watch, lambda: _show(tables, look, limit, form, state))
 

@@ -1,27 +1,34 @@
-"""The commands of `rr-actors` for managers that plan: what a Keeper keeps, and the pools of Budgets."""
+"""The commands of `rr-actors` for managers that plan: a Keeper, the pools of Budgets, the choices of Choices."""
 
 from __future__ import annotations
 
+import os
+import pwd
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from rr_actors.base.errors import UsageError
+from rr_actors.base.names import short_id
 from rr_actors.base.toml import read_bytes
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import AskActor
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_table
+from rr_actors.tools.verbs.console_options import DryRun
 
 app = typer.Typer()
 _ANSWER_S = 60.0
 _LOOSE = Codec(None, "answer")
 
+ChoicesOption = Annotated[
+    str, typer.Option("--choices", metavar="ID", help="The id or path of the child that has the choices.")
+]
 KeeperOption = Annotated[str, typer.Option("--keeper", metavar="ID", help="The id or path of the child that keeps.")]
 
 
-def _asked(state: Path | None, planner: str, message: dict[str, str | None]) -> Any:
+def _asked(state: Path | None, planner: str, message: dict[str, Any]) -> Any:
     command = AskActor(planner, encode(message, f"message to {planner}"), _ANSWER_S)
     with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
         return _LOOSE.show(client.ask(command).answer)
@@ -87,8 +94,19 @@ def _say_kept(rows: list[dict[str, Any]], as_json: bool) -> None:
     if as_json:
         say_json(rows)
     elif rows:
-        cells = [(row["name"], f"{row['ready']} of {row['wanted']}", row["why"], row["detail"]) for row in rows]
-        say_table(("kept", "ready", "why", ""), cells, gives_way=("",), right=("ready",))
+        cells = [
+            (
+                row["name"],
+                f"{row['ready']} of {row['wanted']}",
+                "" if row["least"] is None else f"{row['least']}-{row['most']}",
+                row["scaled"],
+                row["why"],
+                row["detail"],
+            )
+            for row in rows
+        ]
+        heads = ("kept", "ready", "range", "scaled", "why", "")
+        say_table(heads, cells, gives_way=("", "scaled"), right=("ready",))
     else:
         say("nothing is kept", err=True)
 
@@ -120,3 +138,57 @@ def budgets(
     ]
     heads = ("pool", "capacity", "used", "free", "waiting", "enforced", "problem")
     say_table(heads, cells, gives_way=("problem",), right=("capacity", "used", "free", "waiting"))
+
+
+def _me() -> str:
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return str(os.getuid())
+
+
+@app.command(epilog="Example: rr-actors choices")
+def choices(child: ChoicesOption = "choices", state: StateOption = None, as_json: JsonOption = False) -> None:
+    """Show the choices of a Choices: which alternative each has, and what was chosen by hand, by whom."""
+    rows: list[dict[str, Any]] = _asked(state, child, {"choices": None})
+    if as_json:
+        say_json(rows)
+    elif rows:
+        cells = [
+            (short_id(row["id"]), row["kind"], row["present"], row["by_hand"], row["by"], row["why"]) for row in rows
+        ]
+        say_table(
+            ("id", "kind", "in use", "by hand", "by", "why not"), cells, gives_way=("in use", "by hand", "why not")
+        )
+    else:
+        say("there are no choices", err=True)
+
+
+@app.command(epilog="Example: rr-actors choose range lidars/lidar")
+def choose(
+    choice: Annotated[str, typer.Argument(help="The id of a choice, its beginning or end, or its kind.")],
+    alternative: Annotated[
+        str | None, typer.Argument(help="Its server, or the whole as `choices --json` shows it under `allowed`.")
+    ] = None,
+    freely: Annotated[bool, typer.Option("--freely", help="Take back what was chosen by hand.")] = False,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who chooses; you, if it is not given.")] = "",
+    child: ChoicesOption = "choices",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Fix which alternative a choice has, until --freely takes that back; while it fails, another one serves."""
+    if (alternative is None) is not freely:
+        raise UsageError("choose: expected an alternative or --freely, and not both")
+    message = {"choose": choice, "alternative": alternative, "dry_run": dry_run}
+    (row,) = _asked(state, child, message if freely else message | {"by": by or _me()})
+    if as_json:
+        say_json(row)
+        return
+    what = f"choice {short_id(row['id'])} ({row['kind']})"
+    would = "would take back" if dry_run else "took back"
+    if freely:
+        say(f"{would} what was chosen by hand for {what}; it has {row['present']}")
+    else:
+        fixed = alternative if dry_run else row["by_hand"]
+        say(f"{'would choose' if dry_run else 'chose'} {fixed} for {what}, which has {row['present']}")

@@ -18,13 +18,16 @@ import typer
 
 from rr_actors.base.errors import NotFound, NotRunning, UsageError, did_you_mean, few, shown, text_of
 from rr_actors.base.names import short_id
+from rr_actors.base.values.canonical import encode
 from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.streams.stream import Stream, StreamFrame, StreamRow
+from rr_actors.streams.stream_file import StreamHeader, StreamWriter
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
-from rr_actors.system.console.console_questions import Find
+from rr_actors.system.console.console_questions import Find, ReadResponse
 from rr_actors.system.recording.recordings import Recording, RecordingFile, add, read_recording
+from rr_actors.system.recording.stream_recordings import LIMIT_BYTES
 from rr_actors.system.recording.timelines import read_timeline
 from rr_actors.system.recording.traces import Trace
 from rr_actors.tools import graphs
@@ -253,19 +256,28 @@ def stream(
         Path | None,
         typer.Option("--save", metavar="FILE", help="Read one frame into a new file: .png, .npy (numpy's), or .bin."),
     ] = None,
-    count: Annotated[int | None, typer.Option(min=1, help="End after so many lines. Default: at Ctrl-C.")] = None,
+    record_file: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="FILE", help="Read the stream into a new file, for rr.read_stream()."),
+    ] = None,
+    limit: Annotated[
+        int, typer.Option("--limit-bytes", min=1, help="With --record: the most that the file may have.")
+    ] = LIMIT_BYTES,
+    count: Annotated[
+        int | None, typer.Option(min=1, help="End after so many lines or frames. Default: at Ctrl-C.")
+    ] = None,
     timeout_s: Annotated[
         float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=86_400.0, help="The longest wait for a frame.")
     ] = 30.0,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show a stream's rate; or read it as one reader more, and show its frames or save one.
+    """Show a stream's rate; or read it as one reader more, and show its frames, save one, or record them.
 
     Without an option: --rate. To read imports the classes of the values.
     """
-    if rate + echo + (save is not None) > 1:
-        raise UsageError("stream: expected one of --rate, --echo and --save FILE, got several")
+    if rate + echo + (save is not None) + (record_file is not None) > 1:
+        raise UsageError("stream: expected one of --rate, --echo, --save FILE and --record FILE, got several")
     write = None if save is None else _writer(save)
     with ConsoleClient(find_console(state)) as client:
         row = _found(client, id, name)
@@ -275,6 +287,8 @@ def stream(
                 raise NotFound(f"stream {row.info.name!r}: its resource was unloaded", id=row.info.resource_id)
             _save(save, write, frame)
             say(f"saved frame {frame.number} in {save}")
+        elif record_file is not None:
+            _record(client, row, record_file, limit, itertools.islice(_frames(client, row, timeout_s), count))
         elif echo:
             for frame in itertools.islice(_frames(client, row, timeout_s), count):
                 _say_frame(frame, as_json)
@@ -352,6 +366,41 @@ def _frames(client: ConsoleClient, row: StreamRow, timeout_s: float) -> Iterator
 
     yield from frames_of(Stream(row.info.resource_id, row.info.name), is_over, timeout_s)
     say(f"stream {row.info.name!r}: its resource was unloaded", err=True)
+
+
+def _record(client: ConsoleClient, row: StreamRow, file: Path, limit: int, frames: Iterator[StreamFrame]) -> None:
+    """Write the frames into a new file, as they come."""
+    response = client.ask(ReadResponse(row.info.resource_id, row.info.server.partition("/")[0])).text
+    writer = StreamWriter(file, _header(row, response), limit)
+    written = missed = 0
+    try:
+        with suppress(KeyboardInterrupt):
+            for frame in frames:
+                if not writer.write(frame):
+                    say(f"{file} has reached its limit of {limit} bytes", err=True)
+                    break
+                written += 1
+                missed += frame.missed
+    finally:
+        writer.close()
+    lost = f", {missed} missed" if missed else ""
+    say(f"recorded {written} frames in {file}{lost}")
+
+
+def _header(row: StreamRow, response: str) -> StreamHeader:
+    """Return what is known of a stream from outside: requests and responses as JSON has them."""
+    info = row.info
+    return StreamHeader(
+        info.name, info.resource_id, info.server, _encoded(row.request), _encoded(response), time.time()
+    )
+
+
+def _encoded(text: str) -> bytes | None:
+    """Return the canonical bytes of a value that is shown as JSON; None if it is cut."""
+    try:
+        return encode(msgspec.json.decode(text))
+    except msgspec.DecodeError:
+        return None
 
 
 def _say_frame(frame: StreamFrame, as_json: bool) -> None:

@@ -143,6 +143,9 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
                 "Show the pools of a Budgets: how much each has, what is used and free, and how many "
                 "loads wait for room"
             ),
+            "choices": (
+                "Show the choices of a Choices: which alternative each has, and what was chosen by hand, by whom"
+            ),
         },
     },
     "Change its resources": {
@@ -157,6 +160,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
                 "Take a resource away from its holders in its owner's name: what depends on it ends "
                 "first, or replaces it"
             ),
+            "reload": (
+                "Unload a resource and load it again for the same request; its holders keep it, and hear "
+                "the new response"
+            ),
         },
         _mailboxes: {
             "status": (
@@ -167,7 +174,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
         _planner: {
             "apply": (
                 "Have a Keeper keep what another file wants, and show what changes: + is added, - is removed, ~ differs"
-            )
+            ),
+            "choose": (
+                "Fix which alternative a choice has, until --freely takes that back; while it fails, another one serves"
+            ),
         },
     },
     "Run, change and stop it": {

@@ -102,7 +102,8 @@ class LabExperiment:
 
     Attributes:
         program: its file.
-        title, about, look_for: texts for people, from its docstring.
+        title, about: texts for people, from its docstring.
+        look_for, why: what can be seen, and the reason. Both come after the answer to its question.
         code: its text after that.
         declared: what the file declares.
     """
@@ -111,6 +112,7 @@ class LabExperiment:
     title: str
     about: str
     look_for: str
+    why: str
     code: str
     declared: LabDeclaration
 

@@ -1,7 +1,8 @@
 """The folder of the lab: each Python file in it is an experiment. They are read as text, and never imported here.
 
-An experiment has a docstring and `def main(state_dir, ...)`. The docstring's first line is the title; "Look for:" says
-what a reader can see. A block of comments declares levers and a question, as TOML:
+An experiment has a docstring and `def main(state_dir, ...)`. The docstring's first line is the title, what follows is
+what a reader knows before the run. "Look for:" says what can be seen, and "Why:" explains it: the page keeps both back
+until its question is answered. A block of comments declares levers and a question, as TOML:
 
     # /// lab
     # question = "What becomes of the child?"
@@ -28,7 +29,7 @@ from rr_actors.base.toml import parse_typed, wrong
 from rr_actors.tools.web.lab.lab_declarations import LabDeclaration, LabExperiment
 
 _BLOCK = re.compile(r"^# /// lab\n((?:#(?: .*)?\n)*?)# ///\n", re.MULTILINE)
-_LOOK_FOR = "Look for:"
+_LOOK_FOR, _WHY = "Look for:", "Why:"
 
 
 class Lab(NamedTuple):
@@ -95,10 +96,11 @@ def read_experiment(file: Path) -> LabExperiment:
         if lever.name not in parameters:
             raise wrong(f"{file}: lab", "levers", f"a parameter of main(): {', '.join(parameters)}", lever.name)
     title, _, rest = inspect.cleandoc(docstring).partition("\n")
+    rest, _, why = rest.partition(_WHY)
     about, _, look_for = rest.partition(_LOOK_FOR)
     code = "".join(text.splitlines(keepends=True)[tree.body[0].end_lineno :])
     code = _BLOCK.sub("", code).strip() + "\n"
-    return LabExperiment(file, title.rstrip("."), _flowing(about), _flowing(look_for), code, declared)
+    return LabExperiment(file, title.rstrip("."), _flowing(about), _flowing(look_for), _flowing(why), code, declared)
 
 
 def _flowing(text: str) -> str:

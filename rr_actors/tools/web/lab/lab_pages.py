@@ -108,6 +108,7 @@ class LabPage:
         self._takes_code = takes_code
         self._experiment: LabExperiment | None = None
         self._chosen = ""  # the path of a child
+        self._is_told = False  # what the run has shown
         self._status = _bar("/lab")
         self._status.text = "choose an experiment"
         with ui.element("main").classes("rr-lab"):
@@ -131,10 +132,12 @@ class LabPage:
         with ui.row().classes("gap-2 items-center") as self._run_row:
             ui.button("run it", on_click=self._start).props("outline no-caps dense")
             ui.button("stop it", on_click=self._place.stop).props("outline no-caps dense")
+            self._hint = ui.button("what to look for", on_click=self._show_hint).props("outline no-caps dense")
             self._notebook = ui.link("the same as a notebook", "/lab")
         self._look_for = ui.label("").classes("text-bold")
         self._verdict = ui.label("").classes("rr-verdict").props('role="alert"')
-        self._verdict.set_visibility(False)
+        self._why = ui.label("")
+        self._hide_answers()
         self._player = Player(self._pick)
         with self._player.buttons:
             self._kill_button = ui.button("kill -9 the chosen child", on_click=self._kill)
@@ -158,6 +161,15 @@ class LabPage:
             "w-full"
         )
 
+    def _hide_answers(self) -> None:
+        for part in (self._look_for, self._verdict, self._why):
+            part.set_visibility(False)
+        self._hint.set_visibility(True)
+
+    def _show_hint(self) -> None:
+        self._look_for.set_visibility(bool(self._look_for.text))
+        self._hint.set_visibility(False)
+
     async def choose(self, experiment: LabExperiment) -> None:
         """Show an experiment that waits to be run."""
         await self._place.stop()
@@ -165,8 +177,11 @@ class LabPage:
         self._experiment, self._chosen = experiment, ""
         self._title.text, self._about.text = experiment.title, experiment.about
         self._look_for.text = f"Look for: {experiment.look_for}" if experiment.look_for else ""
+        self._why.text = f"Why: {experiment.why}" if experiment.why else ""
+        self._hide_answers()
+        if experiment.question is None:
+            self._show_hint()
         self._original = self._code.value = experiment.code
-        self._verdict.set_visibility(False)
         self._status.text = f"{experiment.name} waits for you"
         self._levers = {lever.name: str(lever.choices[0]) for lever in experiment.levers}
         self._answers: dict[str, bool] = dict.fromkeys(experiment.declared.answers, False)
@@ -205,12 +220,15 @@ class LabPage:
             return
         text = self._code.value or ""
         code = text if self._takes_code and text != self._original else ""
-        self._verdict.set_visibility(False)
+        for part in (self._verdict, self._why):
+            part.set_visibility(False)
         self._asked = frozenset(answer for answer, is_given in self._answers.items() if is_given)
+        if self._asked:
+            self._show_hint()
         if not await self._place.start(experiment.program, experiment.values(self._levers), code):
             ui.notify(f"{AT_ONCE} experiments run already: stop one, or wait for its end", type="warning")
             return
-        self._chosen = ""
+        self._chosen, self._is_told = "", False
         self._player.show(self._place.run)
 
     def _pick(self, path: str) -> None:
@@ -234,11 +252,14 @@ class LabPage:
             return
         self._status.text = f"{run.name} {'runs' if run.is_running else 'has ended'}"
         self._player.look()
-        if not run.is_running and self._player.is_live and not self._verdict.visible:
+        if not run.is_running and self._player.is_live and not self._is_told:
             self._compare(run)
 
     def _compare(self, run: Run) -> None:
-        """Say what the run has shown of its question."""
+        """Say what the run has shown of its question, and why."""
+        self._is_told = True
+        self._show_hint()
+        self._why.set_visibility(bool(self._why.text) and run.has_finished)
         question = self._experiment.question if self._experiment is not None else None
         if question is None:
             return

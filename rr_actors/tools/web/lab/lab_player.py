@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from nicegui import ui
 
@@ -118,6 +119,8 @@ class Player:
         if (watch := run.watch) is None:
             return
         moment = watch.now if at is None else watch.moment_at(at)
+        if not run.is_running:  # its system has gone as it should: the picture of the last moment stays
+            moment = replace(moment, problem="", stale=moment.stale and "")
         self._tree.show(moment, self._chosen)
         self._empty.set_visibility(not moment.children)
         self._graph_panel.set_visibility(bool(moment.registrars))
