@@ -628,7 +628,7 @@ class Loads:
                 if not over:
                     raise
         if over:
-            raise over[0]
+            raise over.pop()  # the error has this frame, and would have itself
         return True
 
     async def _awaited(self, query: Query, request: bytes, options: LoadOptions) -> bool:
@@ -679,8 +679,10 @@ class Loads:
             except RrError:
                 if not over:
                     raise
+            finally:
+                loading.forget_error()
         if over:
-            raise over[0]
+            raise over.pop()  # the error has this frame, and would have itself
         return True
 
     def _not_answered(self, query: Query, error: Exception, timeout_s: float | None) -> c.Command:
