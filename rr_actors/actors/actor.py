@@ -387,7 +387,7 @@ class BaseActor(pykka.Actor):
         else:
             fail(reply, failure)
             logger.info("Exception returned from %s to caller:", self, exc_info=failure)
-        del reply, failure  # the traceback has this frame
+        del envelope, reply, failure  # the traceback has this frame
 
     def _not_opened(self, packed: Packed, error: BaseException, reply: pykka.Future[Any] | None) -> None:
         if reply is None:

@@ -121,8 +121,22 @@ def new_id() -> str:
     return f"{(now_ns // _MS_NS << 80) + next(_numbers):032x}"
 
 
+def planned_id() -> str:
+    """Make an id for the query of a load that a planner makes for itself, in distinction to those made by hand.
+
+    It is a UUIDv8 with the fields of new_id(), so that it is known in any process, also after a crash.
+    """
+    id = new_id()
+    return f"{id[:12]}8{id[13:]}"
+
+
+def is_planned(id: str) -> bool:
+    """Return whether planned_id() has made the id of a query."""
+    return id[12:13] == "8"
+
+
 def made_at(id: str) -> float:
-    """Return when an id of new_id() was made, in seconds since 1970. A resource's id is made of such a one."""
+    """Return when an id was made here, in seconds since 1970. A resource's id begins with such a one."""
     return int(id[:12], 16) / 1000
 
 

@@ -209,6 +209,8 @@ class Group:
         except BaseException:
             self._withdraw()
             raise
+        finally:
+            self._reply.forget_error()
 
     def _check_order(self) -> None:
         for server, _, _ in self._requests:

@@ -163,7 +163,7 @@ class Calls:
         self.dispatcher.call(self._run_in_order, reply, answered, fn, args)
         if not answered.wait(CALL_TIMEOUT_S):
             raise Unavailable(f"registrar {self.actor.name!r}: its loop has not answered for {CALL_TIMEOUT_S:g} s")
-        return reply.get()
+        return reply.take()
 
     def _run_in_order(self, reply: Reply[T], answered: Flag, fn: Callable[..., T], args: tuple[Any, ...]) -> None:
         self.actor.take_turns()
@@ -379,14 +379,17 @@ class Loads:
         self.views = views
         self._starting = set[str]()  # the queries for whose loads on_start waits
 
-    def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Loading:
+    def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions, query_id: str = "") -> Loading:
         """Begin a load, and return the future of its query at once. A worker calls the hearer of its progress.
+
+        Args:
+            query_id: the id that the query gets; "": a new one.
 
         Raises:
             RegistrarDown: the registrar is closed. UsageError: `progress` is no callable.
         """
         hearer = None if options.progress is False else hearer_of(options.progress, self.actor)
-        query = self.views.new(new_id(), target, request, parent, options.codec)
+        query = self.views.new(query_id or new_id(), target, request, parent, options.codec)
         try:
             self._listen(query, options)
             hearing = None if hearer is None else HearsInWorkers(hearer, query.id)
@@ -629,7 +632,7 @@ class Loads:
                 if not over:
                     raise
         if over:
-            raise over[0]
+            raise over.pop()  # the error has this frame, and would have itself
         return True
 
     async def _awaited(self, query: Query, request: bytes, options: LoadOptions) -> bool:
@@ -680,8 +683,10 @@ class Loads:
             except RrError:
                 if not over:
                     raise
+            finally:
+                loading.forget_error()
         if over:
-            raise over[0]
+            raise over.pop()  # the error has this frame, and would have itself
         return True
 
     def _not_answered(self, query: Query, error: Exception, timeout_s: float | None) -> c.Command:
@@ -722,9 +727,8 @@ class Loads:
         if not isinstance(command, c.GiveUp):
             self._wait_for(loading)
             return
-        with contextlib.suppress(TimeoutError):
-            if (error := loading.exception(GRACE_S)) is not None:
-                raise error
+        with contextlib.suppress(pykka.Timeout):
+            loading.take(timeout=GRACE_S)
         raise error_of(command.failure)  # the loop does not answer: it withdraws the load later
 
 

@@ -151,7 +151,7 @@ class Query(Generic[Response]):
     are equal, also in lists and in other processes.
 
     Attributes:
-        id: UUIDv7, 32 hex digits, made by the holder.
+        id: UUIDv7, 32 hex digits, made by the holder; UUIDv8 of what a planner loads for itself.
         resource_id: the id of the resource, the same for all its holders.
         origin: the registrar that holds the query.
         registrar, server: the registrar and the server that serve the resource.

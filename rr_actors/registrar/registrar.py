@@ -23,7 +23,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
-from rr_actors.base.names import SERVERS, ServerId, check_name, named, new_id, parse_server, parsed_server
+from rr_actors.base.names import SERVERS, ServerId, check_name, named, new_id, parse_server, parsed_server, planned_id
 from rr_actors.base.notebook import bundle_or_text, table
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode, text_of_value
@@ -153,8 +153,8 @@ class Consumer(abc.ABC):
         """The registrar's name, unique in its system."""
 
     @abc.abstractmethod
-    def _target(self, server: object) -> ServerId:
-        """Return the id of the server that is meant."""
+    def _target(self, server: object, within_s: float | None = None) -> ServerId:
+        """Return the id of the server that is meant, within so many seconds if another process has to be asked."""
 
     @abc.abstractmethod
     def _holder(self, parent: Parent | None) -> tuple[Consumer, str]:
@@ -327,7 +327,9 @@ class Consumer(abc.ABC):
             self._warn_in_event_loop("load", "load_async")
         wanted = checked("load", options, response_type) if options or response_type is not None else DEFAULTS
         owner, parent = self._holder(wanted.parent)
-        target = parsed_server(server) if type(server) is str and "/" in server else self._target(server)
+        target = (
+            parsed_server(server) if type(server) is str and "/" in server else self._target(server, wanted.timeout_s)
+        )
         loads = owner._load_ways
         return (loads.wait if block else loads.begin)(target, self._encode(request), parent, wanted)
 
@@ -357,7 +359,8 @@ class Consumer(abc.ABC):
         """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
         wanted = checked("load_async", options, response_type)
         owner, parent = self._holder(wanted.parent)
-        return await owner._load_ways.awaited(self._target(server), self._encode(request), parent, wanted)
+        target = self._target(server, wanted.timeout_s)
+        return await owner._load_ways.awaited(target, self._encode(request), parent, wanted)
 
     def _warn_in_event_loop(self, called: str, instead: str) -> None:
         """Warn once for each registrar that a call blocks the event loop of the calling thread.
@@ -923,7 +926,7 @@ class Registrar(Consumer):
 
     # -- for the calls that load -----------------------------------------------------------------------------------
 
-    def _target(self, server: object) -> ServerId:
+    def _target(self, server: object, within_s: float | None = None) -> ServerId:
         return server_target(server, self._node)
 
     def _check_open(self) -> None:
@@ -1388,6 +1391,16 @@ def on_happened(registrar: Registrar, happened: Callable[[], object]) -> None:
     It must not wait. It is called before the answer of the call that has caused the event.
     """
     registrar._actor.on_happened = happened  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def begin_planned(registrar: Registrar, server: str, request: Any, **options: Unpack[LoadKeywords]) -> Reply[Query]:
+    """Begin a load as no part of anything, by a query that is_planned() knows from those loaded by hand.
+
+    A planner finds by that, in its next process, what it may release. Arguments and errors are those of
+    Registrar.load().
+    """
+    loads, wanted = registrar._loads, checked("load", options)  # pyright: ignore[reportPrivateUsage]  # same file
+    return loads.begin(parse_server(server), encode(request), "", wanted, planned_id())
 
 
 def begin_revocation(registrar: Registrar, resource_id: str, why: str, grace_s: float) -> Reply[None]:

@@ -8,6 +8,7 @@ that it has connected to.
 from __future__ import annotations
 
 import abc
+import asyncio
 import contextlib
 import functools
 import inspect
@@ -27,7 +28,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.arguments import LoadOptions
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import ServerSpec, log_unread_types
-from rr_actors.registrar.links.remote_calls import HandleLine, is_for_handles
+from rr_actors.registrar.links.remote_calls import GRACE_S, HandleLine, is_for_handles
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries
 from rr_actors.registrar.model.roles import ROLES
 from rr_actors.registrar.queries import Holder, Query, held_by, read_as
@@ -39,7 +40,6 @@ logger = Log("rr_actors.registrar")
 T = TypeVar("T")
 
 CALL_TIMEOUT_S = 30.0
-_GRACE_S = 10.0
 
 
 # -- every registrar of another process --------------------------------------------------------------------------------
@@ -68,9 +68,13 @@ class RemoteCalls(abc.ABC):
     def finish(self, reply: Reply[T], timeout_s: float | None) -> T:
         """Return the result of a call. The other process ends an overdue call; the thread waits a little longer."""
         try:
-            return reply.take(timeout=None if timeout_s is None else timeout_s + _GRACE_S)
+            return reply.take(timeout=None if timeout_s is None else timeout_s + GRACE_S)
         except pykka.Timeout:
-            raise Unavailable(f"registrar {self.name!r}: no answer within {timeout_s:g} s{self.paused()}") from None
+            raise self.overdue(timeout_s) from None
+
+    def overdue(self, timeout_s: float | None) -> RrError:
+        """Return the error that no answer came within the time limit of a call."""
+        return Unavailable(f"registrar {self.name!r}: no answer within {timeout_s:g} s{self.paused()}")
 
     def paused(self) -> str:
         """Return words, "; it is ...", for an error if a signal has stopped the registrar's process; "" else."""
@@ -111,14 +115,20 @@ class _Begun(Reply[T]):
             self._failed(error)
             raise
 
-    async def awaited(self) -> T:
-        """Return the queries, awaited on any event loop. If that is cancelled, release them."""
+    async def awaited(self, timeout_s: float | None) -> T:
+        """Return the queries, awaited within the time limit of the call. If that is cancelled, release them."""
+        limit = asyncio.timeout(None if timeout_s is None else timeout_s + GRACE_S)
         try:
             self._begin()
-            return await self
+            async with limit:
+                return await self
         except BaseException as error:  # also KeyboardInterrupt, which may come anywhere
             self._failed(error)
+            if limit.expired():
+                raise self._loads.calls.overdue(timeout_s) from None
             raise
+        finally:
+            self.forget_error()
 
     def unawaited(self) -> None:
         """Withdraw the load, or release the queries, which nobody has got."""
@@ -131,11 +141,18 @@ class _Begun(Reply[T]):
 
     def _begin(self) -> None:
         self._send(self._sent)
-        self._sent.when_set(lambda: self.set_unopened(lambda: self._own(self._sent.get())))
+        got = functools.partial(
+            _owned, self._own, self._sent
+        )  # without this future: the error has the frames that call it
+        self._sent.when_set(lambda: self.set_unopened(got))
 
     def _failed(self, error: BaseException) -> None:
         if not (self.done() and isinstance(error, RrError)):  # else nothing is held
             self.unawaited()
+
+
+def _owned(own: Callable[[T], T], sent: Reply[T]) -> T:
+    return own(sent.take())
 
 
 class RemoteLoads(abc.ABC):
@@ -171,7 +188,7 @@ class RemoteLoads(abc.ABC):
 
     async def awaited(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
         """Load a resource, awaited on any event loop. If it is cancelled, the load is withdrawn."""
-        return await self._begun(target, request, parent, options).awaited()
+        return await self._begun(target, request, parent, options).awaited(options.timeout_s)
 
     def _begun(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> _Begun[Query]:
         self.check(options)
@@ -190,7 +207,7 @@ class RemoteLoads(abc.ABC):
 
     def _release(self, sent: Reply[Any]) -> None:
         try:
-            got = sent.get()
+            got = sent.take()
         except Exception:
             return  # nothing is held
         for query in got if isinstance(got, Queries) else (got,):
@@ -227,7 +244,7 @@ class RemoteGroup:
 
     async def awaited(self) -> Queries:
         """Load all requests, awaited on any event loop. If it is cancelled, all queries are released."""
-        return await self._begun().awaited()
+        return await self._begun().awaited(self._options.timeout_s)
 
 
 class RemoteUnloads:
@@ -278,6 +295,10 @@ class RemoteUnloads:
 # -- a registrar of the same system ------------------------------------------------------------------------------------
 
 
+_LOADS = ("_load", "_load_all")
+"""Methods whose late results are heard, too, to be released: their callers wait no longer than their time limits."""
+
+
 class HandleCalls(RemoteCalls):
     """The calls of a handle. Arguments and results travel by cloudpickle.
 
@@ -293,7 +314,8 @@ class HandleCalls(RemoteCalls):
     def send(self, reply: Reply[Any], method: str, *args: Any, **options: Any) -> None:
         """Have a worker of the other process call the method."""
         limit_s = time_limit(options.get("timeout_s", CALL_TIMEOUT_S))
-        self._line.call(method, args, options, limit_s if self._patient else 0.0, reply)
+        patience_s = limit_s if self._patient else 0.0
+        self._line.call(method, args, options, patience_s, reply, None if method in _LOADS else limit_s)
 
     def paused(self) -> str:
         """Return words, "; it is ...", for an error if a signal has stopped the registrar's process; "" else."""

@@ -1,4 +1,4 @@
-"""The interpreter's shared parts: its lock, its exit handlers, and patches of its modules."""
+"""The interpreter's shared parts: its lock, its exit handlers, its signal handlers, and patches of its modules."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import contextlib
 import os
 import queue
 import select
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
-from types import ModuleType
+from types import FrameType, ModuleType
+from typing import Any
 
 from rr_actors.base.errors import UsageError
 
@@ -50,6 +53,46 @@ def begin() -> None:
     sys.setswitchinterval(HURRIED_S)
     turns.hurried_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
+
+
+# Signal handlers: a process that is forked from this one, as a worker of multiprocessing, inherits them. What they stop
+# is not in it, so it would ignore SIGTERM: terminate() of such a process would do nothing, and of a Pool would hang. It
+# has the handlers before them again. A signal that comes sooner waits for that: Python forgets it at a fork.
+
+_handlers: dict[signal.Signals, tuple[Any, Any]] = {}  # this package's, and those before them
+_masks = threading.local()
+
+
+def handle_signal(number: signal.Signals, handler: Callable[[int, FrameType | None], object]) -> Any:
+    """Have this process handle a signal, and return the handler before. A forked process has that one again."""
+    before = signal.signal(number, handler)
+    _handlers[number] = handler, before
+    return before
+
+
+def give_signal_back(number: signal.Signals, before: Any) -> None:
+    """Set the handler that handle_signal() has returned."""
+    _handlers.pop(number, None)
+    signal.signal(number, signal.SIG_DFL if before is None else before)  # None: not set from Python
+
+
+def _before_fork() -> None:
+    _masks.before = signal.pthread_sigmask(signal.SIG_BLOCK, _handlers)
+
+
+def _after_fork() -> None:
+    signal.pthread_sigmask(signal.SIG_SETMASK, _masks.before)
+
+
+def _after_fork_in_child() -> None:
+    for number, (handler, before) in list(_handlers.items()):
+        now: Any = signal.getsignal(number)
+        if handler in (now, getattr(now, "handler", None)):  # a turn wraps it (actors/turns.py)
+            give_signal_back(number, before)
+    _after_fork()
+
+
+os.register_at_fork(before=_before_fork, after_in_parent=_after_fork, after_in_child=_after_fork_in_child)
 
 
 def python(what: str) -> str:

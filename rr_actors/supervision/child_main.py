@@ -56,7 +56,11 @@ def main(inherited: Inherited) -> int:
     dispatcher = event_loop.acquire()  # to the end of the process: its last messages are sent after its node has ended
     child = ChildProcess(inherited, info, path, spec, classes)
 
-    signal.signal(signal.SIGTERM, lambda _signal, _frame: dispatcher.closed or dispatcher.call(child.terminate))
+    def terminate(_number: int, _frame: object) -> None:
+        if not dispatcher.closed:
+            dispatcher.call(child.terminate)
+
+    interpreter.handle_signal(signal.SIGTERM, terminate)
     return dispatcher.course(child.live()).wait()  # no handler of this thread raises, so no other thread shields it
 
 

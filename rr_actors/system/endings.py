@@ -55,14 +55,14 @@ class Termination:
                 f"{self._what}: only the main thread hears signals; call it there, or use start() and stop()"
             )
         for number in (signal.SIGTERM, signal.SIGINT):
-            self._before[number] = signal.signal(number, self._hear)
+            self._before[number] = interpreter.handle_signal(number, self._hear)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for number, handler in self._before.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: not set from Python
+            interpreter.give_signal_back(number, handler)
 
     def _hear(self, number: int, _frame: FrameType | None) -> None:
         if self.told is not None:

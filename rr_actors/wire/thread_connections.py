@@ -281,6 +281,7 @@ class BlockingLink:
             remove(fd)
             if timer is not None:
                 timer.cancel()
+            del ready  # the error that it has has this frame
 
     def _send(self, data: bytes | memoryview) -> int:
         """Write as much as the kernel takes at once; return the number of bytes."""

@@ -23,7 +23,7 @@ from rr_actors.actors.remote import hub
 from rr_actors.runtime import event_loop, user_loop
 from rr_actors.runtime.processes import lifeline
 from rr_actors.wire.name_service import actor_key
-from support import Calls, Gate, eventually, serve, wait_gone
+from support import Calls, Gate, eventually, hang, serve, wait_gone
 from support_inside import node_of
 
 Start = Callable[..., rr.System]
@@ -616,7 +616,7 @@ def test_a_process_that_was_stopped_before_it_could_answer_is_told_of_when_it_di
     watched, calls = system.ref("a"), Calls()
     pid = running_pid(system, "a")
     assert pid is not None
-    os.kill(pid, signal.SIGSTOP)
+    hang(pid)
     rr.monitor(watched, calls)
 
     os.kill(pid, signal.SIGKILL)

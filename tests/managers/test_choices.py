@@ -18,7 +18,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Alternative, Budgets, Choices, Choose, Chosen, Pool, Share
-from support import Calls, Gate, Served, eventually, kill, pid_of, serve, wait_respawned
+from support import Calls, Gate, Served, eventually, hang, kill, pid_of, serve, wait_respawned
 from support_cli import run_cli
 
 Start = Callable[..., rr.System]
@@ -675,10 +675,10 @@ def test_a_trial_is_released_when_its_provider_is_back_after_a_kill(start: Start
         pid_of(world.system, "choices"),
         world.system.registrar("cars"),
     )
-    os.kill(choices, signal.SIGSTOP)  # it does not hear that the radar is loaded
+    hang(choices)  # it does not hear that the radar is loaded
     (tmp_path / "go").touch()
     eventually(lambda: [info.phase for info in handle.resources()] == ["loaded"], LIMIT_S)
-    os.kill(cars, signal.SIGSTOP)  # and does not ask for what it had, until it has started again
+    hang(cars)  # and does not ask for what it had, until it has started again
     try:
         wait_respawned(world.system, "choices", kill(world.system, "choices"))
     finally:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
-from rr_actors.managers import Budgets, OverCapacity, Pool, Programs, RunProgram
+from rr_actors.managers import Budgets, Components, LoadComponent, OverCapacity, Pool, Programs, RunProgram
 from rr_actors.runtime.processes.control_groups import ControlGroups
-from support import eventually, kill, wait_respawned
+from support import LIMIT_S, eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
 
@@ -169,3 +172,31 @@ def test_programs_pay_to_the_budgets_that_they_are_given(start: Start) -> None:
         app.load("programs/program", RunProgram("sleep", ("1001",), cost={"watts": 80}))
     with pytest.raises(rr.InvalidName, match="cost_from"):
         Programs(cost_from="power/share")
+
+
+COMPONENTS = """
+[[component]]
+name = "front"
+type = "camera"
+reliability = 0.9
+program = { command = "sleep", arguments = ["600"], cost = { watts = 70 } }
+
+[[component]]
+name = "rear"
+type = "camera"
+program = { command = "sleep", arguments = ["601"], cost = { watts = 70 } }
+reliability = 0.8
+"""
+
+
+def test_the_next_component_begins_when_the_failed_one_has_let_its_share_go(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "components.toml").write_text(COMPONENTS)
+    system = start(
+        rr.ChildSpec(Budgets, id="budgets", args=([Pool("watts", 100)],), kwargs={"grace_s": 600.0}),
+        rr.ChildSpec(Programs, id="programs", kwargs={"cost_from": "budgets"}),
+        rr.ChildSpec(Components, id="components", args=(str(tmp_path / "components.toml"),)),
+    )
+    camera = system.open_registrar("app").load("components/component", LoadComponent("camera"))
+    os.kill(camera.response.pid, signal.SIGKILL)
+    assert camera.wait_status("UPDATE", timeout_s=LIMIT_S)
+    assert camera.response.name == "rear"

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import functools
 import gc
 import weakref
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
+from support import eventually
 
 Start = Callable[..., rr.System]
 
@@ -20,28 +24,60 @@ class Shop(rr.Manager):
     def load_broken(self, request: str) -> str:
         raise OSError("no device")
 
+    @rr.server("slow")
+    def load_slow(self, request: str) -> str:
+        rr.current().stopping.wait(0.05)
+        return request
+
 
 class Clerk(rr.Actor):
     def on_receive(self, message: object) -> None:
         raise ValueError("no such question")
+
+    def sell(self) -> None:
+        raise ValueError("nothing to sell")
 
 
 class Had:
     """What a frame has."""
 
 
+LOADS: dict[str, Callable[[Any], Any]] = {
+    "load": lambda of: of.load("shop/broken", "x"),
+    "load of a thread": lambda of: of.load("near/broken", "x"),
+    "load of nobody": lambda of: of.load("none/none", "x"),
+    "load without time": lambda of: of.load("shop/slow", "x", timeout_s=0),
+    "load without waiting": lambda of: of.load("shop/broken", "x", block=False).get(),
+    "result of a load": lambda of: of.load("shop/broken", "x", block=False).result(),
+    "exception of a load": lambda of: of.load("shop/broken", "x", block=False).exception(),
+    "load_all": lambda of: of.load_all([("shop/broken", "x"), ("near/broken", "y")]),
+    "unload": lambda of: of.unload("none"),
+    "unload without waiting": lambda of: of.unload("none", block=False).get(),
+    "unload_client": lambda of: of.unload_client("none/none"),
+    "fetch_state": lambda of: of.fetch_state("none"),
+}
 CALLS: dict[str, Callable[[rr.System, rr.Registrar], Any]] = {
-    "load": lambda system, app: app.load("shop/broken", "x"),
-    "load of a thread": lambda system, app: app.load("near/broken", "x"),
-    "load of nobody": lambda system, app: app.load("none/none", "x"),
-    "load without waiting": lambda system, app: app.load("shop/broken", "x", block=False).get(),
-    "load_all": lambda system, app: app.load_all([("shop/broken", "x"), ("near/broken", "y")]),
-    "unload": lambda system, app: app.unload("none"),
     "fetch_queries": lambda system, app: app.fetch_queries("none"),
+    "children of a handle": lambda system, app: system.registrar("shop").children("none"),
     "ask": lambda system, app: system.ref("clerk").ask("x"),
     "ask a thread": lambda system, app: system.ref("usher").ask("x"),
+    "ask without waiting": lambda system, app: system.ref("clerk").ask("x", block=False).get(),
+    "ask a thread without waiting": lambda system, app: system.ref("usher").ask("x", block=False).get(),
+    "proxy": lambda system, app: system.ref("clerk").proxy().sell().get(),
+    "proxy of a thread": lambda system, app: system.ref("usher").proxy().sell().get(),
     "start_child": lambda system, app: system.start_child(rr.ChildSpec(Clerk, id="clerk")),
 }
+AWAITED: dict[str, Callable[[Any], Any]] = {
+    "load": lambda of: of.load_async("shop/broken", "x"),
+    "load without time": lambda of: of.load_async("shop/slow", "x", timeout_s=0),
+    "load_all": lambda of: of.load_all_async([("shop/broken", "x"), ("near/broken", "y")]),
+    "future": lambda of: load_future(of),
+    "unload": lambda of: of.unload_async("none"),
+}
+
+
+async def load_future(of: Any) -> None:
+    await of.load("shop/broken", "x", block=False)  # no frame has the future
 
 
 @pytest.fixture
@@ -51,8 +87,8 @@ def without_collections() -> Iterator[None]:
     gc.enable()
 
 
-@pytest.mark.usefixtures("without_collections")
-def test_the_frames_of_a_call_that_raises_are_freed_at_once(start: Start) -> None:
+@pytest.mark.usefixtures("without_collections", "runtime_dir")
+def test_the_frames_of_a_call_that_raises_are_freed_at_once(start: Start, state_dir: Path) -> None:
     system = start(
         rr.ChildSpec(Shop, id="shop"),
         rr.ChildSpec(Shop, id="near", placement="thread"),
@@ -60,17 +96,51 @@ def test_the_frames_of_a_call_that_raises_are_freed_at_once(start: Start) -> Non
         rr.ChildSpec(Clerk, id="usher", placement="thread"),
     )
     app = system.open_registrar("app")
+    with rr.connect(state_dir) as client:
+        consumers: dict[str, Any] = {
+            "app": app,
+            "handle": system.registrar("shop"),
+            "handle of a thread": system.registrar("near"),
+            "client": client.open_registrar("mine"),
+        }
+        calls = {name: functools.partial(call, system, app) for name, call in CALLS.items()}
+        for whose, consumer in consumers.items():
+            calls |= {f"{whose}: {name}": functools.partial(call, consumer) for name, call in LOADS.items()}
+        assert [name for name, call in calls.items() if keeps(call)] == []
+        asyncio.run(check_awaited(consumers))
 
-    def keeps(call: Callable[[rr.System, rr.Registrar], Any]) -> bool:
-        kept: list[weakref.ref[Had]] = []
 
-        def caller() -> None:
-            had = Had()
-            kept.append(weakref.ref(had))
-            call(system, app)
+def keeps(call: Callable[[], Any]) -> bool:
+    kept: list[weakref.ref[Had]] = []
 
-        with contextlib.suppress(Exception):
-            caller()
-        return kept[0]() is not None
+    def caller() -> None:
+        had = Had()
+        kept.append(weakref.ref(had))
+        call()
 
-    assert [name for name, call in CALLS.items() if keeps(call)] == []
+    with contextlib.suppress(Exception):
+        caller()
+    return is_kept(kept[0])
+
+
+async def check_awaited(consumers: dict[str, Any]) -> None:
+    async def caller(kept: list[weakref.ref[Had]], call: Callable[[Any], Any], consumer: Any) -> None:
+        had = Had()
+        kept.append(weakref.ref(had))
+        await call(consumer)
+
+    for whose, consumer in consumers.items():
+        for name, call in AWAITED.items():
+            kept: list[weakref.ref[Had]] = []
+            with contextlib.suppress(Exception):
+                await caller(kept, call, consumer)
+            assert not await asyncio.to_thread(is_kept, kept[0]), f"{whose}: {name}"
+
+
+def is_kept(had: weakref.ref[Had]) -> bool:
+    """Return whether it is there when threads that end have ended."""
+    try:
+        eventually(lambda: had() is None, 2.0)
+    except AssertionError:
+        return True
+    return False

@@ -16,7 +16,7 @@ from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.messages import Fetch, Gone, Load, Noticed, Unload
 from rr_actors.registrar.model.rows import REVOKED, Held, Hold, Notice, Phase, content_of
-from support import eventually, loaded_with_parts, serve
+from support import LIMIT_S, eventually, loaded_with_parts, serve
 
 
 class Unloads:
@@ -213,3 +213,47 @@ def test_what_nobody_holds_and_could_not_be_unloaded_is_tried_again() -> None:
     assert registrar.phase() is Phase.UNLOAD_FAILED
     registrar.obey(REVOKE)
     assert registrar.phase() is Phase.UNLOADING
+
+
+def test_what_is_lost_gives_up_a_revoked_part_at_once_and_its_holders_hear_nothing_more(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    heard: list[rr.Status] = []
+    serve(parts, "part")
+    serve(provider, "whole", load=loaded_with_parts(provider, ("parts/part", "bolt")))
+    whole = app.load("provider/whole", "x", on_status=heard.append)
+    provider.send_status(whole.resource_id, rr.Status("FATAL", "unplugged"))
+    assert eventually(lambda: [status.message for status in heard] == ["unplugged"])
+    (part,) = parts.resources()
+    parts.revoke(part, "too little power", grace_s=600, timeout_s=30)
+    assert served(parts) == []
+    assert served(provider) == [whole.resource_id]
+    whole.unload()
+    assert [status.message for status in heard] == ["unplugged"]
+
+
+def test_what_hears_in_its_status_callback_that_it_is_lost_keeps_its_parts_until_it_has_heard(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    told, revoked = threading.Event(), threading.Event()
+
+    def hear(request: Any, status: rr.Status) -> None:
+        if status.reason != "revoked":
+            told.set()
+            assert revoked.wait(LIMIT_S)
+            (part,) = provider.children(rr.current().resource_id)
+            provider.replace_part(status, "nut", part=part)
+
+    serve(parts, "part")
+    serve(provider, "whole", load=loaded_with_parts(provider, ("parts/part", "bolt")), status=hear)
+    whole = app.load("provider/whole", "x")
+    (part,) = parts.resources()
+    provider.send_status(whole.resource_id, rr.Status("FATAL", "unplugged"))
+    assert told.wait(LIMIT_S)
+    revocation = threading.Thread(target=parts.revoke, args=(part, "worn"), kwargs={"grace_s": 600})
+    revocation.start()
+    assert eventually(lambda: parts.resources()[0].message == "worn")
+    revoked.set()
+    revocation.join(LIMIT_S)
+    assert eventually(lambda: [info.request for info in parts.resources()] == ["nut"])
+    assert whole.fetch_state() != "FATAL"

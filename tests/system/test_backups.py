@@ -24,7 +24,7 @@ from rr_actors.registrar.engine import cut
 from rr_actors.storage.opening import read_rows
 from rr_actors.system import backups
 from rr_actors.tools.inspection import check, check_state, read_state
-from support import LIMIT_S, eventually, kill, pid_of, wait_respawned
+from support import LIMIT_S, eventually, hang, kill, pid_of, wait_respawned
 from support_cli import run_cli
 
 
@@ -257,7 +257,7 @@ def test_a_process_that_does_not_answer_is_named_and_nobody_waits_for_it(running
     app = running.open_registrar("app")
     app.load("wholes/whole", "x")
     pid = pid_of(running, "tops")
-    os.kill(pid, signal.SIGSTOP)
+    hang(pid)
     try:
         with pytest.raises(RegistrarDown, match=r"no backup was made: registrar 'tops': its process has not answered"):
             running.backup(tmp_path / "backup", timeout_s=0.5)

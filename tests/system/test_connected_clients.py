@@ -62,8 +62,8 @@ class NotedConnections(SystemConnections):
         super().__init__(*args, **options)
         self.opened: list[ConsoleClient] = []
 
-    def open(self) -> ConsoleClient:
-        self.opened.append(super().open())
+    def open(self, greeting_s: float = console_client.GREETING_S) -> ConsoleClient:
+        self.opened.append(super().open(greeting_s))
         return self.opened[-1]
 
 

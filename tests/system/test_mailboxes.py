@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 import rr_actors as rr
-from support import Calls, Workshop, eventually, kill, pid_of, wait_respawned
+from support import Calls, Workshop, eventually, hang, kill, pid_of, wait_respawned
 from support_asks import Background
 
 Start = Callable[..., rr.System]
@@ -135,7 +135,7 @@ def test_of_a_stopped_process_the_error_says_why_it_does_not_answer(start: Start
     mailbox = system.mailbox("worker")
     pid = worker.pid
     assert pid is not None
-    os.kill(pid, signal.SIGSTOP)
+    hang(pid)
     try:
         with pytest.raises(rr.Unavailable, match=r"its process has not answered within 5 s; it is .*stopped"):
             mailbox.look()

@@ -8,10 +8,12 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -439,3 +441,56 @@ def test_no_child_is_left_by_a_program_that_is_killed(tmp_path: Path) -> None:
         program.kill()
     shutil.rmtree(tmp_path / "state")
     eventually(lambda: not lives(pid))
+
+
+# -- processes that a user's code forks ------------------------------------------------------------------------------
+
+
+class Workers(rr.Manager):
+    @rr.server("ended")
+    def end_a_worker(self, method: str) -> int:
+        context: Any = multiprocessing.get_context(method)
+        process = context.Process(target=time.sleep, args=(600,))
+        process.start()
+        process.terminate()
+        process.join()
+        return process.exitcode
+
+    @rr.server("pool")
+    def use_a_pool(self, method: str) -> list[int]:
+        with multiprocessing.get_context(method).Pool(2) as pool:
+            pool.apply_async(time.sleep, (600,))
+            return pool.map(abs, [1, -2])
+
+
+@pytest.mark.parametrize("method", ["fork", "forkserver"])
+def test_a_process_that_a_manager_has_forked_heeds_terminate(start: Start, method: str) -> None:
+    app = start(rr.ChildSpec(Workers, id="workers")).open_registrar("app")
+    assert app.load("workers/ended", method).response == -signal.SIGTERM
+    assert app.load("workers/pool", method).response == [1, 2]
+
+
+RUNS = """
+import multiprocessing, os, threading, time
+import rr_actors as rr
+
+def fork(system):
+    process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(600,))
+    process.start()
+    process.terminate()
+    process.join()
+    print(process.exitcode, flush=True)
+    system.stop()
+
+if __name__ == "__main__":
+    system = rr.System([], state_dir="state").start()
+    threading.Thread(target=fork, args=(system,)).start()
+    system.run()
+"""
+
+
+def test_a_process_that_a_program_has_forked_while_it_runs_heeds_terminate(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(RUNS)
+    command = [sys.executable, "program.py"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=30, check=True)
+    assert ended.stdout == f"{-signal.SIGTERM}\n"

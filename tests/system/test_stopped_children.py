@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
+import re
 import signal
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,7 +13,7 @@ import pykka
 import pytest
 
 import rr_actors as rr
-from support import hang, pid_of
+from support import LIMIT_S, eventually, hang, pid_of
 
 STOPPED = r"is stopped by a signal, .*kill -CONT"
 
@@ -44,7 +46,29 @@ def test_an_ask_says_so(system: rr.System) -> None:
 
 
 def test_a_call_of_a_handle_says_so(system: rr.System, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rr_actors.registrar.remote_registrar._GRACE_S", 0.1)
+    monkeypatch.setattr("rr_actors.registrar.remote_registrar.GRACE_S", 0.1)
     handle = system.registrar("asked")
     with pytest.raises(rr.Unavailable, match=rf"registrar 'asked': no answer within 0.3 s; it {STOPPED}"):
         handle.load("asked/thing", "x", timeout_s=0.3)
+
+
+def test_what_is_awaited_of_a_handle_says_so(start: Callable[..., rr.System], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rr_actors.registrar.remote_registrar.GRACE_S", 0.1)
+    monkeypatch.setattr("rr_actors.registrar.links.remote_calls.GRACE_S", 0.1)
+    system = start(rr.ChildSpec(Asked, id="asked", heartbeat_s=None))
+    handle = system.registrar("asked")
+    held = handle.load("asked/thing", "held")
+    pid = pid_of(system, "asked")
+    hang(pid)
+
+    async def awaited() -> None:
+        calls = handle.load_async("asked/thing", "x", timeout_s=0.3), held.unload_async(timeout_s=0.3)
+        for error in await asyncio.gather(*calls, return_exceptions=True):
+            assert isinstance(error, rr.Unavailable)
+            assert re.fullmatch(rf"registrar 'asked': no answer within 0.3 s; it {STOPPED}.*", str(error))
+
+    try:
+        asyncio.run(asyncio.wait_for(awaited(), LIMIT_S))
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    eventually(lambda: not handle.resources())

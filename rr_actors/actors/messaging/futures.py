@@ -22,7 +22,7 @@ from pykka import ActorDeadError
 
 from rr_actors.actors.messaging import ask_cycles
 from rr_actors.actors.messaging.ask_cycles import Target
-from rr_actors.base.errors import ActorUnavailable, UsageError
+from rr_actors.base.errors import ActorUnavailable, RrError, UsageError
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.reporting.tracebacks import traceback_of
 from rr_actors.runtime import event_loop
@@ -131,13 +131,16 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             UsageError: waiting here would hang, or `timeout` is no number of seconds.
             BaseException: the exception that was set.
         """
-        if self._hook_lock is None:
-            self._wait_done(timeout)
-            return self.get()
         try:
-            return self.get(timeout=timeout)
-        except pykka.Timeout as error:
-            raise TimeoutError(str(error)) from None
+            if self._hook_lock is None:
+                self._wait_done(timeout)
+                return self.get()
+            try:
+                return self.get(timeout=timeout)
+            except pykka.Timeout as error:
+                raise TimeoutError(str(error)) from None
+        finally:
+            del self  # the error has a traceback with this frame
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
         """Wait, and return the exception that was set; None if a value was set.
@@ -148,13 +151,19 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         Raises:
             TimeoutError, concurrent.futures.CancelledError, UsageError: as for result().
         """
-        if self._hook_lock is None:
+        if self._hook_lock is not None:
+            return self._hooked_exception(timeout)
+        try:
             self._wait_done(timeout)
             if self._open is not None:
                 self._unpack()
             if self._cancelled and self._error is not None:
                 raise self._error
             return self._error
+        finally:
+            del self  # the error has a traceback that began in this frame
+
+    def _hooked_exception(self, timeout: float | None) -> BaseException | None:
         limit_s = time_limit(timeout, "timeout")
         try:
             self.get(timeout=timeout)
@@ -206,7 +215,12 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         try:
             return self.get(timeout=timeout)
         finally:
-            self._error = None
+            self.forget_error()
+
+    def forget_error(self) -> None:
+        """Have a later get() raise another error than the one that has been raised."""
+        if self._error is not None:
+            self._error = RrError(f"{self._whose()}: its error was raised before")
 
     def set(self, value: Any = None) -> None:
         """Set the value. After cancel(), this and the other methods that set it do nothing.
@@ -292,7 +306,10 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             yield from letting_in(self._wait_on(loop))
         if self._open is not None and (process := event_loop.current()) is not None and process.is_loop_thread():
             yield from process.workers.run(self._unpack).__await__()
-        return self.get()
+        try:
+            return self.get()
+        finally:
+            del self  # the error has a traceback with this frame
 
     __iter__ = __await__
 
@@ -456,11 +473,13 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 self._callbacks.remove(callback)
 
     def _unpack(self) -> None:
-        with self._lock:
-            if self._open is None:
-                return
-            self._value, self._error = _opened(self._open)
-            self._open = None
+        try:
+            with self._lock:
+                if self._open is not None:
+                    self._value, self._error = _opened(self._open)
+                    self._open = None
+        finally:
+            del self  # the error has a traceback that began in this frame
 
     def overdue(self, timeout_s: float | None) -> pykka.Timeout:
         """Return the error for a caller that has waited `timeout_s` seconds without a reply."""

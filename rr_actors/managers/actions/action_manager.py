@@ -30,7 +30,7 @@ from rr_actors.base.errors import (
     UsageError,
     shown,
 )
-from rr_actors.base.names import new_id
+from rr_actors.base.names import is_planned, new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.actions.action import Action, RunControl, Word, bind, given_to, name_of, result_of, run_alone
 from rr_actors.managers.actions.graph_documents import read_graph
@@ -62,6 +62,7 @@ from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOADED, State
 from rr_actors.registrar.queries import Query, Status
+from rr_actors.registrar.registrar import begin_planned
 from rr_actors.registrar.servers.callback_context import current
 from rr_actors.runtime.processes.isolated import Events, run_isolated
 
@@ -187,7 +188,7 @@ class Actions(Manager):
         A graph whose load was interrupted is loaded again, and may run already.
         """
         for query in self.registrar.queries():
-            if query.server == "control":  # the crash came between an answer and its release
+            if is_planned(query.id):  # the crash came between an answer of another manager and its release
                 threading.Thread(target=query.unload, kwargs={"timeout_s": None}, daemon=True).start()
         logs = logged(self.registrar.directory)
         resources = self.registrar.resources()
@@ -528,8 +529,8 @@ class Actions(Manager):
 
     def _tell_there(self, actor: str, key: str, word: Word | Literal["over"], step: int, told: threading.Event) -> None:
         try:
-            with self.registrar.load(f"{actor}/control", ControlRun(key, word, step), timeout_s=None):
-                pass
+            told_there = begin_planned(self.registrar, f"{actor}/control", ControlRun(key, word, step), timeout_s=None)
+            told_there.get().unload_if_held()
         except (RegistrarDown, UnknownRegistrar):  # it is gone, and with it its runs
             logger.info("%s: %s is gone", key, actor)
         except RrError as error:

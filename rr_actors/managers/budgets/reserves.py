@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 import msgspec
 
 from rr_actors.base.errors import CatalogError, UnknownQuery, text_of
-from rr_actors.base.names import made_at
+from rr_actors.base.names import is_planned, made_at
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.books import Book
 from rr_actors.managers.budgets.planner import LEAST, Plan, Spare
@@ -26,7 +26,7 @@ from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
 from rr_actors.managers.planning.setbacks import Setbacks
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
-from rr_actors.registrar.registrar import NO_FIELDS, Registrar
+from rr_actors.registrar.registrar import NO_FIELDS, Registrar, begin_planned
 from rr_actors.supervision.core.specs import Backoff
 
 logger = Log("rr_actors.managers.budgets")
@@ -63,7 +63,7 @@ class Reserves:
         record: KeptRecord[Record],
         grace_s: float,
     ) -> None:
-        """Go on with those that are held; release what is held besides."""
+        """Go on with those that are held. Release those that a crash has left before they were noted."""
         self._registrar, self._planning, self._record, self._grace_s = registrar, planning, record, grace_s
         self._all: dict[str, Reserve] = {
             f"{name}/{i}": one for name, pool in pools.items() for i, one in enumerate(pool.reserve)
@@ -87,7 +87,7 @@ class Reserves:
             record.now.reserves = kept
             record.save()
         self._wanted = {name: sum(key in self._on for key in keys) for name, keys in self._of_pool.items()}
-        for id in set(held) - set(kept.values()):
+        for id in filter(is_planned, held.keys() - kept.values()):
             self._owed[f"query {id}"] = id
         for server_id in sorted({one.server for one in self._both.values()}):
             registrar.on_status(server_id, self._hear)
@@ -220,8 +220,8 @@ class Reserves:
         reserve = self._both[key]
         request = NO_FIELDS if reserve.request is None else reserve.request
         priority = min(priority, self._registrar.config.max_priority)
-        load = functools.partial(self._registrar.load, reserve.server, request, timeout_s=None)
-        start = functools.partial(load, priority=priority, block=False)
+        load = functools.partial(begin_planned, self._registrar, reserve.server, request)
+        start = functools.partial(load, priority=priority, timeout_s=None)
         started = functools.partial(self._started, key, priority)
         self._planning.begin(("start", key), key, start, started, limit_s=_RESERVE_S)
 

@@ -59,6 +59,7 @@ from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOWEST, Phase, State
 from rr_actors.registrar.queries import Query, Status, StatusCallback
+from rr_actors.registrar.registrar import begin_planned
 from rr_actors.registrar.servers.callback_context import current
 
 logger = Log("rr_actors.managers.choices")
@@ -548,7 +549,8 @@ class Choices(Manager):
         if one is None:
             raise UnknownServer(f"{key}: its server is not there any more", server=key, known=())
         server, request, limit_s = loading_of(one)
-        return self.registrar.load(server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
+        trial = begin_planned(self.registrar, server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
+        return trial.get()
 
     def _have_taken(self, id: str, key: str) -> None:
         """Have a choice return to an alternative, in its status callback, where a crash can repeat it."""

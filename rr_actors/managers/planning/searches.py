@@ -2,14 +2,13 @@
 
 A replacement loads each candidate beside the part, as no part of anything: a second part could not be told from the
 first. Then `replace_part` joins what is loaded, in one commit. What a crash leaves of such loads belongs to nothing,
-and the next process releases it.
+and the next process releases it. What people have loaded by hand with the same registrar stays theirs.
 """
 
 from __future__ import annotations
 
 import contextlib
 import contextvars
-import functools
 import itertools
 import threading
 import time
@@ -19,7 +18,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import LoadFailed, RegistrarDown, RrError, Unavailable, UnknownQuery
-from rr_actors.base.names import parse_server
+from rr_actors.base.names import is_planned, parse_server
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.managers.planning.hedging import HEDGE_S, first_of
@@ -27,7 +26,7 @@ from rr_actors.managers.planning.retries import GIVEN_UP, Retries
 from rr_actors.managers.planning.setbacks import BACKOFF
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
-from rr_actors.registrar.registrar import Registrar
+from rr_actors.registrar.registrar import Registrar, begin_planned
 from rr_actors.registrar.servers.callback_context import current
 
 logger = Log("rr_actors.managers")
@@ -206,16 +205,13 @@ class Search(Generic[C]):
 
     def as_part(self, load: Loading) -> Reply[Query]:
         """Begin to load a part of the resource whose callback runs."""
-        return self._begin(load)
+        reply = self._registrar.load(load.server, load.request, timeout_s=load.timeout_s, block=False)
+        return cast("Reply[Query]", reply)
 
     def beside(self, load: Loading) -> Reply[Query]:
         """Begin to load as no part of anything, as urgently as the resource is needed."""
         priority = next((info.priority for info in self._registrar.resources() if info.id == self.id), None)
-        return contextvars.Context().run(functools.partial(self._begin, load, priority=priority))
-
-    def _begin(self, load: Loading, **options: Any) -> Reply[Query]:
-        reply = self._registrar.load(load.server, load.request, timeout_s=load.timeout_s, block=False, **options)
-        return cast("Reply[Query]", reply)
+        return begin_planned(self._registrar, load.server, load.request, timeout_s=load.timeout_s, priority=priority)
 
     def swap(self, status: Status, part: Query | None, load: Loading, response: Callable[[Query], R]) -> R:
         """Put what is loaded beside in the place of the part; return the new response."""
@@ -258,7 +254,7 @@ def release_soon(query: Query) -> None:
 
 
 def release_strays(registrar: Registrar, server: str, begun: str) -> None:
-    """Release what the process before has loaded of a server beside parts, in a thread of its own.
+    """Release what the process before has loaded itself of a server, beside parts, in a thread of its own.
 
     Its provider may know more of that than the catalog here, so the thread waits for it.
 
@@ -291,5 +287,5 @@ def _agree(registrar: Registrar, provider: str) -> None:
 
 
 def strays(registrar: Registrar, begun: str) -> list[Query]:
-    """Return what is held as no part of anything, and was loaded before this process began."""
-    return [query for query in registrar.queries() if not query.parent and query.id < begun]
+    """Return what a process before this one has loaded itself, by begin_planned(), and is held still."""
+    return [query for query in registrar.queries() if is_planned(query.id) and query.id < begun]

@@ -137,14 +137,16 @@ def limit_grace(decision: Decision, revocation: Revocation) -> None:
 def pass_revocation_on(decision: Decision, resource: Resource, notice: Notice, *, handled: bool) -> None:
     """Have a resource give up a revoked part: only the part, if that is `handled`; else the resource is revoked, too.
 
-    If it does not hold the part any more, there is nothing to do: it has put another in its place.
+    What is lost needs no part, and its holders have heard so: it gives up the part alone. They may hold it for long
+    still, for example until they have found something else, which may need just what the part has. If the resource does
+    not hold the part any more, there is nothing to do: it has put another in its place.
     """
     catalog = decision.catalog
     parts = [catalog.held[id] for id in catalog.parts_of(resource.id)]
     revoked = [held for held in parts if held.resource_id == notice.resource_id and held.hold is not Hold.OWED]
     if not revoked or resource.id in catalog.revocations:
         return
-    if handled:
+    if handled or (resource.state is State.FATAL and not _may_revive(catalog, resource)):
         for held in revoked:
             let_go(decision, held)
     elif is_revocable(catalog, resource):
@@ -295,8 +297,7 @@ def _revived(decision: Decision, resource: Resource) -> Resource:
     If a new request has got another resource meanwhile, it stays FATAL: of each request, one resource is given away.
     """
     catalog = decision.catalog
-    own = (catalog.notices[id].state for id in catalog.own_notices.get(resource.id, ()))
-    if resource.state is not State.FATAL or State.FATAL not in own or resource.id in catalog.revocations:
+    if not _may_revive(catalog, resource) or resource.id in catalog.revocations:
         return resource
     if resource.phase is not LOADED or catalog.joinable(resource.server, resource.request) is not None:
         return resource
@@ -304,6 +305,12 @@ def _revived(decision: Decision, resource: Resource) -> Resource:
     resource = replace(resource, state=State.UPDATE)
     decision.put(resource)
     return resource
+
+
+def _may_revive(catalog: Catalog, resource: Resource) -> bool:
+    """Return whether a resource is FATAL, and its status callback has not dealt with that yet."""
+    own = (catalog.notices[id].state for id in catalog.own_notices.get(resource.id, ()))
+    return resource.state is State.FATAL and State.FATAL in own
 
 
 def _part(catalog: Catalog, resource_id: str, query_id: str) -> Held | None:

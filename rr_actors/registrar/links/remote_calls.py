@@ -91,6 +91,8 @@ def is_repeatable(name: str) -> bool:
 
 
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
+GRACE_S = 1.0
+"""Seconds after a time limit until the other process has to have said how the call ended."""
 
 
 class LinkHost(Protocol):
@@ -199,34 +201,44 @@ class HandleLine:
         kwargs: dict[str, Any],
         patience_s: float | None = 0.0,
         reply: Reply[Any] | None = None,
+        limit_s: float | None = None,
     ) -> Reply[Any]:
         """Call a method. The reply gets its result or error. From any thread.
 
-        It waits `patience_s` seconds for a registrar that is being started or respawned; None: without limit. A caller
-        that gives the reply has it also when the call is interrupted.
+        It waits `patience_s` seconds for a registrar that is being started or respawned; None: without limit. A moment
+        after `limit_s` seconds the reply gets Unavailable, and what the method returns later is dropped; None: never. A
+        caller that gives the reply has it also when the call is interrupted.
 
         Raises:
             NotSerializable: an argument cannot be pickled.
         """
         body = pickling.dumps((args, kwargs), f"{self._registrar}.{method.lstrip('_')}()")
         reply = Reply() if reply is None else reply
-        self._node.dispatcher.call(self._begin, method, body, reply, patience_s)
+        self._node.dispatcher.call(self._begin, method, body, reply, patience_s, limit_s)
         return reply
 
-    def _begin(self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None) -> None:
-        task = self._node.dispatcher.loop.create_task(self._call(method, body, reply, patience_s))
+    def _begin(
+        self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None, limit_s: float | None
+    ) -> None:
+        task = self._node.dispatcher.loop.create_task(self._call(method, body, reply, patience_s, limit_s))
         self._calls.add(task)
         task.add_done_callback(self._calls.discard)
 
-    async def _call(self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None) -> None:
+    async def _call(
+        self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None, limit_s: float | None
+    ) -> None:
+        limit = asyncio.timeout(None if limit_s is None else limit_s + GRACE_S)
         try:
-            result = await self._result(method, body, patience_s)
+            async with limit:
+                result = await self._result(method, body, patience_s)
         except asyncio.CancelledError:
             fail(reply, self._down("stopped"))
         except Exception as error:
-            fail(reply, error)
+            fail(reply, self.overdue(limit_s) if limit.expired() else error)
         else:
             reply.set_unopened(functools.partial(pickling.loads, result))
+        finally:
+            del reply  # the error has a traceback with this frame
 
     async def _result(self, method: str, body: bytes, patience_s: float | None) -> bytes:
         """Call the method. Try again while the registrar is not up yet and the caller is patient.
@@ -254,7 +266,7 @@ class HandleLine:
             link.flush()
             return await call.answer
         finally:
-            del self._open[number]
+            del self._open[number], call  # the error has a traceback with this frame
 
     async def _linked(self) -> Link:
         """Return the link, and open it first if there is none.
@@ -288,6 +300,10 @@ class HandleLine:
         if entry.status is not Presence.UP:
             raise self._down(entry.status, entry.because)
         return entry.address
+
+    def overdue(self, limit_s: float | None) -> Unavailable:
+        """Return the error that no answer came within the time limit of a call."""
+        return Unavailable(f"registrar {self._registrar!r}: no answer within {limit_s:g} s{self.paused()}")
 
     def paused(self) -> str:
         """Return words, "; it is ...", for an error if a signal has stopped the registrar's process; "" else."""

@@ -36,7 +36,7 @@ from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Response, Status, StatusCallback, StatusCallbacks, end, hear, received
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.user_loop import CallersLoop
-from rr_actors.system.console.console_client import Connections, ConsoleClient, find_console
+from rr_actors.system.console.console_client import GREETING_S, Connections, ConsoleClient, find_console
 from rr_actors.system.console.console_commands import OpenRegistrar
 from rr_actors.system.console.console_messages import Dropped, Heard, Holding, Welcome
 
@@ -67,12 +67,12 @@ class SystemConnections(Connections):
         self.welcome: Welcome | None = None
         self.ended: NotRunning | None = None
 
-    def open(self) -> ConsoleClient:
+    def open(self, greeting_s: float = GREETING_S) -> ConsoleClient:
         """Return a new connection, as Connections.open() does."""
         if self.ended is not None and not (self.is_closed or self.reconnects):
             raise self.has_ended()
         try:
-            opened = super().open()
+            opened = super().open(greeting_s)
         except NotRunning as error:
             if self.welcome is None or self.is_closed:
                 raise
@@ -81,12 +81,12 @@ class SystemConnections(Connections):
         return opened
 
     @contextmanager
-    def lent(self) -> Generator[ConsoleClient]:
+    def lent(self, greeting_s: float = GREETING_S) -> Generator[ConsoleClient]:
         """Lend a connection, as Connections.lent() does."""
         if self.reconnects:
             self.drop_ended()
         try:
-            with super().lent() as client:
+            with super().lent(greeting_s) as client:
                 yield client
         except NotRunning as error:
             if self.is_closed or error is self.ended:

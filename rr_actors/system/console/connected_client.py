@@ -19,6 +19,7 @@ from typing import Any, Self, TypeVar, cast
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import (
     InvalidRequest,
+    LoadTimeout,
     NotRunning,
     NotSerializable,
     RrError,
@@ -46,7 +47,7 @@ from rr_actors.registrar.pages import QueryRow
 from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, read_as, was_given
 from rr_actors.registrar.registrar import Consumer
 from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, RemoteLoads, RemoteUnloads
-from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.time_limits import deadline_of, left_until, time_limit
 from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.asking.client_proxies import GRACE_S, ClientProxy, in_thread
@@ -60,7 +61,7 @@ from rr_actors.system.console.client_queries import (
     asked_with,
     listen,
 )
-from rr_actors.system.console.console_client import find_console
+from rr_actors.system.console.console_client import GREETING_S, find_console
 from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, Release
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
 from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
@@ -208,6 +209,10 @@ class _ClientCalls(RemoteCalls):
             self.connections.ask(Release(self.name, held_as, server, limit_s), limit_s + GRACE_S)
         self.views.forget(query_id, server)
 
+    def overdue(self, timeout_s: float | None) -> RrError:
+        """Return the error of a load whose thread has not heard in time how it ended."""
+        return _too_late(f"registrar {self.name!r}", timeout_s, "the system has not answered")
+
     def all_streams(self, query: Query[Any]) -> Callable[[], bool]:
         """Return a function for one reader, which has a thread ask the system once, and returns False until it knows.
 
@@ -255,14 +260,15 @@ class _ClientLoads(RemoteLoads):
 
     def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
         client, limit_s = self._client, _limit(options.timeout_s)
+        deadline = deadline_of(limit_s + GRACE_S)
         client.check_here()
         wait_s = None if options.wait_s is None else _limit(options.wait_s)
         command = Hold(client.name, str(target), bytes(request), limit_s, options.priority, wait_s)
         query: ClientQuery | None = None
         try:
             # If the connection ends before keep(), the system releases the query.
-            with client.views.loading(), client.connections.lent() as connection:
-                held = connection.ask(command, limit_s + GRACE_S)
+            with client.views.loading(), client.connections.lent(min(GREETING_S, limit_s + GRACE_S)) as connection:
+                held = connection.ask(command, left_until(deadline))
                 place = held.query_id, target, request, "", client.name, self.holder, _shown_types, client.all_streams
                 query = ClientQuery(place, bytes(request), options)
                 if options.codec is not None:
@@ -273,7 +279,9 @@ class _ClientLoads(RemoteLoads):
                 client.views.add(query, options)
                 connection.keep()
             return query
-        except BaseException:  # such as KeyboardInterrupt: the caller never gets the query
+        except BaseException as error:  # also KeyboardInterrupt: the caller never gets the query
+            if type(error) is Unavailable and time.monotonic() >= deadline:
+                raise _too_late(str(target), options.timeout_s, str(error)) from error
             if query is not None:
                 threading.Thread(target=self.release, args=(query,), name="rr-undo").start()
             raise
@@ -301,9 +309,8 @@ class _ClientLoads(RemoteLoads):
                 self.send_load(sent[-1], target, request, "", options)
             wait(sent, return_when=FIRST_EXCEPTION)
             for place, one in enumerate(sent):
-                if one.done() and isinstance(error := one.exception(), RrError):
-                    note_request(error, requests, place)
-                    raise error
+                if one.done() and isinstance(one.exception(), RrError):
+                    _raise_of(one, requests, place)
             return Queries(one.get() for one in sent)
         except BaseException:
             for one in reversed(sent):
@@ -312,6 +319,14 @@ class _ClientLoads(RemoteLoads):
                 else:
                     one.add_done_callback(self.release_later)
             raise
+
+
+def _raise_of(one: Reply[Query], requests: Sequence[LoadWanted], place: int) -> None:
+    try:
+        one.take()
+    except RrError as error:
+        note_request(error, requests, place)
+        raise
 
 
 class ClientRegistrar(Consumer):
@@ -346,11 +361,12 @@ class ClientRegistrar(Consumer):
         """The registrar's name in the system, "client.NAME"."""
         return self._name
 
-    def _target(self, server: object) -> ServerId:
+    def _target(self, server: object, within_s: float | None = None) -> ServerId:
         if not is_a(server, Declared):
             return parse_server_id(server)
         place = declaring(cast("Declared[Any, Any, Any]", server))
-        return parse_server_id(self._connections.ask(FindServer(*place)).id)
+        limit_s = GREETING_S if within_s is None else min(GREETING_S, within_s)
+        return parse_server_id(self._connections.ask(FindServer(*place), limit_s).id)
 
     def _holder(self, parent: Parent | None) -> tuple[Consumer, str]:
         _refuse(self._name, "parent", parent is not None)
@@ -533,6 +549,12 @@ def _asked(connections: SystemConnections, actor: str, message: Any, timeout_s: 
 def _limit(timeout_s: float | None) -> float:
     limit_s = time_limit(timeout_s)
     return TIMEOUT_LIMIT_S if limit_s is None else min(limit_s, TIMEOUT_LIMIT_S)
+
+
+def _too_late(server: str, timeout_s: float | None, why: str) -> LoadTimeout:
+    """Return the error of a load of which the system has not said in time how it has ended."""
+    text = f"{server}: not loaded within {timeout_s:g} s; {why}; the load is withdrawn"
+    return LoadTimeout(text, server=server, timeout_s=timeout_s, status="")
 
 
 def _encoded(value: Any, what: str) -> bytes:

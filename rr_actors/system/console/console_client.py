@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import socket
@@ -20,6 +21,7 @@ import msgspec
 
 from rr_actors.base.errors import ConfigError, NotRunning, Unavailable, UsageError
 from rr_actors.base.values.failure import error_of
+from rr_actors.runtime.time_limits import deadline_of, left_until
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_commands import AwaitStatuses
 from rr_actors.system.console.console_protocol import ANSWERS, answer_of, decoder_of
@@ -40,7 +42,8 @@ from rr_actors.wire.unix_sockets import SocketDir, peer_at
 
 _A = TypeVar("_A")
 _Page = TypeVar("_Page", c.Children, c.Registrars, c.Resources, c.QueryPage, c.Loads, c.Usages, c.Streams)
-_GREETING_S = 5.0
+GREETING_S = 5.0
+"""Seconds within which a console answers a new connection."""
 _RETRY_S = 0.01
 _IDLE = 8  # connections that are kept for the next call
 
@@ -52,7 +55,8 @@ class ConsoleClient:
 
     Args:
         run_dir: the directory of the console's socket, as find_console() returns it.
-        timeout_s: seconds that an answer may take.
+        timeout_s: seconds that an answer may take, and that a request may take to be sent.
+        greeting_s: seconds within which the console has to answer at first.
         client: the same for all connections of a client; "": this is its only one.
 
     Attributes:
@@ -65,15 +69,18 @@ class ConsoleClient:
         Unavailable: the console is another user's, or speaks another version.
     """
 
-    def __init__(self, run_dir: Path, *, timeout_s: float = 60.0, client: str = "") -> None:
+    def __init__(
+        self, run_dir: Path, *, timeout_s: float = 60.0, greeting_s: float = GREETING_S, client: str = ""
+    ) -> None:
+        deadline = deadline_of(greeting_s)
         self.run_dir = run_dir
         self.timeout_s = timeout_s
-        self._socket = _connected(run_dir)
+        self._socket = _connected(run_dir, deadline)
         self._frames = FrameReader(decoder_of(ANSWERS), c.ANSWER_LIMIT_BYTES)
         self._answers: deque[c.Message] = deque()
         self.is_broken = False
         try:
-            self.welcome = self._asked(c.Hello(c.VERSION, client), c.Welcome, _GREETING_S)
+            self.welcome = self._asked(c.Hello(c.VERSION, client), c.Welcome, deadline)
         except BaseException:
             self.close()
             raise
@@ -82,26 +89,27 @@ class ConsoleClient:
         """Send a question or a command, and return its answer.
 
         Args:
-            timeout_s: seconds that the answer may take; None: the client's own limit.
+            timeout_s: seconds until the answer has to be here; None: the client's own limit.
 
         Raises:
             RrError: the system refused the request, or could not carry it out.
             NotRunning: the system has ended.
             Unavailable: no answer came in time; the system may carry out the request all the same.
         """
-        return self._asked(request, answer_of(type(request)), timeout_s)
+        deadline = deadline_of(self.timeout_s if timeout_s is None else timeout_s)
+        return self._asked(request, answer_of(type(request)), deadline)
 
-    def _asked(self, request: c.Message, expected: type[_A], timeout_s: float | None) -> _A:
+    def _asked(self, request: c.Message, expected: type[_A], deadline: float) -> _A:
         self.is_broken = True
-        self._send(request)
-        answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
+        self._send(request, deadline)
+        answer = self._receive(deadline)
         self.is_broken = isinstance(answer, c.Holding | c.Refused)
         return _checked(answer, expected)
 
     def wait_statuses(self, registrar: str) -> list[c.Heard | c.Dropped]:
         """Wait without limit for statuses of the queries of the registrar that this connection has opened."""
         self._send(AwaitStatuses(registrar))
-        return _checked(self._receive(None), c.Statuses).statuses
+        return _checked(self._receive(math.inf), c.Statuses).statuses
 
     def keep(self) -> None:
         """Say that the query of the last Holding has arrived; otherwise the end of the connection releases it."""
@@ -166,13 +174,13 @@ class ConsoleClient:
 
     def _parts(self, request: c.Follow | c.BeginRecording, tick_s: float | None = None) -> Iterator[Any]:
         self._send(request)
-        _checked(self._receive(self.timeout_s), c.Following)
+        _checked(self._receive(deadline_of(self.timeout_s)), c.Following)
         return self._fed(tick_s)
 
     def _fed(self, tick_s: float | None) -> Iterator[Any]:
         while True:
             try:
-                answer = self._next(tick_s)
+                answer = self._next(deadline_of(tick_s))
             except NotRunning:
                 return
             if isinstance(answer, c.Refused):
@@ -210,28 +218,29 @@ class ConsoleClient:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _send(self, request: c.Message) -> None:
+    def _send(self, request: c.Message, deadline: float | None = None) -> None:
+        """Send a request until a deadline; None: within the time of an answer."""
         frame = framed(request, c.REQUEST_LIMIT_BYTES, "the longest request of a console")
         try:
-            self._socket.settimeout(self.timeout_s)
+            self._socket.settimeout(_left_s(deadline_of(self.timeout_s) if deadline is None else deadline))
             self._socket.sendall(frame)
         except TimeoutError as error:
             raise Unavailable(f"{self._who()} does not read what it is sent") from error
         except OSError:
             return  # the console has refused the connection: its answer is read next
 
-    def _receive(self, timeout_s: float | None) -> c.Message:
-        answer = self._next(timeout_s)
+    def _receive(self, deadline: float) -> c.Message:
+        began = time.monotonic()
+        answer = self._next(deadline)
         if answer is None:
-            raise Unavailable(f"{self._who()} has not answered within {timeout_s:g} s")
+            raise Unavailable(f"{self._who()} has not answered for {time.monotonic() - began:.1f} s")
         return answer
 
-    def _next(self, timeout_s: float | None) -> c.Message | None:
-        """Return the next answer, or None if none has come within `timeout_s`. Another thread may close the socket."""
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    def _next(self, deadline: float) -> c.Message | None:
+        """Return the next answer, or None if none has come by the deadline. Another thread may close the socket."""
         while not self._answers:
             try:
-                self._socket.settimeout(None if deadline is None else max(0.001, deadline - time.monotonic()))
+                self._socket.settimeout(_left_s(deadline))
                 data = self._socket.recv(2**18)
             except TimeoutError:
                 return None
@@ -270,9 +279,14 @@ def _checked(answer: c.Message, expected: type[_A]) -> _A:
     return answer
 
 
-def _connected(run_dir: Path) -> socket.socket:
+def _left_s(deadline: float) -> float | None:
+    """Return the time limit of a socket, which must be over 0: it would not wait for what is there already."""
+    left_s = left_until(deadline)
+    return None if left_s is None else max(0.001, left_s)
+
+
+def _connected(run_dir: Path, deadline: float) -> socket.socket:
     sockets = SocketDir(run_dir)
-    deadline = time.monotonic() + _GREETING_S
     try:
         while True:
             try:
@@ -316,15 +330,18 @@ class Connections:
         """Whether this side has closed the connections."""
         return bool(self._closed)
 
-    def open(self) -> ConsoleClient:
+    def open(self, greeting_s: float = GREETING_S) -> ConsoleClient:
         """Return a new connection. The caller closes it; close() does, too.
+
+        Args:
+            greeting_s: seconds within which the console has to answer.
 
         Raises:
             NotRunning: no system runs, or these connections are closed.
             Unavailable: the system is another user's, or speaks another version.
         """
         if not self._closed:
-            client = ConsoleClient(self._find(), timeout_s=self._timeout_s, client=self._name)
+            client = ConsoleClient(self._find(), timeout_s=self._timeout_s, greeting_s=greeting_s, client=self._name)
             with self._lock:
                 if not self._closed:
                     self._all.add(client)
@@ -333,15 +350,18 @@ class Connections:
         raise NotRunning(self._closed)
 
     @contextmanager
-    def lent(self) -> Generator[ConsoleClient]:
+    def lent(self, greeting_s: float = GREETING_S) -> Generator[ConsoleClient]:
         """Lend a connection that no other call uses within the `with` block.
+
+        Args:
+            greeting_s: as for open().
 
         Raises:
             NotRunning, Unavailable: as open().
         """
         with self._lock:
             kept = self._idle.pop() if self._idle else None
-        client = kept or self.open()
+        client = kept or self.open(greeting_s)
         try:
             yield client
         except NotRunning:  # the system has ended, and the idle connections with it
@@ -356,13 +376,18 @@ class Connections:
     def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
         """Send a question or a command, and return its answer.
 
+        Args:
+            timeout_s: seconds until the answer has to be here, also if a connection has to be opened before; None:
+                the limit of these connections.
+
         Raises:
             RrError: the system refused the request, or could not carry it out.
             NotRunning: the system has ended, or these connections are closed.
             Unavailable: no answer came in time; the system may carry out the request all the same.
         """
-        with self.lent() as client:
-            return client.ask(request, timeout_s)
+        deadline = deadline_of(self._timeout_s if timeout_s is None else timeout_s)
+        with self.lent(GREETING_S if timeout_s is None else min(GREETING_S, timeout_s)) as client:
+            return client.ask(request, left_until(deadline))
 
     def drop_ended(self) -> None:
         """Close the idle connections that the system has closed."""

@@ -14,21 +14,25 @@ from rr_actors.system.console.console_questions import ListMethods
 
 T = TypeVar("T")
 
-GRACE_S = 10.0
-"""How long an answer may take, in addition to the time limit of its request."""
+GRACE_S = 0.5
+"""How long an answer may take, in addition to the time limit of its request: it says more than that none came."""
+
+_LISTING_S = 10.0
 _answer = Codec(None, "answer")
 
 
 def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
     """Have a new thread make a call, and set the reply. The application's executor may be full of other calls."""
+    threading.Thread(target=_make, args=(reply, call), name="rr-client", daemon=True).start()
 
-    def make() -> None:
-        try:
-            reply.set(call())
-        except BaseException as error:  # it is for the thread that reads the reply
-            fail(reply, error)
 
-    threading.Thread(target=make, name="rr-client", daemon=True).start()
+def _make(reply: Reply[T], call: Callable[[], T]) -> None:
+    try:
+        reply.set(call())
+    except BaseException as error:  # it is for the thread that reads the reply
+        fail(reply, error)
+    finally:
+        del reply  # the error has a traceback with this frame
 
 
 class ClientProxy:
@@ -67,7 +71,7 @@ class ClientProxy:
         return _answer.show(self._connections.ask(command, self._limit_s + GRACE_S).answer)
 
     def __dir__(self) -> list[str]:
-        return [row.name for row in self._connections.ask(ListMethods(self._actor), GRACE_S).rows]
+        return [row.name for row in self._connections.ask(ListMethods(self._actor), _LISTING_S).rows]
 
     def __repr__(self) -> str:
         return f"<ClientProxy of {self._actor}>"
