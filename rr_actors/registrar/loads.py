@@ -622,8 +622,10 @@ class Loads:
             connections.drop_mine()
             raise
         else:
-            if (command := self._after(query, client, answer, line.epoch)) is None:
+            if type(answer) is Loaded and client.checksums.get(query.server, 0) == answer.types and actor.hold(answer):
+                loaded_directly(query, answer.resource_id, answer.response, answer.state)
                 return True
+            command = self._not_held(query, client, answer, line.epoch)
         connections.drop_mine()
         if not over:
             try:
@@ -670,9 +672,11 @@ class Loads:
             connections.drop(line)
             raise
         else:
-            if (command := self._after(query, client, answer, line.epoch)) is None:
+            if type(answer) is Loaded and client.checksums.get(query.server, 0) == answer.types and actor.hold(answer):
+                loaded_directly(query, answer.resource_id, answer.response, answer.state)
                 await self.calls.let_others_in(_FAR)
                 return True
+            command = self._not_held(query, client, answer, line.epoch)
         connections.drop(line)
         if not over:
             limit_s = None if isinstance(command, c.GiveUp) else left_until(deadline)
@@ -697,8 +701,8 @@ class Loads:
             return c.SendAgain(query.id)
         return c.GiveUp(query.id, failure_of(error), unheard=True)
 
-    def _after(self, query: Query, client: ProviderLink, answer: Loaded | LoadRefused, epoch: int) -> c.Command | None:
-        """Store the answer to a load; return the loop's command if the query is not held then.
+    def _not_held(self, query: Query, client: ProviderLink, answer: Loaded | LoadRefused, epoch: int) -> c.Command:
+        """Return the loop's command after an answer that refuses the load, or that was not stored.
 
         Args:
             epoch: the provider's.
@@ -710,9 +714,6 @@ class Loads:
         if isinstance(answer, Loaded):
             if client.checksums.get(query.server, 0) != answer.types:
                 return c.SendAgain(id)  # the link brings the types, and then the answer once more
-            if actor.hold(answer):
-                loaded_directly(query, answer.resource_id, answer.response, answer.state)
-                return None
             return c.Got(id, answer.resource_id, answer.response, answer.state, epoch)
         if not actor.forget_refused(id):
             # The loop may have sent the load again. It is withdrawn, on disk, before the caller hears the error.

@@ -51,7 +51,7 @@ BARE_MODULES = 12
 HELP_MODULES = 126
 """Of `rr-actors --help`, and a TAB for a verb: typer's, msgspec's, and a few of the base."""
 
-PS_MODULES = 412
+PS_MODULES = 414
 """Of `rr-actors ps`, and a TAB for one of its options: these and the console's, which are nearly all of a system."""
 
 USED = "import rr_actors as rr; rr.System; rr.Manager; rr.Supervisor; rr.Actor; rr.connect"

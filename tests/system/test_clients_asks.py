@@ -91,11 +91,13 @@ def test_a_handler_hears_who_asks(system: rr.System, client: rr.Client) -> None:
         assert "does not hold the scope" in caught.value.__notes__[0]
 
 
-def test_nobody_asks_in_the_name_of_another_client(system: rr.System, client: rr.Client, state_dir: Path) -> None:
+def test_nobody_asks_in_the_name_of_another_client(
+    system: rr.System, client: rr.Client, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     anna = client.open_registrar("anna")
     with rr.connect(state_dir) as other:
         mine = other.open_registrar("bert")
-        mine._name = anna.name  # as a client would that was changed
+        monkeypatch.setattr(mine, "_name", anna.name)  # as a client would that was changed
         with pytest.raises(UnknownRegistrar, match=r"'client\.anna': another client has opened it"):
             mine.ask("bench", "who asks")
 

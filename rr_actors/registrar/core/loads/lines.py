@@ -126,7 +126,7 @@ def line_of(catalog: Catalog, key: RequestKey) -> list[Resource]:
 def _in_use(catalog: Catalog, key: RequestKey) -> list[Resource]:
     """Return the resources of a request that keep others waiting.
 
-    One that could not be unloaded does not: whoever has it has released it, and could do so for ever.
+    One that could not be unloaded does not: its holder has released it, and could do so for ever.
     """
     return [resource for resource in catalog.used(key) if resource.phase is not UNLOAD_FAILED]
 
