@@ -147,5 +147,5 @@ def test_ref_finds_a_sibling_first_then_the_only_one_of_that_id_and_paths(start:
 
 
 def test_ref_outside_of_a_callback_says_so(system: rr.System) -> None:
-    with pytest.raises(rr.UsageError, match="expected to be called in a load, unload, status or recover callback"):
+    with pytest.raises(rr.UsageError, match="expected to be called in a callback"):
         rr.ref("models")

@@ -34,6 +34,7 @@ from rr_actors.registrar.model.messages import (
     Unload,
     Unloaded,
     UnloadRefused,
+    WaitedFor,
 )
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, ServedQuery, State, content_of
 from support import Calls, Gate, eventually, serve
@@ -103,6 +104,7 @@ AGAIN: list[Any] = [
     Noticed(NOTICE),
     NoticesHandled(["n"]),
     Probe("served", "r", "served", []),
+    WaitedFor("mine", "r", "served", []),
     Gone("app"),
     Reprioritise("served", "app", 5),
     Reprioritised("mine", 5),
@@ -132,6 +134,7 @@ AGAIN: list[Any] = [
     c.BeginTrial("recover:r"),
     c.TrialOver("recover:r"),
     c.RefusalOver("request:cam:0"),
+    c.WaitOver("served"),
     c.LingerOver("r"),
     c.GraceOver("r", "event"),
     c.Heard("mine", "event"),

@@ -162,6 +162,8 @@ def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop:
         query.unload()
     served.do_unload = None
     query.unload()
+    with app.load("provider/camera", "again") as again:
+        provider.reload(again.resource_id)
     served.do_load = failing
     with pytest.raises(rr.LoadFailed):
         app.load("provider/camera", "back")

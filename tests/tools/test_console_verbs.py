@@ -137,7 +137,7 @@ def test_what_a_script_waits_for_in_vain_is_told_and_nonsense_is_refused(app: rr
     ran = rr_actors("wait", "shop", "--for", "stopped", "--timeout", "0.2")
     assert ran.returncode == 1
     assert re.fullmatch(r"shop: still running after [\d.]+ s\n", ran.stderr)
-    assert "nothing: gone after" in rr_actors("wait", "nothing", "--timeout", "0").stderr
+    assert "nothing: still gone after" in rr_actors("wait", "nothing", "--timeout", "0").stderr
     told = "--for: expected running, starting, restarting, stopped, OK, UPDATE, WARNING, ERROR, FATAL, loaded, loading"
     assert told in refused(2, "wait", "shop", "--for", "happy")
 
