@@ -91,8 +91,8 @@ def is_repeatable(name: str) -> bool:
 
 
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
-GRACE_S = 1.0
-"""Seconds after a time limit until the other process has to have said how the call ended."""
+GRACE_S = 10.0
+"""Seconds after a time limit until the other process has to have said how the call ended: it may have stood still."""
 
 
 class LinkHost(Protocol):

@@ -698,6 +698,7 @@ class Decision:
                 where.pop(key, None)
             else:
                 where[key] = old
+        self.catalog.stirred.clear()  # as before each decision
         self.catalog.unfinished = None
         self._undo = []
         self.changes.clear()
