@@ -667,8 +667,8 @@ class Registrar(Consumer):
                 urgent first, then the one that came first. Default: False, they share it. Give True for what two
                 users must not use at the same time, such as an instrument.
             grace_s: how long the holder of an exclusive resource has to release it when a load with a higher priority
-                waits. It hears FATAL, with ``status.reason == "revoked"``. Default: None, 5 seconds. Raise it if holders
-                need longer to save their work.
+                waits. It hears FATAL, with ``status.reason == "revoked"``. Default: None, 5 seconds. Raise it if
+                holders need longer to save their work.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".

@@ -173,7 +173,7 @@ def test_all_that_happens_for_want_of_room_is_told_by_name(house: House) -> None
 
     def because(what: str) -> str:
         rows = json.loads(run_cli("loads", "--json", "--state", house.system.state_dir).stdout)["waiting"]
-        return next((row["said"] for row in rows if f'["{what}"' in json.dumps(row["request"])), "")
+        return next((row["said"] for row in rows if f'device ["{what}' in str(row["request"])), "")
 
     room = "waits for room in pool 'watts': asked"
     held = f'{room} 50, free 40 of 100; held by devices/device ["heater",60,0.0] (priority 1)'

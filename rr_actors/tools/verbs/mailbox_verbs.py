@@ -12,7 +12,7 @@ import typer
 from rr_actors.base.errors import UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.asking.waiting import CHILD_STATES, GONE, RESOURCE_STATES, child_of, wait_for
+from rr_actors.system.console.asking.waiting import CHILD_STATES, GONE, RESOURCE_STATES, check_state, child_of, wait_for
 from rr_actors.system.console.console_commands import PauseActor, ResumeActor, StepActor
 from rr_actors.system.console.console_questions import ListHistory, LookAtMailbox
 from rr_actors.system.recording.event_texts import ago
@@ -116,6 +116,7 @@ def wait(
     as_json: JsonOption = False,
 ) -> None:
     """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if in vain."""
+    check_state(wanted, "--for")
     began = time.monotonic()
     done, seen = wait_for(lambda: client_of(state), target, wanted, timeout_s)
     waited_s = round(time.monotonic() - began, 1)

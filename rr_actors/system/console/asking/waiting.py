@@ -37,9 +37,7 @@ def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, tim
         NotRunning: no system ran until the time limit; or it has ended meanwhile, and `wanted` is not GONE.
         UsageError: no such state is known, or several children (NotFound) or resources have this name.
     """
-    known = (*CHILD_STATES, *RESOURCE_STATES, GONE)
-    if wanted and wanted.lower() not in map(str.lower, known):
-        raise UsageError(f"state: expected {', '.join(known)}, got {shown(wanted)}")
+    check_state(wanted, "state")
     deadline = time.monotonic() + timeout_s
     accepted = {wanted.lower()} if wanted else {"running", "loaded"}
     states = [GONE]
@@ -54,6 +52,13 @@ def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, tim
             raise
         return True, GONE
     return False, states[0]
+
+
+def check_state(wanted: str, field: str) -> None:
+    """Raise UsageError if there is no such state; `field` is how the caller names it. "" is one."""
+    known = (*CHILD_STATES, *RESOURCE_STATES, GONE)
+    if wanted and wanted.lower() not in map(str.lower, known):
+        raise UsageError(f"{field}: expected {', '.join(known)}, got {shown(wanted)}")
 
 
 def _patiently(connect: Callable[[], ConsoleClient], deadline: float) -> ConsoleClient:
