@@ -48,7 +48,7 @@ Python 3.12 and later. 128 of them come with asyncio, sqlite3, msgspec, pykka an
 BARE_MODULES = 12
 """Of the import alone: what decides which module a name is in, and leaves the garbage collector alone meanwhile."""
 
-HELP_MODULES = 126
+HELP_MODULES = 127
 """Of `rr-actors --help`, and a TAB for a verb: typer's, msgspec's, and a few of the base."""
 
 PS_MODULES = 414
