@@ -28,7 +28,7 @@ def text_of(annotation: Any) -> str:
     """Return an annotation as source code has it."""
     if isinstance(annotation, str):
         return annotation
-    return inspect.formatannotation(annotation).replace("rr_actors.", "")
+    return inspect.formatannotation(annotation).replace("rr_actors.", "").replace("typing.", "")
 
 
 def parameter_of(parameter: inspect.Parameter) -> str:

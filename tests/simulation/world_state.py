@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rr_actors.registrar.model.catalog import Server
-from rr_actors.registrar.model.rows import Held, Phase, Resource
+from rr_actors.registrar.model.rows import Held, Phase, Resource, State
 from simulation.oracle import Ledger
 from simulation.pending_steps import Todo
 from simulation.sim_links import TO_CONSUMER, SimLine, SimLink
@@ -88,14 +88,17 @@ class WorldState:
         return [registrar for registrar in self.registrars.values() if registrar.state != "gone"]
 
     def dependent(self) -> dict[str, int]:
-        """The resources that are loaded and have not dealt with a status, and the attempts of their loads."""
+        """The resources that are loaded and have not dealt with a status, and the attempts of their loads.
+
+        One that is FATAL does not depend on its parts any more.
+        """
         dealt = {id for id, _ in self.ledger.handled}
         rows = [
             (registrar.name, row)
             for registrar in self.live()
             if registrar.name not in self.left
             for row in registrar.disk["resources"].values()
-            if isinstance(row, Resource) and row.id not in dealt
+            if isinstance(row, Resource) and row.id not in dealt and row.state is not State.FATAL
         ]
         lives = self.ledger.lives
         return {
