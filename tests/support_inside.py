@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, TypeVar
 
@@ -30,6 +32,23 @@ def on_loop(registrar: rr.Registrar, fn: Callable[[], T]) -> T:
         return fn()
 
     return actor_of(registrar).node.dispatcher.run(call(), 10)
+
+
+@contextlib.contextmanager
+def no_loop(app: rr.Registrar) -> Iterator[None]:
+    """Hold the event loop of rr_actors up: nothing that needs it happens meanwhile."""
+    entered, release = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        entered.set()
+        release.wait(30)
+
+    actor_of(app).node.dispatcher.call(wait)
+    assert entered.wait(10)
+    try:
+        yield
+    finally:
+        release.set()
 
 
 def node_of(owner: Any) -> Node:

@@ -458,6 +458,11 @@ async def _load_async(world: World) -> None:
     world.app.unload(query)
 
 
+async def _load_async_elsewhere(world: World) -> None:
+    query = await world.app.load_async("stock/thing", world.fresh())
+    await query.unload_async()
+
+
 def _load_two(world: World) -> None:
     world.app.load_all([("provider/thing", world.fresh()), ("stock/thing", world.fresh())])
 
@@ -532,6 +537,7 @@ def scenes() -> Iterator[Scene]:
     yield Scene("unload_all", lambda world: world.app.unload_all(), _three)
     yield Scene("unload_all as a future", lambda world: world.app.unload_all(block=False).get(timeout=5), _three)
     yield Scene("load_async", lambda world: _run(_load_async(world)))
+    yield Scene("load_async elsewhere", lambda world: _run(_load_async_elsewhere(world)))
     yield Scene("queries", lambda world: [query.request for query in world.app.queries()], _three)
     yield Scene("listings", lambda world: (world.app.clients(), world.app.servers(), world.app.owed()))
     yield Scene("save_catalog", lambda world: world.app.save_catalog(), _three)

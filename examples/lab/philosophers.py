@@ -1,6 +1,6 @@
 """Dining philosophers: each needs two forks, and takes one after the other.
 
-A fork that is asked has its turn for as long as the meal takes. A fork that is told notes who waits for it, and nobody
+A fork that is asked has its turn for as long as the meal takes. With `tell`, a fork notes who waits for it, and nobody
 waits in a handler.
 
 Look for: the errors, and when they come; who has eaten at the end.

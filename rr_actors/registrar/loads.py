@@ -69,7 +69,7 @@ class Calls:
         self.dispatcher = actor.node.dispatcher
         self.limits = TimeLimits(self.dispatcher.loop)
         self._unshared = 0
-        self._turn: tuple[asyncio.AbstractEventLoop, asyncio.Task[Any] | None] | None = None
+        self._turn: tuple[asyncio.AbstractEventLoop, asyncio.Task[Any]] | None = None
 
     def check_open(self) -> None:
         """Raise RegistrarDown if the registrar is closed."""
@@ -113,21 +113,23 @@ class Calls:
             return None
         return client.connections
 
-    def line_of_task(self, connections: ThreadConnections[Exchange]) -> BlockingLink | None:
+    def line_of_task(
+        self, connections: ThreadConnections[Exchange], task: asyncio.Task[Any] | None
+    ) -> BlockingLink | None:
         """Return a connection for the running task alone; None if the loop has to ask instead.
 
         If other tasks have asked in this turn of their event loop, the loop asks: it sends and reads many at once.
         """
-        if self.dispatcher.is_loop_thread() or not self._is_alone():
+        if task is None or self.dispatcher.is_loop_thread() or not self._is_alone(task):
             return None
-        line = connections.take_idle(self._in_worker)
+        line = connections.take_idle(task, self.dispatcher.workers.submit)
         if line is None or isinstance(line, BlockingLink):
             return line
         connections.give_back(line)
         return None
 
-    def _is_alone(self) -> bool:
-        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+    def _is_alone(self, task: asyncio.Task[Any]) -> bool:
+        loop = asyncio.get_running_loop()
         if self._turn is None or self._turn[0] is not loop:
             self._turn = loop, task
             loop.call_soon(self._end_turn)
@@ -135,10 +137,6 @@ class Calls:
 
     def _end_turn(self) -> None:
         self._turn = None
-
-    def _in_worker(self, work: Callable[[], None]) -> None:
-        with contextlib.suppress(RrError):  # no thread is free, or the workers have ended
-            self.dispatcher.workers.submit(work)
 
     async def let_others_in(self, weight: int) -> None:
         """Let the other tasks of the event loop have their turns, after answers that came without one."""
@@ -647,7 +645,8 @@ class Loads:
         client = actor.clients.get(query.registrar)
         if client is None or (connections := self.calls.connections_to(client)) is None:
             return False
-        if (line := self.calls.line_of_task(connections)) is None:
+        task = asyncio.current_task()
+        if (line := self.calls.line_of_task(connections, task)) is None:
             return False
         over: list[RrError] = []  # as in _directly()
 
@@ -669,7 +668,7 @@ class Loads:
         except (OSError, NotSerializable) as error:
             command = self._not_answered(query, error, timeout_s)
         except BaseException:  # cancelled, or KeyboardInterrupt
-            connections.drop(line)
+            connections.drop(line, task)
             raise
         else:
             if type(answer) is Loaded and client.checksums.get(query.server, 0) == answer.types and actor.hold(answer):
@@ -677,7 +676,7 @@ class Loads:
                 await self.calls.let_others_in(_FAR)
                 return True
             command = self._not_held(query, client, answer, line.epoch)
-        connections.drop(line)
+        connections.drop(line, task)
         if not over:
             limit_s = None if isinstance(command, c.GiveUp) else left_until(deadline)
             loading = Loading(self, query, limit_s, timeout_s)
@@ -1036,8 +1035,8 @@ class Unloads:
         connections = None if client is None else calls.connections_to(client)
         if client is None or connections is None:
             return False
-        line = None
-        if client.epoch_here() is None and (line := calls.line_of_task(connections)) is None:
+        line, task = None, asyncio.current_task()
+        if client.epoch_here() is None and (line := calls.line_of_task(connections, task)) is None:
             return False
         if not actor.owe(query_id):
             if line is not None:
@@ -1061,7 +1060,7 @@ class Unloads:
             raise
         finally:
             if line is not None:
-                connections.drop(line)  # it has been given back, unless it is lost or has an answer to come
+                connections.drop(line, task)  # it has been given back, unless it is lost or has an answer to come
         if type(answer) is not Unloaded:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             unloading = Unloading(self, query_id, left_until(deadline), timeout_s)

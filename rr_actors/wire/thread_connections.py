@@ -50,7 +50,7 @@ class ThreadConnections(Generic[E]):
         self._dial = dial
         self._lock = threading.Lock()  # held to begin dialling, and to close
         self._idle: list[E] = []
-        self._in_use: dict[E, int] = {}  # and the thread that uses it
+        self._in_use: dict[E, object] = {}  # and who uses it: a thread's number, or a task
         self._dialling: set[int] = set()  # the threads that dial
         self._is_adding = False
         self._dial_after = 0.0
@@ -63,7 +63,7 @@ class ThreadConnections(Generic[E]):
 
     @property
     def in_use(self) -> list[E]:
-        """The connections that threads use now."""
+        """The connections that threads and tasks use now."""
         return list(self._in_use)
 
     def take(self, timeout_s: float | None) -> E | None:
@@ -76,24 +76,37 @@ class ThreadConnections(Generic[E]):
             line = self._idle.pop()
         except IndexError:
             return self._dialled(timeout_s)
-        self._in_use[line] = threading.get_ident()
+        self._in_use[line] = me = threading.get_ident()
         if self.closed:  # perhaps after close() had cut the connections in use
-            self.drop(line)
+            self.drop(line, me)
             return None
         return line
 
-    def take_idle(self, work: Callable[[Callable[[], None]], object]) -> E | None:
-        """Return a connection as take() does, but open none here: an event loop must not wait for a handshake.
+    def take_idle(self, task: object, work: Callable[[Callable[[], None]], object]) -> E | None:
+        """Return a connection for a task alone, which must give it back or drop it; None: none is free.
+
+        It opens none here: an event loop must not wait for a handshake. A call that blocks the event loop of the task
+        has the same thread. So the connection is the task's, not the thread's.
 
         Args:
-            work: runs a function in another thread. If no connection is free, it is given one that opens another.
+            work: runs a function in another thread, or raises an RrError. If no connection is free, it is given one
+                that opens another.
         """
-        if self._idle:
-            return self.take(None)
-        if not self._is_adding:
-            self._is_adding = True
-            work(self._add)
-        return None
+        try:
+            line = self._idle.pop()
+        except IndexError:
+            if not self._is_adding:
+                self._is_adding = True
+                try:
+                    work(self._add)
+                except RrError:  # no thread is free, or the workers have ended
+                    self._is_adding = False
+            return None
+        self._in_use[line] = task
+        if self.closed:
+            self.drop(line, task)
+            return None
+        return line
 
     def _add(self) -> None:
         try:
@@ -121,7 +134,7 @@ class ThreadConnections(Generic[E]):
                 return None
             self._in_use[line] = me
             if self.closed:
-                self.drop(line)
+                self.drop(line, me)
                 return None
             return line
         except BaseException:  # such as KeyboardInterrupt: no caller gets the connection
@@ -141,11 +154,18 @@ class ThreadConnections(Generic[E]):
 
     def take_out(self, line: E) -> bool:
         """Remove a connection, which the caller must close; return False if the calling thread has given it back."""
-        return self._in_use.get(line) == threading.get_ident() and self._in_use.pop(line, None) is not None
+        return self._take_out(line, threading.get_ident())
 
-    def drop(self, line: E) -> None:
-        """Close a connection that is lost or has an answer to come, unless the calling thread has given it back."""
-        if self.take_out(line):
+    def _take_out(self, line: E, user: object) -> bool:
+        return self._in_use.get(line) == user and self._in_use.pop(line, None) is not None
+
+    def drop(self, line: E, user: object = None) -> None:
+        """Close a connection that is lost or has an answer to come, unless its user has given it back.
+
+        Args:
+            user: the task that has taken it; None: the calling thread has.
+        """
+        if self._take_out(line, user or threading.get_ident()):
             line.close()
 
     def drop_mine(self) -> None:
@@ -278,7 +298,8 @@ class BlockingLink:
         try:
             await ready
         finally:
-            remove(fd)
+            if not loop.is_closed():  # else the task is dropped
+                remove(fd)
             if timer is not None:
                 timer.cancel()
             del ready  # the error that it has has this frame

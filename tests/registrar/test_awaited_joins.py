@@ -8,31 +8,13 @@ import os
 import signal
 import threading
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
 from support import Served, eventually, serve
-from support_inside import actor_of
-
-
-@contextlib.contextmanager
-def no_loop(app: rr.Registrar) -> Iterator[None]:
-    """Hold the event loop of rr_actors up: nothing that needs it happens meanwhile."""
-    entered, release = threading.Event(), threading.Event()
-
-    def wait() -> None:
-        entered.set()
-        release.wait(30)
-
-    actor_of(app).node.dispatcher.call(wait)
-    assert entered.wait(10)
-    try:
-        yield
-    finally:
-        release.set()
+from support_inside import no_loop
 
 
 def agree(app: rr.Registrar, provider: rr.Registrar) -> bool:

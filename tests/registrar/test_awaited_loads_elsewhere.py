@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
 from support import Workshop, connect_threads, eventually, hang, pid_of, wait_respawned
-from support_inside import actor_of
+from support_inside import no_loop
 from support_managers import Order, Shop
 
 FIRST = Order("first")
@@ -33,23 +32,6 @@ def app(shop: rr.System) -> rr.Registrar:
     app = shop.open_registrar("app")
     connect_threads(app, "shop/thing", FIRST)
     return app
-
-
-@contextlib.contextmanager
-def no_loop(app: rr.Registrar) -> Iterator[None]:
-    """Hold the event loop of rr_actors up: nothing that needs it happens meanwhile."""
-    entered, release = threading.Event(), threading.Event()
-
-    def wait() -> None:
-        entered.set()
-        release.wait(30)
-
-    actor_of(app).node.dispatcher.call(wait)
-    assert entered.wait(10)
-    try:
-        yield
-    finally:
-        release.set()
 
 
 def agree(app: rr.Registrar, shop: rr.System) -> bool:
@@ -102,6 +84,25 @@ def test_a_task_that_waits_for_a_callback_lets_the_others_run(
     workshop.shut("made slow")
     run(main(), factory)
     assert agree(app, shop)
+
+
+@pytest.mark.filterwarnings("ignore:registrar 'app'. load.. blocks the event loop:RuntimeWarning")
+def test_a_blocking_load_that_fails_takes_no_connection_from_a_task_of_its_thread(
+    shop: rr.System, app: rr.Registrar, workshop: Workshop
+) -> None:
+    async def main() -> None:
+        slow = asyncio.create_task(app.load_async("shop/thing", Order("slow")))
+        await asyncio.to_thread(workshop.wait, "load slow")
+        with pytest.raises(rr.LoadTimeout):
+            app.load("shop/thing", Order("slower"), timeout_s=0.3)
+        workshop.open("made slow")
+        assert (await slow).response.name == "slow"
+
+    for step in ("made slow", "made slower"):
+        workshop.shut(step)
+    run(main())
+    workshop.open("made slower")
+    eventually(lambda: agree(app, shop))
 
 
 def test_a_task_that_is_cancelled_while_it_waits_holds_nothing(

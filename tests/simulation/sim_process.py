@@ -311,7 +311,7 @@ class SimShell:
         if self.catalog.resources[resource.id].state is State.FATAL:  # it was, before it began
             return {r.id for r in others}
         apart = {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
-        if self.catalog.servers[resource.server].exclusive:  # whoever holds it is to release it first
+        if self.catalog.servers[resource.server].exclusive:  # its holder is to release it first
             apart -= {r.id for r in others if r.phase is not Phase.UNLOAD_FAILED and r.id in self.catalog.holders}
         return apart
 

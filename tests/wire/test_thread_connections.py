@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
-from rr_actors.base.errors import Unavailable
+from rr_actors.base.errors import MailboxFull, Unavailable
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Exchange
 from support import Gate
@@ -86,6 +87,32 @@ def test_closing_cuts_what_is_in_use_and_what_comes_back_then_is_closed() -> Non
     assert lines.take(None) is None
     assert len(made) == 2
     let_go(made)
+
+
+def test_a_task_takes_what_is_free_and_has_another_thread_open_more() -> None:
+    made: list[FakeExchange] = []
+    lines = pool(made)
+    task, other = object(), object()
+    wanted: list[Callable[[], None]] = []
+    assert lines.take_idle(task, refuse) is None
+    for _ in range(2):
+        assert lines.take_idle(task, wanted.append) is None
+    (add,) = wanted  # the refusal is forgotten, and one is enough at a time
+    add()
+    line = lines.take_idle(task, wanted.append)
+    assert line is made[0]
+    lines.drop_mine()
+    lines.drop(line)
+    lines.drop(line, other)
+    assert not made[0].is_closed
+    lines.drop(line, task)
+    assert made[0].is_closed
+    assert lines.in_use == []
+    let_go(made)
+
+
+def refuse(_work: Callable[[], None]) -> None:
+    raise MailboxFull("all threads run")
 
 
 def test_what_was_dialled_while_it_closed_is_for_nobody() -> None:
