@@ -292,7 +292,11 @@ class Folder:
 
     def names(self) -> list[str]:
         """Return the names of all entries of the directory."""
-        return os.listdir(self.fd)
+        fd = os.open(".", _AS_DIRECTORY, dir_fd=self.fd)  # listings by one open file share its place, and lose names
+        try:
+            return os.listdir(fd)
+        finally:
+            os.close(fd)
 
     def rename(self, old: str, new: str) -> None:
         """Rename the entry `old` to `new`, and replace an entry `new`."""

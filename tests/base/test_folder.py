@@ -27,3 +27,14 @@ def test_a_descriptor_is_closed_once_by_whichever_comes_first(tmp_path: Path) ->
         folder.close()
         del folder
         os.fstat(other.fileno())
+
+
+def test_each_listing_is_whole_while_another_of_the_same_folder_has_not_ended(tmp_path: Path) -> None:
+    folder = Folder.at(tmp_path)
+    names = [f"{number}.journal" for number in range(20)]
+    for name in names:
+        (tmp_path / name).touch()
+    with os.scandir(folder.fd) as other:  # as another thread, or a process that has inherited the descriptor
+        next(other)
+        assert sorted(folder.names()) == sorted(names)
+        assert 1 + len(list(other)) == 20

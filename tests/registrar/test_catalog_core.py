@@ -1862,8 +1862,15 @@ def test_a_callback_that_raises_withdraws_what_is_in_flight_and_its_late_answer_
 
 def test_a_probe_goes_on_along_what_is_in_flight() -> None:
     registrar = building()
-    registrar.decide(Probe("r", "theirs", "blocked", ["p/cam"]), "p")
-    assert requests(registrar) == [Probe("q", "theirs", "blocked", ["p/cam", "app/robot"])]
+    registrar.decide(Probe("r", "theirs", "q newer", ["p/cam"]), "p")
+    assert requests(registrar) == [Probe("q", "theirs", "q newer", ["p/cam", "app/robot"])]
+    assert hold_of(registrar) is Hold.PENDING
+
+
+def test_a_probe_goes_on_for_a_newer_load_so_that_all_probes_of_a_ring_end_the_same_one() -> None:
+    registrar = building()
+    registrar.decide(Probe("r", "theirs", "older", ["p/cam"]), "p")
+    assert requests(registrar) == [Probe("q", "r", "q", [])]
     assert hold_of(registrar) is Hold.PENDING
 
 

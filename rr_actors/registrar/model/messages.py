@@ -158,7 +158,8 @@ class Probe(msgspec.Struct, frozen=True, array_like=True, tag=13):
     """Edge chasing (Chandy, Misra, Haas 1983): does the resource of `query_id` wait, directly or not, for `waiter`?
 
     `waiter` is a resource that is being loaded, and `blocked` the query on which it waits. `ring` holds the
-    "registrar/server" names passed so far. A probe that comes to the waiter has found a ring.
+    "registrar/server" names passed so far. A probe that comes to the waiter has found a ring. On its way it goes on for
+    the newest query that it passes (core/loads/load_rings.py).
 
     `holds`: does it hold `waiter`, directly or not? That one is loaded, and holds `blocked` as a part.
     """

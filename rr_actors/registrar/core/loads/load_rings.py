@@ -42,6 +42,10 @@ def ring_of_holds(catalog: Catalog, message: Load, resource_id: str) -> list[str
 # for nothing yet. So a probe starts at such a load. All other edges are known at their providers by then.
 # Therefore a load may go by another connection than the probe that follows it. A link may break and lose a probe. The
 # loads that wait at that provider are then sent again over the next link, and each starts another probe.
+#
+# A ring that closes at two places at once is found by two probes. Both have to end the same load, or nothing is left of
+# the ring. So a probe that passes a newer load than its own goes on for that one: of each ring the newest load fails,
+# the one with the greatest id.
 
 _RING_LIMIT = 256
 
@@ -95,7 +99,9 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     for held_id in parts_of(decision, resource.id):
         held = catalog.held[held_id]
         if held.hold is PENDING:
-            decision.request(held.registrar, Probe(held.id, message.waiter, message.blocked, ring))
+            own = Probe(held.id, resource.id, held.id, [])
+            on = replace(message, query_id=held.id, ring=ring)
+            decision.request(held.registrar, own if held.id > message.blocked else on)
 
 
 def _chase_holders(decision: Decision, resource: Resource, message: Probe) -> None:
