@@ -85,13 +85,13 @@ class SystemConnections(Connections):
         """Lend a connection, as Connections.lent() does."""
         if self.reconnects:
             self.drop_ended()
-        try:
-            with super().lent(greeting_s) as client:
+        with super().lent(greeting_s) as client:
+            try:
                 yield client
-        except NotRunning as error:
-            if self.is_closed or error is self.ended:
-                raise
-            raise self.has_ended() from error
+            except NotRunning as error:
+                if self.is_closed or not client.has_ended:  # an actor that was asked may raise it, too
+                    raise
+                raise self.has_ended() from error
 
     def has_ended(self) -> NotRunning:
         """Return the error that says that the system has ended, and note that it has."""

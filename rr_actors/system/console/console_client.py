@@ -61,6 +61,7 @@ class ConsoleClient:
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
+        has_ended: whether the system has closed the connection, or this side has.
         is_broken: whether the connection must not be kept for another call: the last answer did not come, or is a
             Holding without its keep() yet, or a Refused, after which the console may close the connection.
 
@@ -78,7 +79,7 @@ class ConsoleClient:
         self._socket = _connected(run_dir, deadline)
         self._frames = FrameReader(decoder_of(ANSWERS), c.ANSWER_LIMIT_BYTES)
         self._answers: deque[c.Message] = deque()
-        self.is_broken = False
+        self.has_ended = self.is_broken = False
         try:
             self.welcome = self._asked(c.Hello(c.VERSION, client), c.Welcome, deadline)
         except BaseException:
@@ -245,8 +246,10 @@ class ConsoleClient:
             except TimeoutError:
                 return None
             except OSError as error:
+                self.has_ended = True
                 raise NotRunning(f"{self._who()} has ended: {error.strerror}") from error
             if not data:
+                self.has_ended = True
                 raise NotRunning(f"{self._who()} has ended, or closed the connection")
             self._answers += self._frames.feed(data)
             if self._frames.error is not None and not self._answers:
