@@ -300,6 +300,7 @@ class _ClientLoads(RemoteLoads):
                 held = connection.ask(command, limit_s + GRACE_S)
                 if client.views.hold_again(query, held):
                     connection.keep()
+        client.views.pass_on()
 
     def _load_all(self, requests: Sequence[LoadWanted], options: LoadOptions) -> Queries:
         sent: list[Reply[Query]] = []
