@@ -333,6 +333,11 @@ class Connections:
         """Whether this side has closed the connections."""
         return bool(self._closed)
 
+    def check_open(self) -> None:
+        """Raise NotRunning if this side has closed the connections."""
+        if self._closed:
+            raise NotRunning(self._closed)
+
     def open(self, greeting_s: float = GREETING_S) -> ConsoleClient:
         """Return a new connection. The caller closes it; close() does, too.
 
@@ -343,13 +348,13 @@ class Connections:
             NotRunning: no system runs, or these connections are closed.
             Unavailable: the system is another user's, or speaks another version.
         """
-        if not self._closed:
-            client = ConsoleClient(self._find(), timeout_s=self._timeout_s, greeting_s=greeting_s, client=self._name)
-            with self._lock:
-                if not self._closed:
-                    self._all.add(client)
-                    return client
-            client.close()
+        self.check_open()
+        client = ConsoleClient(self._find(), timeout_s=self._timeout_s, greeting_s=greeting_s, client=self._name)
+        with self._lock:
+            if not self._closed:
+                self._all.add(client)
+                return client
+        client.close()
         raise NotRunning(self._closed)
 
     @contextmanager
