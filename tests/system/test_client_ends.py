@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -201,6 +202,26 @@ def test_the_end_of_the_system_is_a_status_of_each_query(ending: rr.System, stat
         assert all(str(state_dir) in one.message for one in heard)
         assert query.state is rr.State.FATAL
         assert isinstance(client.ended, rr.NotRunning)
+
+
+def test_the_end_is_heard_also_if_statuses_come_while_the_system_stops(ending: rr.System, state_dir: Path) -> None:
+    heard = Calls()
+    with rr.connect(state_dir) as client:
+        query = client.open_registrar("w").load("cameras/camera", "front", on_status=heard)
+        cameras = ending.registrar("cameras")
+
+        def say() -> None:
+            with contextlib.suppress(rr.RrError):  # it has stopped
+                while True:
+                    cameras.send_status(query.resource_id, rr.Status("WARNING", "dirty"))
+
+        saying = [InThread(say) for _ in range(2)]
+        eventually(lambda: heard)
+
+        ending.stop()
+
+        eventually(lambda: list(heard)[-1].reason == "ended")
+        assert all(one.ended().error is None for one in saying)
 
 
 @pytest.mark.parametrize(

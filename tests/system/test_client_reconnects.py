@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -108,6 +110,27 @@ def test_a_query_is_held_again_after_a_restart_with_its_callback_and_its_priorit
     assert query.wait_status("WARNING", timeout_s=LIMIT_S).query_id == id
     query.unload()
     assert system.registrar("cameras").resources() == []
+
+
+def test_callbacks_of_queries_that_come_back_together_run_one_after_the_other(place: Place, client: rr.Client) -> None:
+    runs, overlaps, heard = threading.Lock(), Calls(), Calls()
+
+    def on_status(status: rr.Status) -> None:
+        if runs.acquire(blocking=False):
+            time.sleep(0.02)  # so long another one could begin
+            runs.release()
+        else:
+            overlaps(status)
+        heard(status)
+
+    worker = client.open_registrar("w")
+    for name in ("a", "b", "c", "d"):
+        worker.load("lamps/lamp", name, on_status=on_status)
+    place.stop()
+    place.start(Lamps)
+
+    assert told(heard, 8) == [("ERROR", "ended")] * 4 + [("OK", "reconnected")] * 4
+    assert not overlaps
 
 
 def test_what_the_next_run_does_not_have_is_lost_by_name(place: Place, client: rr.Client) -> None:

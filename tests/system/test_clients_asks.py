@@ -35,6 +35,8 @@ class Bench(rr.Manager):
                 if (asker := rr.current().origin) not in holders:
                     raise rr.UsageError(f"{asker} does not hold the scope")
                 return 1.25
+            case "not running":
+                raise rr.NotRunning("no scope runs")
             case "key":
                 return {}[5]
             case "progress":
@@ -116,6 +118,14 @@ def test_an_exception_of_a_handler_has_its_class_and_its_traceback(client: rr.Cl
     assert (error.actor, error.error) == ("bench", "KeyError")
     assert "return {}[5]" in error.traceback
     assert error.__notes__ == [f"raised in bench:\n{error.traceback}"]
+
+
+def test_a_handler_that_raises_not_running_does_not_end_the_client(client: rr.Client) -> None:
+    with pytest.raises(rr.NotRunning, match=r"^no scope runs"):
+        client.ask("bench", "not running")
+
+    assert client.ended is None
+    assert client.ask("bench", "who asks").startswith("client.pid-")
 
 
 def test_a_message_with_an_object_is_refused_with_advice_that_applies(client: rr.Client) -> None:

@@ -66,6 +66,24 @@ def test_what_does_not_come_in_time_says_what_there_is(rr_system: Start) -> None
         ref.wait_running(timeout_s=-1)
 
 
+def test_a_client_whose_system_has_ended_waits_for_none(rr_system: Start) -> None:
+    system = rr_system(rr.ChildSpec(Cameras, id="cameras", placement="thread"))
+    with rr.connect(system.state_dir) as client:
+        system.stop()
+        assert client.wait_for("cameras", "gone") == "gone"
+        with pytest.raises(rr.NotRunning, match="has ended: connect to its next run"):
+            client.wait_for("cameras", timeout_s=None)
+
+
+def test_a_client_that_is_closed_does_not_say_that_all_is_gone(rr_system: Start) -> None:
+    system = rr_system(rr.ChildSpec(Cameras, id="cameras", placement="thread"))
+    client = rr.connect(system.state_dir)
+    client.close()
+    for state in ("", "gone"):
+        with pytest.raises(rr.NotRunning, match="the client is closed"):
+            client.wait_for("cameras", state, timeout_s=None)
+
+
 def test_a_time_limit_by_another_name_says_which_is_meant(rr_system: Start) -> None:
     app = rr_system(rr.ChildSpec(Cameras, id="cameras", placement="thread")).open_registrar("app")
     with pytest.raises(TypeError, match="unexpected keyword argument 'timeout'; did you mean 'timeout_s'"):

@@ -85,13 +85,13 @@ class SystemConnections(Connections):
         """Lend a connection, as Connections.lent() does."""
         if self.reconnects:
             self.drop_ended()
-        try:
-            with super().lent(greeting_s) as client:
+        with super().lent(greeting_s) as client:
+            try:
                 yield client
-        except NotRunning as error:
-            if self.is_closed or error is self.ended:
-                raise
-            raise self.has_ended() from error
+            except NotRunning as error:
+                if self.is_closed or not client.has_ended:  # an actor that was asked may raise it, too
+                    raise
+                raise self.has_ended() from error
 
     def has_ended(self) -> NotRunning:
         """Return the error that says that the system has ended, and note that it has."""
@@ -168,7 +168,7 @@ def held_as(query: ClientQuery) -> str:
 
 
 class ClientViews:
-    """The queries that a client's registrar holds, and the status callbacks. One thread passes the statuses on.
+    """The queries that a client's registrar holds, and the status callbacks. Statuses are passed on one by one.
 
     Args:
         is_open: returns whether the client has the registrar open. When it has not, no callback begins any more.
@@ -185,6 +185,8 @@ class ClientViews:
         self._again: dict[str, ClientQuery] = {}  # those held after a restart of the system, by their new ids
         self._loads = 0  # in flight
         self._early: dict[str, list[Heard | Dropped]] = {}  # of loads whose answers have not been read yet
+        self._news: deque[Callable[[], None]] = deque()  # what is to be passed on
+        self._passing_on = threading.Lock()
 
     @contextmanager
     def loading(self) -> Generator[None]:
@@ -205,9 +207,8 @@ class ClientViews:
         with self._lock:
             self._held[query.id] = query
             self.callbacks.set(query.id, own, options.loop)
-            early = self._early.pop(query.id, [])
-        for heard in early:
-            self.hear(heard)
+            self._take_early(query, query.id)
+        self.pass_on()
 
     def find(self, query_id: str) -> ClientQuery | None:
         """Return the query of this id that is held; None else."""
@@ -257,11 +258,33 @@ class ClientViews:
                     if len(self._early) > _EARLY:  # the oldest is of a query that was released meanwhile
                         del self._early[next(iter(self._early))]
                 return
+            self._take(held, heard)
+        self.pass_on()
+
+    def pass_on(self) -> None:
+        """Pass on what waits for that, unless another thread does it now: callbacks run one after the other."""
+        while self._news and self._passing_on.acquire(blocking=False):
+            try:
+                while self._news:
+                    self._news.popleft()()
+            finally:
+                self._passing_on.release()
+
+    def _take_early(self, query: ClientQuery, id: str) -> None:
+        for heard in self._early.pop(id, ()):
+            self._take(query, heard)
+
+    def _take(self, query: ClientQuery, heard: Heard | Dropped) -> None:
         if isinstance(heard, Dropped):
-            self.forget(held.id, "")
+            self._news.append(functools.partial(self.forget, query.id, ""))
         else:
-            own = replace(heard, query_id=held.id)
-            self._tell(held, status_heard(own), heard.response, released=heard.released)
+            status = status_heard(replace(heard, query_id=query.id))
+            self._news.append(lambda: self._tell(query, status, heard.response, released=heard.released))
+
+    def end(self) -> None:
+        """Forget all queries, after what waits to be passed on."""
+        self._news.append(lambda: self.forget("", ""))
+        self.pass_on()
 
     def lost(self, error: RrError) -> None:
         """End all queries, as the system has ended: each hears FATAL, and its calls raise the error."""
@@ -272,13 +295,15 @@ class ClientViews:
         """End a query that the system's next run does not hold, if there is one: it hears FATAL."""
         lose(query, error)
         self._say(query, State.FATAL, error.message, ENDED, released=True)
-        self.forget(query.id, "")
+        self._news.append(lambda: self.forget(query.id, ""))
+        self.pass_on()
 
     def away(self, error: NotRunning) -> None:
         """Have all queries wait for the system's next run: each hears ERROR, and its loops raise the error."""
         for query in self._all():
             lose(query, error)
             self._say(query, State.ERROR, error.message, ENDED)
+        self.pass_on()
 
     def all_away(self) -> list[ClientQuery]:
         """Return the queries that wait for the system's next run, the oldest first."""
@@ -289,7 +314,7 @@ class ClientViews:
         return (query := self._held.get(query_id)) is not None and is_lost(query)
 
     def hold_again(self, query: ClientQuery, held: Holding) -> bool:
-        """Note that the system's next run holds a query, which hears so.
+        """Note that the system's next run holds a query, which hears so with the next pass_on().
 
         Return False if the query was released meanwhile, or is held by an earlier call.
         """
@@ -299,10 +324,8 @@ class ClientViews:
             self._again.pop(held_as(query), None)
             hold_again(query, held)
             self._again[held.query_id] = query
-            early = self._early.pop(held.query_id, [])
-        self._say(query, held.state, "the system has been started again, and holds it", AGAIN, held.response)
-        for heard in early:
-            self.hear(heard)
+            self._say(query, held.state, "the system has been started again, and holds it", AGAIN, held.response)
+            self._take_early(query, held.query_id)
         return True
 
     def _all(self) -> list[ClientQuery]:
@@ -322,7 +345,7 @@ class ClientViews:
         place = {"resource_id": query.resource_id, "query_id": query.id, "source": query.server_id}
         status = Status(state, text, repeated=False, **place)
         status.reason = reason
-        self._tell(query, status, response, released=released)
+        self._news.append(lambda: self._tell(query, status, response, released=released))
 
     def _tell(self, query: ClientQuery, status: Status, response: bytes | None, *, released: bool) -> None:
         hear(query, received(status, self.find), response, released=released)
@@ -451,7 +474,7 @@ def listen(lifeline: Lifeline, views_of: Callable[[], ClientViews | None], load_
             _load_again(views_of, load)
         del load
     if (views := views_of()) is not None:
-        views.forget("", "")
+        views.end()
 
 
 def _until_its_end(lifeline: Lifeline, views_of: Callable[[], ClientViews | None]) -> NotRunning | None:

@@ -149,7 +149,9 @@ class Client:
 
     def wait_for(self, id: str, state: str = "", *, timeout_s: float | None = 30.0) -> str:
         """Wait until a child or a resource is in a state, as System.wait_for() does, with its errors."""
-        return waited_for(self._connections.open, id, state, timeout_s)
+        seen = waited_for(self._connections.open, id, state, timeout_s)
+        self._connections.check_open()  # else all seemed gone
+        return seen
 
     def backup(self, directory: str | os.PathLike[str], *, timeout_s: float = 30.0) -> Backup:
         """Have the system back itself up to a directory of its machine, as System.backup() does, with its errors."""
@@ -300,6 +302,7 @@ class _ClientLoads(RemoteLoads):
                 held = connection.ask(command, limit_s + GRACE_S)
                 if client.views.hold_again(query, held):
                     connection.keep()
+        client.views.pass_on()
 
     def _load_all(self, requests: Sequence[LoadWanted], options: LoadOptions) -> Queries:
         sent: list[Reply[Query]] = []

@@ -61,6 +61,7 @@ class ConsoleClient:
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
+        has_ended: whether the system has closed the connection, or this side has.
         is_broken: whether the connection must not be kept for another call: the last answer did not come, or is a
             Holding without its keep() yet, or a Refused, after which the console may close the connection.
 
@@ -78,7 +79,7 @@ class ConsoleClient:
         self._socket = _connected(run_dir, deadline)
         self._frames = FrameReader(decoder_of(ANSWERS), c.ANSWER_LIMIT_BYTES)
         self._answers: deque[c.Message] = deque()
-        self.is_broken = False
+        self.has_ended = self.is_broken = False
         try:
             self.welcome = self._asked(c.Hello(c.VERSION, client), c.Welcome, deadline)
         except BaseException:
@@ -245,8 +246,10 @@ class ConsoleClient:
             except TimeoutError:
                 return None
             except OSError as error:
+                self.has_ended = True
                 raise NotRunning(f"{self._who()} has ended: {error.strerror}") from error
             if not data:
+                self.has_ended = True
                 raise NotRunning(f"{self._who()} has ended, or closed the connection")
             self._answers += self._frames.feed(data)
             if self._frames.error is not None and not self._answers:
@@ -330,6 +333,11 @@ class Connections:
         """Whether this side has closed the connections."""
         return bool(self._closed)
 
+    def check_open(self) -> None:
+        """Raise NotRunning if this side has closed the connections."""
+        if self._closed:
+            raise NotRunning(self._closed)
+
     def open(self, greeting_s: float = GREETING_S) -> ConsoleClient:
         """Return a new connection. The caller closes it; close() does, too.
 
@@ -340,13 +348,13 @@ class Connections:
             NotRunning: no system runs, or these connections are closed.
             Unavailable: the system is another user's, or speaks another version.
         """
-        if not self._closed:
-            client = ConsoleClient(self._find(), timeout_s=self._timeout_s, greeting_s=greeting_s, client=self._name)
-            with self._lock:
-                if not self._closed:
-                    self._all.add(client)
-                    return client
-            client.close()
+        self.check_open()
+        client = ConsoleClient(self._find(), timeout_s=self._timeout_s, greeting_s=greeting_s, client=self._name)
+        with self._lock:
+            if not self._closed:
+                self._all.add(client)
+                return client
+        client.close()
         raise NotRunning(self._closed)
 
     @contextmanager

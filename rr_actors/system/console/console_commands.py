@@ -38,7 +38,7 @@ from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.asking import actor_calls
 from rr_actors.system.console.client_registrars import Caller
-from rr_actors.system.console.console_view import REGISTRAR, Command, View
+from rr_actors.system.console.console_view import REGISTRAR, Command, Verb, View
 
 # -- resources -------------------------------------------------------------------------------------------------------
 
@@ -536,8 +536,11 @@ class Release(Command[c.Done], frozen=True):
         return c.Done(f"released {self.query_id or self.server or 'all'}")
 
 
-class AwaitStatuses(Command[c.Statuses], frozen=True):
-    """Wait for statuses of the queries of the registrar that was opened by this connection. The answer has no limit."""
+class AwaitStatuses(Verb[c.Statuses], frozen=True):
+    """Wait for statuses of the queries of the registrar that was opened by this connection. The answer has no limit.
+
+    A system that is stopping answers, too: its end is the next that the client hears.
+    """
 
     registrar: c.Text
 

@@ -12,7 +12,15 @@ import typer
 from rr_actors.base.errors import UnknownQuery, UsageError, did_you_mean, shown
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.asking.waiting import CHILD_STATES, GONE, RESOURCE_STATES, check_state, child_of, wait_for
+from rr_actors.system.console.asking.waiting import (
+    CHILD_STATES,
+    GONE,
+    RESOURCE_STATES,
+    check_state,
+    child_of,
+    patiently,
+    wait_for,
+)
 from rr_actors.system.console.console_commands import PauseActor, ResumeActor, StepActor
 from rr_actors.system.console.console_questions import ListHistory, LookAtMailbox
 from rr_actors.system.recording.event_texts import ago
@@ -118,7 +126,8 @@ def wait(
     """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if in vain."""
     check_state(wanted, "--for")
     began = time.monotonic()
-    done, seen = wait_for(lambda: client_of(state), target, wanted, timeout_s)
+    until = began + (0 if wanted.lower() == GONE else timeout_s)
+    done, seen = wait_for(lambda: patiently(lambda: client_of(state), until), target, wanted, timeout_s)
     waited_s = round(time.monotonic() - began, 1)
     if as_json:
         say_json({"target": target, "state": seen, "waited_s": waited_s, "done": done})

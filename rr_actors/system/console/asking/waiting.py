@@ -23,7 +23,7 @@ _TICK_S = 0.5  # while nothing happens, so often
 
 
 def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, timeout_s: float) -> tuple[bool, str]:
-    """Wait until a child or a resource is in a state; while no system runs, for one that does.
+    """Wait until a child or a resource is in a state.
 
     Args:
         target: a child's id or path, or a resource's name, or its id or a part of that.
@@ -34,7 +34,7 @@ def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, tim
         Whether it was in time, and the state that was seen last.
 
     Raises:
-        NotRunning: no system ran until the time limit; or it has ended meanwhile, and `wanted` is not GONE.
+        NotRunning: no system runs, or it has ended meanwhile, and `wanted` is not GONE.
         UsageError: no such state is known, or several children (NotFound) or resources have this name.
     """
     check_state(wanted, "state")
@@ -42,7 +42,7 @@ def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, tim
     accepted = {wanted.lower()} if wanted else {"running", "loaded"}
     states = [GONE]
     try:
-        with _patiently(connect, 0.0 if GONE in accepted else deadline) as asking, connect() as hearing:
+        with connect() as asking, connect() as hearing:
             for _ in _looks(hearing, deadline):
                 states = _states_of(asking, target)
                 if not accepted.isdisjoint(map(str.lower, states)):
@@ -61,7 +61,12 @@ def check_state(wanted: str, field: str) -> None:
         raise UsageError(f"{field}: expected {', '.join(known)}, got {shown(wanted)}")
 
 
-def _patiently(connect: Callable[[], ConsoleClient], deadline: float) -> ConsoleClient:
+def patiently(connect: Callable[[], ConsoleClient], deadline: float) -> ConsoleClient:
+    """Connect to a system, which need not run yet.
+
+    Raises:
+        NotRunning: no system ran until the deadline, a time of time.monotonic().
+    """
     while True:
         try:
             return connect()
@@ -131,9 +136,9 @@ def waited_for(
     while True:
         left_s = left_until(deadline)
         done, seen = wait_for(connect, target, wanted, math.inf if left_s is None else left_s)
-        if not done:
-            expected = wanted or "running or loaded"
-            raise Unavailable(f"{target}: expected {expected} within {timeout_s:g} s, it is {seen}")
-        if is_so(seen):
+        if done and is_so(seen):
             return seen
+        if left_until(deadline) == 0:
+            expected, but = wanted or "running or loaded", ", and does not answer" if done else ""
+            raise Unavailable(f"{target}: expected {expected} within {timeout_s:g} s, it is {seen}{but}")
         time.sleep(_LOOKS_S)
