@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import os
 import shutil
 import tempfile
@@ -217,12 +218,16 @@ class OutputLog:
     def close(self) -> None:
         """Log nothing more."""
         self._is_over.set()
-        if self._thread is not None:
-            self._thread.join()
+        thread = self._thread
+        if thread is not None:
+            thread.join()
 
     def _run(self) -> None:
         while not self._is_over.wait(_LOOK_S):
             with self._lock:
+                if not self._files:
+                    self._thread = None
+                    return
                 for tail in self._files.values():
                     tail.look()
 
@@ -241,24 +246,27 @@ class _Tail:
 
     def look(self, *, final: bool = False) -> None:
         """Log the lines that have come."""
-        lines = list(self._new_lines())
-        if final and self._rest:
-            lines.append(self._rest)
-            self._rest = b""
-        for line in lines[:_MOST]:
-            output_logger.info("%s: %s", self._name, readable(line.decode(errors="replace")))
-        if len(lines) > _MOST:
-            output_logger.info("%s: %d lines more, in %s", self._name, len(lines) - _MOST, self._path)
+        lines = self._new_lines()
+        for line in itertools.islice(lines, _MOST):
+            self._log(line)
+        if more := sum(1 for _ in lines):  # they may be too many to be kept
+            output_logger.info("%s: %d lines more, in %s", self._name, more, self._path)
         if final:
+            if self._rest:
+                self._log(self._rest)
             self._close()
+
+    def _log(self, line: bytes) -> None:
+        output_logger.info("%s: %s", self._name, readable(line.decode(errors="replace")))
 
     def _new_lines(self) -> Iterator[bytes]:
         while True:
             if self._file is None and not self._open():
                 return
+            is_over = self._began_anew()  # asked first: from then on no more comes into the file that is open
             data = self._read()
             if not data:
-                if not self._began_anew():
+                if not is_over:
                     return
                 self._close()
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,6 +12,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Actions, RunAction, RunGraph, run_graph
+from rr_actors.managers.actions.graph_documents import read_graph
+from rr_actors.managers.actions.graph_library import Shelf
 from support import eventually, kill, wait_respawned
 from support_cli import run_cli
 
@@ -133,6 +136,25 @@ def test_an_action_that_begins_later_in_a_graph_is_that_of_its_begin(
         assert running.result(60).outputs == {"said": "one"}
 
 
+def test_a_graph_that_cannot_be_changed_goes_on_with_the_classes_it_began_with(
+    start: Start, tmp_path: Path, folder: Path
+) -> None:
+    (folder / "wait.py").write_text(WAIT.format(place=str(tmp_path)))
+    (tmp_path / "graphs").mkdir()
+    long = {**THEN, "graph_name": "long", "graph_description": "x" * 2**24}
+    (tmp_path / "graphs" / "long.json").write_text(json.dumps(long))
+    place = Place(start, tmp_path, graphs=tmp_path / "graphs")
+    running = place.app.load("actions/graph", RunGraph({**THEN, "graph_name": "g"}))
+    assert eventually((tmp_path / "began").exists)
+    (folder / "tell.py").write_text(tell("two"))
+    with pytest.raises(rr.RrError) as caught:
+        place.system.ref("actions").proxy().change_graph(running.resource_id, "long").get()
+    assert not isinstance(caught.value, rr.GraphError)
+    (tmp_path / "go").touch()
+    assert eventually(lambda: running.response["graph_state"] == "FINISHED", what=str(running.response))
+    assert "'said': 'one'" in str(running.response)
+
+
 WRONG: list[tuple[str, str]] = [
     (f"{HEAD}class Tell(rr.Action:\n", "line 4: expected a Python file with a class of actions, got SyntaxError: "),
     (f"{HEAD}\n1 / 0\n", "line 5: expected a Python file with a class of actions, got ZeroDivisionError: "),
@@ -195,3 +217,14 @@ def test_graphs_of_a_folder_follow_the_classes_of_the_other(
     (tmp_path / "tell.py").rename(folder / "tell.py")
     assert run_graph(place.app, "g", timeout_s=60).outputs == {"said": "one"}
     assert "tell.py" not in run_cli("ps").stdout
+
+
+def test_who_asks_for_a_graph_that_cannot_run_gets_an_error_of_its_own() -> None:
+    shelf = Shelf({}, {"g": read_graph({"graph_name": "g", "actions": [{"name": "Tell"}]})})
+    errors: list[rr.GraphError] = []
+    for _ in range(2):
+        with pytest.raises(rr.GraphError, match=r"actions\[0\]\.name") as caught:
+            shelf.find("g")
+        errors.append(caught.value)
+    assert errors[0] is not errors[1]
+    assert (errors[0].path, str(errors[0])) == (errors[1].path, str(errors[1]))

@@ -6,6 +6,7 @@ import logging
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -68,6 +69,42 @@ def test_a_long_output_is_followed_when_its_file_begins_anew(tmp_path: Path, cap
     assert caplog.messages[:2] == ["it: one", "it: two"]
     assert caplog.messages[-1] == "it: the end"
     assert "it: before" not in caplog.messages
+
+
+def test_what_comes_just_before_the_file_begins_anew_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO)
+    file, log, read = tmp_path / "output.log", OutputLog(), os.read
+    file.write_text("one\n")
+    inode = file.stat().st_ino
+
+    def read_before_more_comes(fd: int, most: int) -> bytes:
+        data = read(fd, most)
+        if not data and file.stat().st_ino == inode == os.fstat(fd).st_ino:
+            with file.open("a") as more:
+                more.write("two\n")
+            file.rename(tmp_path / "output.old")
+            file.write_text("three\n")
+        return data
+
+    monkeypatch.setattr(os, "read", read_before_more_comes)
+    log.follow("a", "it", file, from_start=True)
+    assert eventually(lambda: "it: three" in caplog.messages)
+    log.close()
+    assert caplog.messages == ["it: one", "it: two", "it: three"]
+
+
+def test_nothing_waits_for_output_when_no_program_runs(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    file, log = tmp_path / "output.log", OutputLog()
+    file.write_text("one\n")
+    for key in ("a", "b"):
+        log.follow(key, key, file, from_start=True)
+        log.leave(key)
+        assert caplog.messages.pop() == f"{key}: one"
+        assert eventually(lambda: "rr-program-output" not in [thread.name for thread in threading.enumerate()])
+    log.close()
 
 
 PROGRAM = """

@@ -65,14 +65,16 @@ class ActionFolder:
         self._texts: dict[str, str] = {}
         self._by_file: dict[str, Kinds] = {}
         self.faults: dict[str, ConfigError] = {}
-        self._record = None if beginning is None else KeptRecord(beginning.directory / "actions.json", _Record)
+        self._record: KeptRecord[_Record] | None = None
         self._run = "" if beginning is None else beginning.run
-        if self._record is not None and beginning is not None and not beginning.by_hand and self._has_gone_on():
-            self._take()
-            return
-        self.look()
-        for fault in self.faults.values():
-            raise fault
+        record = None if beginning is None else KeptRecord(beginning.directory / "actions.json", _Record)
+        if beginning is None or record is None or beginning.by_hand or record.now.run != beginning.run:
+            self.look()
+            for fault in self.faults.values():
+                raise fault  # what held before a crash stays in the record
+        else:
+            self._go_on(record.now.texts)
+        self._record = record
         self._take()
 
     def look(self) -> bool:
@@ -191,21 +193,15 @@ class ActionFolder:
                 self._record.now = now
                 self._record.save()
 
-    def _has_gone_on(self) -> bool:
-        """Run the texts that held before a crash; the first look after that finds what has changed since.
-
-        Return False if this run of the system has not read the files yet.
-        """
-        if self._record is None or self._record.now.run != self._run:
-            return False
-        for file, text in self._record.now.texts.items():
+    def _go_on(self, texts: Mapping[str, str]) -> None:
+        """Run the texts that held before a crash; the first look after that finds what has changed since."""
+        for file, text in texts.items():
             try:
                 self._by_file[file] = self._kinds_in(file, text)
             except ConfigError as error:  # the code that it uses is another one by now
                 logger.warning("%s; its text before the crash does not hold any more", error)
             else:
                 self._texts[file] = text
-        return True
 
 
 def _merged(some: Iterable[Kinds]) -> dict[str, type[Action]]:

@@ -19,7 +19,6 @@ from rr_actors.base import pickling
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import (
     CatalogError,
-    GraphError,
     LoadFailed,
     LoadTimeout,
     NotFound,
@@ -290,14 +289,14 @@ class Actions(Manager):
         change, before = Change(shelf.find(new, file), start), engine.shelf
         engine.shelf = shelf
         try:
-            self._say(graph, change)
-        except GraphError:
+            unconfirmed = engine.tell(change)
+        except RrError:  # nothing has changed
             engine.shelf = before
             raise
+        _raise_unconfirmed(unconfirmed)
 
     def _say(self, graph: str, event: Event) -> None:
-        if unconfirmed := self._engine(graph).tell(event):
-            raise Unavailable("; ".join(unconfirmed))
+        _raise_unconfirmed(self._engine(graph).tell(event))
 
     def _engine(self, graph: str) -> GraphEngine:
         with self._lock:
@@ -584,3 +583,8 @@ def _flat_inputs(graph: ActionGraph, inputs: dict[str, Any]) -> dict[str, Any]:
 def _key_of(part: Query) -> str:
     request = part.request
     return request.instance if isinstance(request, RunGraph) else request.run
+
+
+def _raise_unconfirmed(unconfirmed: Sequence[str]) -> None:
+    if unconfirmed:
+        raise Unavailable("; ".join(unconfirmed))

@@ -79,7 +79,8 @@ class Shelf:
         if isinstance(graph, dict):
             return self.complete(read_graph(graph, file))
         if graph in self.misfits:
-            raise self.misfits[graph]
+            misfit = self.misfits[graph]
+            raise GraphError(str(misfit), **misfit.details)  # each caller's own: a traceback grows with each raise
         if graph not in self.graphs:
             known = ", ".join(sorted(self.graphs)) or "none"
             raise wrong_graph("", "graph", f"a graph: one of {known}", graph)

@@ -146,8 +146,3 @@ def find_key(text: object, allowed: Sequence[str]) -> str:
     if len(found) > 1:
         raise UsageError(f"{shown(text)} means several alternatives: {few(found)}; give one with its request")
     return found[0]
-
-
-def first(key: str, keys: Sequence[str]) -> list[str]:
-    """Return the keys with this one before all others, if it is one of them."""
-    return [*(one for one in keys if one == key), *(one for one in keys if one != key)]

@@ -34,15 +34,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import wrong
 from rr_actors.managers.choices.addresses import Addresses
 from rr_actors.managers.choices.alternatives import Alternative, check_rings, read_alternatives
-from rr_actors.managers.choices.by_hand import (
-    ByHand,
-    ChoiceInfo,
-    ChoicesRecord,
-    ChosenByHand,
-    find_choice,
-    find_key,
-    first,
-)
+from rr_actors.managers.choices.by_hand import ByHand, ChoiceInfo, ChoicesRecord, ChosenByHand, find_choice, find_key
 from rr_actors.managers.choices.choice_search import ChoiceSearch, breaks_first, loading_of
 from rr_actors.managers.choices.chosen import Choose, Chosen, Held, held_choice
 from rr_actors.managers.choices.labelled import Labelled
@@ -153,7 +145,7 @@ class Choices(Manager):
             choice: the choice's id, the beginning or end of that, or a kind that only one choice has.
             alternative: its key, as choices() says it, or its server if it is the only one of that.
             by: who chooses, for people.
-            dry_run: change nothing, and return what is meant.
+            dry_run: change nothing, and return the choice as it is.
 
         Raises:
             NotFound: there is no such choice, or it allows no such alternative. `.id`, `.known`
@@ -330,20 +322,13 @@ class Choices(Manager):
             key = self._by_hand.key(id)
         one, present = self._offers.find(key, held.request.kind), self._in_use(held)
         parts = self.registrar.children(id)
-        if (
-            key == held.present
-            or one is None
-            or not parts
-            or not (one.break_first or (present and present.break_first))
-        ):
+        breaks = one is not None and (one.break_first or (present is not None and present.break_first))
+        if key == held.present or not parts or not breaks:
             self._return(id, held, key, status)
             return
         held.moving = False
         self._break(id, parts[0])
-        search = self._search(held)
-        if not self._fill(search, status, ()):
-            self._give_up(search, status)
-        self._trials.look()
+        self._choose_again(id, held, status)
 
     def _replace(self, id: str, held: Held, status: Status, part: Query) -> None:
         """Put the next best alternative in the place of one that has failed; give up if there is none."""
@@ -366,7 +351,7 @@ class Choices(Manager):
         self._trials.look()
 
     def _choose_again(self, id: str, held: Held, status: Status) -> None:
-        """Choose anew after a crash, when one had been released and it is not known how far the next one had come."""
+        """Choose anew where one has been released; after a crash, the next one may have come as far as to be a part."""
         for part in self.registrar.children(id):
             self._release(part)
         search = self._search(held)
@@ -510,8 +495,8 @@ class Choices(Manager):
 
     def _allowed_now(self, id: str, held: Held) -> list[Alternative]:
         """Return what a choice allows now, the best first, and what was chosen by hand before all. With the lock."""
-        by_key = {one.key: one for one in self._offers.allowed_now(held.request)}
-        return [by_key[key] for key in first(self._by_hand.key(id), [*by_key])]
+        by_hand = self._by_hand.key(id)
+        return sorted(self._offers.allowed_now(held.request), key=lambda one: one.key != by_hand)
 
     def _in_turn(
         self, best: Sequence[Alternative], without: Collection[str], loaded: Collection[str] = ()
