@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,22 @@ REQUESTS: dict[str, Any] = {
     "components/pipe": Pipe("image"),
     "robots/robot": LoadRobot("rover"),
 }
+
+
+class Lingering:
+    """What a manager does at a stop takes a while, in which its callbacks could end."""
+
+    def on_stop(self) -> None:
+        super().on_stop()  # type: ignore[misc]
+        time.sleep(0.2)
+
+
+class LingeringComponents(Lingering, Components):
+    pass
+
+
+class LingeringPipes(Lingering, Pipes):
+    pass
 
 
 def camera(name: str, code: str = "", **more: object) -> str:
@@ -54,10 +71,12 @@ def served(request: pytest.FixtureRequest, start: Start, tmp_path: Path) -> Call
     """Start a system with these cameras; return it, and what loads one of them by the manager that is tested."""
     server: str = request.param
 
-    def begin(*entries: str, replace: bool = True) -> tuple[rr.System, Any]:
-        kind = Pipes if server == "components/pipe" else Components
+    def begin(*entries: str, replace: bool = True, lingers: bool = False) -> tuple[rr.System, Any]:
         text = "\n".join(entries)
-        if kind is Components:
+        if server == "components/pipe":
+            kind = LingeringPipes if lingers else Pipes
+        else:
+            kind = LingeringComponents if lingers else Components
             text = text.replace('outputs = ["image"]\n', "")
         (tmp_path / "cameras.toml").write_text(text)
         (tmp_path / "robots.toml").write_text('[[robot]]\nname = "rover"\ndriver = { type = "camera" }\n')
@@ -207,7 +226,7 @@ def test_what_waits_for_room_is_released_at_once(served: Any, tmp_path: Path) ->
 
 @pytest.mark.parametrize("orderly", [False, True])
 def test_the_search_for_room_goes_on_in_the_next_process(served: Any, tmp_path: Path, orderly: bool) -> None:
-    system, load = served(camera("front", RUNS, reliability=0.9))
+    system, load = served(camera("front", RUNS, reliability=0.9), lingers=orderly)
     heard = Calls()
     query = load(heard)
     lose_it_on_a_full_disk(system, heard, tmp_path / "full")

@@ -541,5 +541,6 @@ def test_the_end_of_a_program_that_a_full_disk_hides_is_heard_of_when_there_is_r
     with pytest.raises(rr.CatalogError):
         system.registrar("programs").send_status(query, rr.Status(rr.State.WARNING))
     resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
-    eventually(lambda: query.state is rr.State.FATAL)
-    assert heard.items[-1].message.startswith("the program was ended by signal 9 (SIGKILL)")
+    (status,) = heard.wait()
+    assert status.state is rr.State.FATAL
+    assert status.message.startswith("the program was ended by signal 9 (SIGKILL)")

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import groupby
-from typing import Any, Generic, NamedTuple, TypeVar, cast
+from typing import Any, Generic, NamedTuple, NoReturn, TypeVar, cast
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import LoadFailed, RegistrarDown, RrError, Unavailable, UnknownQuery
@@ -35,6 +35,8 @@ C = TypeVar("C")
 K = TypeVar("K")
 R = TypeVar("R")
 T = TypeVar("T")
+
+_LOOK_S = 0.01  # between two looks at whether a registrar is closed
 
 
 class Loading(NamedTuple):
@@ -182,26 +184,39 @@ class Search(Generic[C]):
     def until_had(self, search: Callable[[], T | None]) -> T | None:
         """Return what one pass over the candidates finds. While the machine has no more of what one needs, pass again.
 
-        The holders hear WARNING, and each pass waits longer.
+        The holders hear WARNING, and each pass waits longer. A pass that finds nothing while the manager stops decides
+        nothing.
 
         Raises:
             UnknownQuery: the resource is being unloaded.
-            RegistrarDown: this process stops. The next one hears the status again.
+            RegistrarDown: the manager has stopped. The next process hears the status again.
         """
         before, said = list(self.tried), ""
         for count in itertools.count():
             self.wanted = ""
             found = search()
-            if found is not None or not self.wanted:
+            if found is not None:
                 return found
-            if said != self.wanted:
+            if self.wanted and said != self.wanted:
                 said = self.wanted
                 self.say(f"no other one can be started now, and that is tried again: {said}")
-            if not self._pause(BACKOFF.delay(count, 0.0)):
-                raise RegistrarDown(f"{self.wanted}; {self._registrar.name} stops", registrar=self._registrar.name)
+            if not self._pause(BACKOFF.delay(count, 0.0) if self.wanted else 0.0):
+                self._await_close()
+            if not self.wanted:
+                return None
             self.check_wanted()
             self.tried[:] = before
         return None
+
+    def _await_close(self) -> NoReturn:
+        """Wait until the registrar is closed: until then what the callback returns would be committed.
+
+        Raises:
+            UnknownQuery, RegistrarDown: as check_wanted().
+        """
+        while True:
+            self.check_wanted()
+            time.sleep(_LOOK_S)
 
     def as_part(self, load: Loading) -> Reply[Query]:
         """Begin to load a part of the resource whose callback runs."""
