@@ -25,6 +25,7 @@ import rr_actors as rr
 from rr_actors.base.reporting import log
 from rr_actors.runtime import thread_rules
 from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, serve
+from warm_servers import WarmServers, warm_servers
 
 _MARK = "RR_ACTORS_TESTS"
 _LEAK_LIMIT_S = 5.0
@@ -105,6 +106,13 @@ def pytest_collection_finish() -> None:
     sys.path.sort(key=lambda entry: entry.startswith(below))
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[WarmServers]:
+    """The process that forks the fork servers of tests whose folder asks for it."""
+    with warm_servers() as servers:
+        yield servers
 
 
 _others = {int(name) for name in os.listdir("/proc") if name.isdigit()} - {os.getpid()}  # processes that are not ours

@@ -43,7 +43,7 @@ from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.wire.name_service import NameEntry, Presence, actor_key, open_state_dir, registrar_key
-from support import Gate, eventually, lives, quickly, wait_gone
+from support import WARM, Gate, eventually, lives, quickly, wait_gone
 from support_supervision import Idle, Log, SlowToRegister, StuckManager, Threaded, Tree, Worker, let_go
 
 Plant = Callable[..., Tree]
@@ -68,7 +68,7 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
         if tree.hosted is not None:
             tree.stop()
         tree.close()
-    assert not psutil.Process().children(recursive=True)
+    assert {child.pid for child in psutil.Process().children(recursive=True)} == WARM
 
 
 @pytest.fixture
