@@ -76,7 +76,7 @@ class ThreadConnections(Generic[E]):
             line = self._idle.pop()
         except IndexError:
             return self._dialled(timeout_s)
-        self._in_use[line] = me = threading.get_ident()
+        self._in_use[line] = threading.get_ident()
         if self.closed:  # perhaps after close() had cut the connections in use
             self.drop(line)
             return None
