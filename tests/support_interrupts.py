@@ -431,8 +431,9 @@ def _nothing_of(_: object) -> None:
 def _run(coroutine: Coroutine[Any, Any, None]) -> None:
     """As asyncio.run(), but it waits a second at most for what is left.
 
-    An interrupt within asyncio may lose the wake-up of a task, which then never ends, and asyncio.run() with it. The
-    task's coroutine ends here all the same, as it would with the loop of an application that gives up.
+    An interrupt within asyncio may lose the wake-up of a task, which then never ends, and asyncio.run() with it. Or it
+    may lose the task itself, which then runs but is in no list: it ends when the garbage collector runs. The task's
+    coroutine ends here all the same, as it would with the loop of an application that gives up.
     """
     runner = asyncio.Runner()
     try:
@@ -451,6 +452,7 @@ def _run(coroutine: Coroutine[Any, Any, None]) -> None:
         loop.run_until_complete(loop.shutdown_default_executor())
         asyncio.set_event_loop(None)
         loop.close()
+        coroutine.close()
 
 
 async def _load_async(world: World) -> None:

@@ -14,6 +14,7 @@ import functools
 import math
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
@@ -69,7 +70,8 @@ class Calls:
         self.dispatcher = actor.node.dispatcher
         self.limits = TimeLimits(self.dispatcher.loop)
         self._unshared = 0
-        self._turn: tuple[asyncio.AbstractEventLoop, asyncio.Task[Any]] | None = None
+        # no references: a closed event loop never ends its turn, and would keep its task
+        self._turn: tuple[weakref.ref[asyncio.AbstractEventLoop], weakref.ref[asyncio.Task[Any]]] | None = None
 
     def check_open(self) -> None:
         """Raise RegistrarDown if the registrar is closed."""
@@ -113,16 +115,15 @@ class Calls:
             return None
         return client.connections
 
-    def line_of_task(
-        self, connections: ThreadConnections[Exchange], task: asyncio.Task[Any] | None
-    ) -> BlockingLink | None:
-        """Return a connection for the running task alone; None if the loop has to ask instead.
+    def line_of_task(self, connections: ThreadConnections[Exchange], query_id: str) -> BlockingLink | None:
+        """Return a connection for the running task's call about a query; None if the loop has to ask instead.
 
         If other tasks have asked in this turn of their event loop, the loop asks: it sends and reads many at once.
         """
+        task = asyncio.current_task()
         if task is None or self.dispatcher.is_loop_thread() or not self._is_alone(task):
             return None
-        line = connections.take_idle(task, self.dispatcher.workers.submit)
+        line = connections.take_idle(query_id, self.dispatcher.workers.submit)
         if line is None or isinstance(line, BlockingLink):
             return line
         connections.give_back(line)
@@ -130,10 +131,10 @@ class Calls:
 
     def _is_alone(self, task: asyncio.Task[Any]) -> bool:
         loop = asyncio.get_running_loop()
-        if self._turn is None or self._turn[0] is not loop:
-            self._turn = loop, task
+        if self._turn is None or self._turn[0]() is not loop:
+            self._turn = weakref.ref(loop), weakref.ref(task)
             loop.call_soon(self._end_turn)
-        return self._turn[1] is task
+        return self._turn[1]() is task
 
     def _end_turn(self) -> None:
         self._turn = None
@@ -645,19 +646,20 @@ class Loads:
         client = actor.clients.get(query.registrar)
         if client is None or (connections := self.calls.connections_to(client)) is None:
             return False
-        task = asyncio.current_task()
-        if (line := self.calls.line_of_task(connections, task)) is None:
-            return False
+        line: BlockingLink | None = None
         over: list[RrError] = []  # as in _directly()
 
         def ended(_held: Held | None, error: RrError | None) -> None:
-            if error is not None:
+            if error is not None and line is not None:
                 over.append(error)
                 connections.cut(line)
 
         timeout_s = options.timeout_s
         deadline = deadline_of(timeout_s)
         try:
+            line = self.calls.line_of_task(connections, query.id)
+            if line is None:
+                return False
             load = actor.begin_directly(query, request, ended, _rank(options), options.own)
             if load is None:
                 connections.give_back(line)
@@ -667,8 +669,8 @@ class Loads:
             connections.give_back(line)
         except (OSError, NotSerializable) as error:
             command = self._not_answered(query, error, timeout_s)
-        except BaseException:  # cancelled, or KeyboardInterrupt
-            connections.drop(line, task)
+        except BaseException:  # cancelled, or KeyboardInterrupt, which may come anywhere
+            connections.drop_mine(query.id)
             raise
         else:
             if type(answer) is Loaded and client.checksums.get(query.server, 0) == answer.types and actor.hold(answer):
@@ -676,7 +678,7 @@ class Loads:
                 await self.calls.let_others_in(_FAR)
                 return True
             command = self._not_held(query, client, answer, line.epoch)
-        connections.drop(line, task)
+        connections.drop_mine(query.id)
         if not over:
             limit_s = None if isinstance(command, c.GiveUp) else left_until(deadline)
             loading = Loading(self, query, limit_s, timeout_s)
@@ -1035,17 +1037,17 @@ class Unloads:
         connections = None if client is None else calls.connections_to(client)
         if client is None or connections is None:
             return False
-        line, task = None, asyncio.current_task()
-        if client.epoch_here() is None and (line := calls.line_of_task(connections, task)) is None:
-            return False
-        if not actor.owe(query_id):
-            if line is not None:
-                connections.give_back(line)
-            return False
         deadline = deadline_of(timeout_s)
-        unload = Unload(query_id, actor.name)
         answer: Any = None
+        line: BlockingLink | None = None
         try:
+            if client.epoch_here() is None and (line := calls.line_of_task(connections, query_id)) is None:
+                return False
+            if not actor.owe(query_id):
+                if line is not None:
+                    connections.give_back(line)
+                return False
+            unload = Unload(query_id, actor.name)
             if line is None:
                 answer = answered(actor, client, unload)
             else:
@@ -1054,13 +1056,12 @@ class Unloads:
             if type(answer) is Unloaded and not actor.forget_released(query_id):
                 calls.dispatcher.call(actor.receive, answer, client.provider)
         except OSError:  # also TimeoutError, and then no time is left
-            pass
+            connections.drop_mine(query_id)
         except BaseException:  # cancelled, or KeyboardInterrupt: the loop goes on with the release
-            calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
+            connections.drop_mine(query_id)
+            with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
+                calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
             raise
-        finally:
-            if line is not None:
-                connections.drop(line, task)  # it has been given back, unless it is lost or has an answer to come
         if type(answer) is not Unloaded:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             unloading = Unloading(self, query_id, left_until(deadline), timeout_s)

@@ -50,7 +50,7 @@ class ThreadConnections(Generic[E]):
         self._dial = dial
         self._lock = threading.Lock()  # held to begin dialling, and to close
         self._idle: list[E] = []
-        self._in_use: dict[E, object] = {}  # and who uses it: a thread's number, or a task
+        self._in_use: dict[E, object] = {}  # and who uses it: a thread's number, or what a task's call is named
         self._dialling: set[int] = set()  # the threads that dial
         self._is_adding = False
         self._dial_after = 0.0
@@ -76,19 +76,21 @@ class ThreadConnections(Generic[E]):
             line = self._idle.pop()
         except IndexError:
             return self._dialled(timeout_s)
-        self._in_use[line] = me = threading.get_ident()
+        self._in_use[line] = threading.get_ident()
         if self.closed:  # perhaps after close() had cut the connections in use
-            self.drop(line, me)
+            self.drop(line)
             return None
         return line
 
-    def take_idle(self, task: object, work: Callable[[Callable[[], None]], object]) -> E | None:
-        """Return a connection for a task alone, which must give it back or drop it; None: none is free.
+    def take_idle(self, user: str, work: Callable[[Callable[[], None]], object]) -> E | None:
+        """Return a connection for a task's call alone, which must give it back or drop it; None: none is free.
 
         It opens none here: an event loop must not wait for a handshake. A call that blocks the event loop of the task
-        has the same thread. So the connection is the task's, not the thread's.
+        has the same thread. So the connection is the call's, not the thread's. There is no reference to the task: if
+        its event loop is closed before the answer comes, nothing else ends the call than that the task is collected.
 
         Args:
+            user: a name that no other call has, such as its query's id.
             work: runs a function in another thread, or raises an RrError. If no connection is free, it is given one
                 that opens another.
         """
@@ -99,12 +101,15 @@ class ThreadConnections(Generic[E]):
                 self._is_adding = True
                 try:
                     work(self._add)
-                except RrError:  # no thread is free, or the workers have ended
+                except BaseException as error:
                     self._is_adding = False
+                    if not isinstance(error, RrError):  # such as KeyboardInterrupt
+                        raise
+                    # else no thread is free, or the workers have ended
             return None
-        self._in_use[line] = task
+        self._in_use[line] = user
         if self.closed:
-            self.drop(line, task)
+            self.drop_mine(user)
             return None
         return line
 
@@ -134,7 +139,7 @@ class ThreadConnections(Generic[E]):
                 return None
             self._in_use[line] = me
             if self.closed:
-                self.drop(line, me)
+                self.drop(line)
                 return None
             return line
         except BaseException:  # such as KeyboardInterrupt: no caller gets the connection
@@ -159,20 +164,21 @@ class ThreadConnections(Generic[E]):
     def _take_out(self, line: E, user: object) -> bool:
         return self._in_use.get(line) == user and self._in_use.pop(line, None) is not None
 
-    def drop(self, line: E, user: object = None) -> None:
-        """Close a connection that is lost or has an answer to come, unless its user has given it back.
-
-        Args:
-            user: the task that has taken it; None: the calling thread has.
-        """
-        if self._take_out(line, user or threading.get_ident()):
+    def drop(self, line: E) -> None:
+        """Close a connection that is lost or has an answer to come, unless the calling thread has given it back."""
+        if self.take_out(line):
             line.close()
 
-    def drop_mine(self) -> None:
-        """Drop all connections of the calling thread, which may have been interrupted in take()."""
-        me = threading.get_ident()
-        for line in [line for line, thread in list(self._in_use.items()) if thread == me]:
-            self.drop(line)
+    def drop_mine(self, user: str = "") -> None:
+        """Close all connections of the calling thread, which may have been interrupted in take().
+
+        Args:
+            user: close those of this call of a task instead, which may have been interrupted in take_idle().
+        """
+        me = user or threading.get_ident()
+        for line in [line for line, other in list(self._in_use.items()) if other == me]:
+            if self._take_out(line, me):
+                line.close()
 
     def cut(self, line: E) -> None:
         """End a connection that is in use: for the thread that waits on it, it is lost. Else do nothing."""

@@ -14,7 +14,7 @@ import rr_actors as rr
 from rr_actors.managers import Actions, RunAction, RunGraph, run_graph
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_library import Shelf
-from support import eventually, kill, wait_respawned
+from support import eventually, kill, pid_of, wait_respawned
 from support_cli import run_cli
 
 Start = Callable[..., rr.System]
@@ -186,6 +186,22 @@ def test_a_file_that_is_wrong_is_named_with_its_line_and_ends_nothing(
     assert place.said() == "two"
     with pytest.raises(rr.GraphError, match=r"got 'Missing' \(str\)$"):
         place.said("Missing")
+
+
+def test_a_file_that_ends_the_process_is_named_and_runs_again_when_it_has_changed(
+    start: Start, tmp_path: Path, folder: Path
+) -> None:
+    place = Place(start, tmp_path)
+    assert place.said() == "one"
+    (folder / "tell.py").write_text("import os\nos._exit(3)")
+    (folder / "new.py").write_text(tell("new", "New"))
+    with pytest.raises(rr.GraphError, match=r"tell\.py: expected a Python file .* with which the manager's process"):
+        place.said("Missing")
+    pid = pid_of(place.system, "actions")
+    assert (place.said(), place.said("New")) == ("one", "new")
+    assert pid_of(place.system, "actions") == pid
+    (folder / "tell.py").write_text(tell("two"))
+    assert place.said() == "two"
 
 
 def test_a_file_that_is_wrong_fails_the_start(tmp_path: Path, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import signal
 import threading
@@ -123,6 +124,32 @@ def test_a_task_that_is_cancelled_while_it_waits_holds_nothing(
     workshop.wait("unload slow")
     eventually(lambda: agree(app, shop))
     assert {query.request.name for query in app.queries()} == {"first", "other"}
+
+
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
+def test_a_load_or_an_unload_whose_event_loop_is_closed_ends_with_its_task(
+    shop: rr.System, app: rr.Registrar, workshop: Workshop, caplog: pytest.LogCaptureFixture
+) -> None:
+    def leave(coroutine: Coroutine[Any, Any, Any], line: str) -> None:
+        loop = asyncio.new_event_loop()
+        task = loop.create_task(coroutine)
+        loop.run_until_complete(asyncio.to_thread(workshop.wait, line))
+        assert not task.done()
+        loop.run_until_complete(loop.shutdown_default_executor())
+        loop.close()
+
+    for step in ("made slow", "unload first"):
+        workshop.shut(step)
+    with caplog.at_level("CRITICAL", "asyncio"):  # it complains of each task that is left
+        (held,) = app.queries()
+        leave(held.unload_async(), "unload first")
+        leave(app.load_async("shop/thing", Order("slow")), "load slow")
+        gc.collect()
+    for step in ("made slow", "unload first"):
+        workshop.open(step)
+    workshop.wait("unload slow")
+    eventually(lambda: agree(app, shop))
+    assert app.queries() == []
 
 
 def test_an_unload_whose_task_is_cancelled_goes_on(shop: rr.System, app: rr.Registrar, workshop: Workshop) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import functools
 import gc
@@ -37,6 +38,9 @@ class Clerk(rr.Actor):
     def sell(self) -> None:
         raise ValueError("nothing to sell")
 
+    def sum(self, *prices: int) -> int:
+        return sum(prices)
+
 
 class Had:
     """What a frame has."""
@@ -63,6 +67,16 @@ CALLS: dict[str, Callable[[rr.System, rr.Registrar], Any]] = {
     "ask a thread": lambda system, app: system.ref("usher").ask("x"),
     "ask without waiting": lambda system, app: system.ref("clerk").ask("x", block=False).get(),
     "ask a thread without waiting": lambda system, app: system.ref("usher").ask("x", block=False).get(),
+    "map": lambda system, app: asked(system).map(repr).get(),
+    "map, of map": lambda system, app: asked(system).map(repr).map(repr).get(),
+    "map that fails": lambda system, app: system.ref("clerk").proxy().sum(1, 2).map(len).get(),
+    "filter": lambda system, app: asked(system).filter(repr).get(),
+    "reduce": lambda system, app: asked(system).reduce(max, 0).get(),
+    "join": lambda system, app: asked(system).join(asked(system)).get(),
+    "join of one that fails": lambda system, app: system.ref("clerk").proxy().sum(1, 2).join(asked(system)).get(),
+    "result of map": lambda system, app: asked(system).map(repr).result(5.0),
+    "exception of map": lambda system, app: asked(system).map(repr).exception(),
+    "wait for map": lambda system, app: concurrent.futures.wait([asked(system).map(repr)], 5.0),
     "proxy": lambda system, app: system.ref("clerk").proxy().sell().get(),
     "proxy of a thread": lambda system, app: system.ref("usher").proxy().sell().get(),
     "start_child": lambda system, app: system.start_child(rr.ChildSpec(Clerk, id="clerk")),
@@ -74,6 +88,11 @@ AWAITED: dict[str, Callable[[Any], Any]] = {
     "future": lambda of: load_future(of),
     "unload": lambda of: of.unload_async("none"),
 }
+
+
+def asked(system: rr.System) -> Any:
+    """The future of an ask that fails."""
+    return system.ref("clerk").ask("x", block=False)
 
 
 async def load_future(of: Any) -> None:

@@ -92,7 +92,7 @@ def test_closing_cuts_what_is_in_use_and_what_comes_back_then_is_closed() -> Non
 def test_a_task_takes_what_is_free_and_has_another_thread_open_more() -> None:
     made: list[FakeExchange] = []
     lines = pool(made)
-    task, other = object(), object()
+    task, other = "query 1", "query 2"
     wanted: list[Callable[[], None]] = []
     assert lines.take_idle(task, refuse) is None
     for _ in range(2):
@@ -103,9 +103,9 @@ def test_a_task_takes_what_is_free_and_has_another_thread_open_more() -> None:
     assert line is made[0]
     lines.drop_mine()
     lines.drop(line)
-    lines.drop(line, other)
+    lines.drop_mine(other)
     assert not made[0].is_closed
-    lines.drop(line, task)
+    lines.drop_mine(task)
     assert made[0].is_closed
     assert lines.in_use == []
     let_go(made)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import functools
+import operator
 import queue
 import sys
 import threading
@@ -151,9 +152,9 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         Raises:
             TimeoutError, concurrent.futures.CancelledError, UsageError: as for result().
         """
-        if self._hook_lock is not None:
-            return self._hooked_exception(timeout)
         try:
+            if self._hook_lock is not None:
+                return self._hooked_exception(timeout)
             self._wait_done(timeout)
             if self._open is not None:
                 self._unpack()
@@ -167,6 +168,7 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         limit_s = time_limit(timeout, "timeout")
         try:
             self.get(timeout=timeout)
+            return None
         except KeyboardInterrupt:
             raise
         except pykka.Timeout as error:
@@ -180,7 +182,8 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             return error
         except BaseException as error:
             return error
-        return None
+        finally:
+            del self  # the error has a traceback with this frame
 
     def get(self, *, timeout: float | None = None) -> T:
         """Wait for the value, or for ever if `timeout` (seconds) is None.
@@ -191,21 +194,21 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
                 `timeout` is no number of seconds.
             BaseException: the exception that was set.
         """
-        hook_lock = self._hook_lock
-        if hook_lock is not None:
-            with hook_lock:
-                if not self._set:
-                    self._end_hook(self._hook(timeout), None)
-        if not self._set:
-            self._wait(timeout)
-        if self._open is not None:
-            self._unpack()
-        if self._error is not None:
-            try:
+        try:
+            hook_lock = self._hook_lock
+            if hook_lock is not None:
+                with hook_lock:
+                    if not self._set:
+                        self._end_hook(self._hook(timeout), None)
+            if not self._set:
+                self._wait(timeout)
+            if self._open is not None:
+                self._unpack()
+            if self._error is not None:
                 raise self._error
-            finally:
-                del self  # the error has a traceback with this frame
-        return self._value
+            return self._value
+        finally:
+            del self  # the error has a traceback with this frame
 
     def take(self, *, timeout: float | None = None) -> T:
         """Return what get() does, and forget the error, for a caller that alone has the future.
@@ -400,6 +403,8 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
             self.get()
         except BaseException as error:
             self._end_hook(None, error)
+        finally:
+            del self  # the error has a traceback with this frame
 
     def _end_hook(self, value: Any, error: BaseException | None) -> None:
         with self._lock:
@@ -492,23 +497,50 @@ class Reply(pykka.Future[T], concurrent.futures.Future[T]):
         return "a future" if self.target is None else f"the reply of {self.target.name}"
 
 
-def _derive(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return Pykka's method, which makes a future of the class of its first argument, for subclasses of Reply too.
+def _derive(name: str, combine: Callable[..., Any]) -> Any:
+    """Return Pykka's method of this name: combine(value, *args) is the value of the future that it returns.
 
-    Theirs have constructors with arguments.
+    Pykka's own keep the futures in closures, which an error's traceback has: only a collection would free what the
+    frames of its callers have.
     """
 
-    @functools.wraps(method)
-    def derive(self: Reply[Any], *args: Any) -> Any:
-        plain: Reply[Any] = Reply()
-        plain.set_get_hook(lambda timeout: self.get(timeout=timeout))
-        return method(plain, *args)
+    @functools.wraps(getattr(pykka.Future, name))
+    def derive(self: Reply[Any], *args: Any) -> Reply[Any]:
+        derived: Reply[Any] = Reply()
+        derived.set_get_hook(functools.partial(_combined, combine, self, args))
+        return derived
 
     return derive
 
 
-for _name in ("filter", "join", "map", "reduce"):
-    setattr(Reply, _name, _derive(getattr(pykka.Future, _name)))
+def _combined(combine: Callable[..., Any], future: Reply[Any], args: tuple[Any, ...], timeout: float | None) -> Any:
+    try:
+        value = future.get(timeout=timeout)
+        if combine is _joined:
+            args = tuple(map(operator.methodcaller("get", timeout=timeout), args))
+        return combine(value, *args)
+    finally:
+        del future, args  # the error has a traceback with this frame
+
+
+def _joined(value: Any, *others: Any) -> list[Any]:
+    return [value, *others]
+
+
+def _filtered(items: Any, func: Callable[[Any], bool]) -> list[Any]:
+    return list(filter(func, items))
+
+
+def _mapped(value: Any, func: Callable[[Any], Any]) -> Any:
+    return func(value)
+
+
+def _reduced(items: Any, func: Callable[[Any, Any], Any], *start: Any) -> Any:
+    return functools.reduce(func, items, *start)
+
+
+for _name, _combine in {"filter": _filtered, "join": _joined, "map": _mapped, "reduce": _reduced}.items():
+    setattr(Reply, _name, _derive(_name, _combine))
 
 
 class StopReply(Reply[bool]):

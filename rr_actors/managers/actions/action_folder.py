@@ -37,10 +37,16 @@ _Stamp = tuple[int, int, int]
 
 
 class _Record(msgspec.Struct):
-    """The run of the system that has read the files, and the texts of those that hold, by their paths."""
+    """The run of the system that has read the files, and the texts of those that hold, by their paths.
+
+    `begun`: the paths and texts that run now, and in which run of the system. A crash leaves the one that has
+    ended the process.
+    """
 
     run: str = ""
     texts: dict[str, str] = {}
+    begun_in: str = ""
+    begun: list[tuple[str, str]] = []
 
 
 class ActionFolder:
@@ -68,6 +74,10 @@ class ActionFolder:
         self._record: KeptRecord[_Record] | None = None
         self._run = "" if beginning is None else beginning.run
         record = None if beginning is None else KeptRecord(beginning.directory / "actions.json", _Record)
+        self._kept = record
+        self._begun: list[tuple[str, str]] = []
+        if beginning and record and not beginning.by_hand and record.now.begun_in == beginning.run:
+            self._begun = list(record.now.begun)
         if beginning is None or record is None or beginning.by_hand or record.now.run != beginning.run:
             self.look()
             for fault in self.faults.values():
@@ -139,8 +149,24 @@ class ActionFolder:
         """Run a text, and return its classes of actions.
 
         Raises:
-            ConfigError: it is wrong.
+            ConfigError: it is wrong, or the process ended when it ran before.
         """
+        if (file, text) in self._begun:
+            said = "one with which the manager's process ended; it runs again when it has changed"
+            raise wrong(file, "", _PYTHON, None, said=said)
+        self._note_begun([*self._begun, (file, text)])
+        try:
+            return self._run_text(file, text)
+        finally:
+            self._note_begun([begun for begun in self._begun if begun != (file, text)])
+
+    def _note_begun(self, begun: list[tuple[str, str]]) -> None:
+        self._begun = begun
+        if self._kept is not None:
+            self._kept.now.begun_in, self._kept.now.begun = self._run, begun
+            self._kept.save()
+
+    def _run_text(self, file: str, text: str) -> Kinds:
         others = {**self._taken, **_merged(kinds for name, kinds in self._by_file.items() if name != file)}
         module = ModuleType(f"{Path(file).stem}#{next(_versions)}")
         module.__file__ = file
@@ -188,7 +214,7 @@ class ActionFolder:
         """Let the classes of all files hold, and write their texts."""
         self.kinds: Kinds = _merged(self._by_file.values())
         if self._record is not None:
-            now = _Record(self._run, dict(self._texts))
+            now = _Record(self._run, dict(self._texts), self._run, self._begun)
             if now != self._record.now:
                 self._record.now = now
                 self._record.save()
