@@ -192,7 +192,7 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
                 "methods there are"
             ),
             "kill": "Send a signal to a child's process; if the child ends, its supervisor handles that as any end",
-            "terminate": "Stop a child in order",
+            "terminate": "Stop a child cleanly",
             "restart": "Start a child again",
             "start": "Add a child to the running tree, and start it",
             "shutdown": "Stop the whole system cleanly, as its own stop() does",
