@@ -1,4 +1,4 @@
-"""A service: in a container as process 1, under systemd, or in a terminal. SIGTERM and Ctrl-C end it in order."""
+"""A service: in a container as process 1, under systemd, or in a terminal. SIGTERM and Ctrl-C end it cleanly."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ the ring. An order of the forks, the same for all, makes a ring impossible.
 # ]
 # [answers]
 # "one is refused at once, the others eat" = {prints = "refused: "}
-# "all wait, until a time limit ends one" = {prints = "waited in vain: "}
+# "all wait, until a time limit ends one" = {prints = "waited without success: "}
 # "all eat, one after another" = {prints = "have eaten: 3 of 3"}
 # "all wait for ever" = {prints = "have eaten: 0 of 3"}
 # ///
@@ -100,7 +100,7 @@ def main(state_dir: str, way: str = "ask", where: str = "one process", first: st
             ]
             errors = [error for answer in answers if (error := answer.exception()) is not None]
             for error in errors:
-                said = "refused" if isinstance(error, rr.UsageError) else "waited in vain"
+                said = "refused" if isinstance(error, rr.UsageError) else "waited without success"
                 print(f"{said}: {error}", flush=True)
             eaten = 3 - len(errors)
         else:

@@ -278,7 +278,7 @@ class DistantReply(Reply[Any]):
         super().set_exception(error)
 
     def overdue(self, timeout_s: float | None) -> pykka.Timeout:
-        """Return the error for a caller that has waited in vain; it says if a signal has stopped the process."""
+        """Return the error for a caller who got no answer in time; it says if a signal stopped its process."""
         process = hub(self._where.path)
         why = "" if process is None else process.paused(self._where)
         return pykka.Timeout(f"{super().overdue(timeout_s)}{why}")

@@ -1,7 +1,7 @@
 """Bars on the terminal for loads with progress=True. The one module of the registrar that needs the library rich.
 
 A terminal has one live display at a time, so all bars of the process are lines of one. The display begins with the
-first report of a load, and ends with the last of these loads. If the error output is no terminal, nothing is drawn.
+first report of a load, and ends with the last of these loads. If standard error is no terminal, nothing is drawn.
 """
 
 from __future__ import annotations

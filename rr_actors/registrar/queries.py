@@ -967,7 +967,7 @@ class Views:
     def _ask_types(self, server_id: str) -> ServerType | None:
         """Ask the provider for a server's types, which a crash may have lost; None if it does not answer in time.
 
-        After a first wait in vain, reads do not wait any more: the question stays open until the provider is back.
+        After a first wait without an answer, reads wait no more: the question stays open until the provider is back.
         """
         dispatcher = self._actor.node.dispatcher
         if dispatcher.is_loop_thread() or self._actor.closed or server_id in self._silent:

@@ -302,7 +302,7 @@ class Consumer(abc.ABC):
             wait_s: seconds that the load may wait in line for an exclusive resource. With 0 it fails at once while
                 somebody has it. None: as long as the whole load may take.
             progress: a callable that hears each rr.Progress that the load callback reports, while this load waits. Or
-                True: draw a bar, if the error output is a terminal (needs the extra `progress`). The thread that waits
+                True: draw a bar, if standard error is a terminal (needs the extra `progress`). The thread that waits
                 calls it: the calling thread, with load_async() the task's event loop, with ``block=False`` a worker.
             block: False returns a Pykka future of the query at once.
 

@@ -129,7 +129,7 @@ of_each_process: list[Callable[[], object]] = []
 
 
 def at_exit(handler: Callable[[], object]) -> None:
-    """Register a handler for the orderly end of this process, and of each process that a fork server forks from it."""
+    """Register a handler for the clean end of this process, and of each process that a fork server forks from it."""
     of_each_process.append(handler)
     atexit.register(handler)
 

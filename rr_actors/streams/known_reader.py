@@ -88,7 +88,7 @@ class KnownReader:
     Attributes:
         wanted: how many frames it can take.
         left: it reads no more, but may still have values.
-        stuck: it was waited for in vain, and has said nothing since.
+        stuck: it did not read in time, and has said nothing since.
         keeps_since: when it was first found to keep too much; None: it has said something since, or got a frame.
     """
 

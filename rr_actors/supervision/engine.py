@@ -194,9 +194,9 @@ class Supervision:
                 self._on_exit(action)
 
     def _is_over(self, report: Report) -> bool:
-        """Return whether a kept child has ended for good: it is forgotten, or has ended in order, with its supervisor.
+        """Return whether a kept child has ended for good: it is forgotten, or has ended cleanly, with its supervisor.
 
-        One that has not ended in order may not have unloaded what it serves. It comes back, and then does.
+        One that has not ended cleanly may not have unloaded what it serves. It comes back, and then does.
         """
         if not self.kept.has(report.id):
             return False

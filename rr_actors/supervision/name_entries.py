@@ -212,7 +212,7 @@ class KeptChildren:
         One whose record is damaged, or whose arguments cannot be unpickled, is lost, and comes last.
 
         Raises:
-            CatalogError: the records cannot be listed, or not be read for want of something outside.
+            CatalogError: the records cannot be listed, or not be read because something outside is missing.
         """
         run = self._node.dispatcher.workers.run
         async with self._one_by_one:

@@ -333,7 +333,7 @@ class SupervisorRef:
             spec: the new child; under simple_one_for_one a list of additional arguments.
             id: under simple_one_for_one, the child's id. The child and its arguments are on disk then. They come back
                 with their supervisor, also after a crash of the whole system. terminate_child() ends the child, and so
-                does an orderly stop of the system. A temporary child does not come back. Default: None, an id is made
+                does a clean stop of the system. A temporary child does not come back. Default: None, an id is made
                 up, and the child ends with its supervisor.
 
         Raises:

@@ -29,7 +29,7 @@ class Told(BaseException):
 
 
 class Termination:
-    """A context manager for the main thread. Within it, SIGTERM and SIGINT mean: stop in order.
+    """A context manager for the main thread. Within it, SIGTERM and SIGINT mean: stop cleanly.
 
     The first signal raises Told, if `awaited` is true. Each further signal calls `hurry`. A process with id 1 has no
     default action for SIGTERM: without a handler the signal does nothing to it.

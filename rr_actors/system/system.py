@@ -439,7 +439,7 @@ class System:
                 await steps.take_async("closing the console", console.close())
             await steps.take_async("closing the process's part of it", node.close())
             node.stopping = f"system {self.name!r} has been stopped: start it, and open the registrar again"
-        steps.end(f"system {self.name!r}: not everything stopped in order")
+        steps.end(f"system {self.name!r}: not everything stopped cleanly")
 
     async def _wind_up(self, node: Node, limit_s: float, steps: Steps) -> None:
         node.stopping = f"system {self.name!r} is being stopped"
@@ -505,7 +505,7 @@ class System:
 
         Raises:
             The errors of stop().
-            SupervisionError: the block ended in order, but the tree had ended by itself, and not in order; as run().
+            SupervisionError: the block ended cleanly, but the tree had ended by itself, and not cleanly; as run().
         """
         gave_up = self._gave_up()
         self.stop()
@@ -533,7 +533,7 @@ class System:
             raise gave_up from gave_up.__cause__
 
     def _gave_up(self) -> SupervisionError | None:
-        """Return the error of a running system whose tree has ended by itself, and not in order."""
+        """Return the error of a running system whose tree has ended by itself, and not cleanly."""
         report = self._end
         if self._node is None or report is None or report.exception is None:
             return None
@@ -550,12 +550,12 @@ class System:
         handlers of both signals meanwhile.
 
         Returns:
-            The signal that ended it; or None, if the tree ended by itself in order, or the system was stopped by
+            The signal that ended it; or None, if the tree ended by itself cleanly, or the system was stopped by
             another thread or a console.
 
         Raises:
             The errors of start() and stop().
-            SupervisionError: the tree ended by itself, and not in order; `__cause__` is the error that ended it.
+            SupervisionError: the tree ended by itself, and not cleanly; `__cause__` is the error that ended it.
             UsageError: a thread other than the main one calls it.
         """
         with Termination(f"system {self.name!r}: run()", self._stop_at_once) as termination:
@@ -890,7 +890,7 @@ class System:
         Raises:
             UsageError: the system does not run or has no console, the library nicegui is not installed, or an argument
                 is not valid.
-            Unavailable: the page did not start; the error output says why.
+            Unavailable: the page did not start; standard error says why.
         """
         check_may_block("System.serve_web()")
         self._running()

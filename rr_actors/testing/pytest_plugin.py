@@ -72,7 +72,7 @@ def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start
         steps = Steps()
         for system in reversed(systems):
             steps.take(f"stopping {system.state_dir}", system.stop)
-        steps.end("rr_system: several systems did not stop in order")
+        steps.end("rr_system: several systems did not stop cleanly")
     if left := _still_left(mark, before):
         pytest.fail(f"rr_system: left behind: {'; '.join(left)}")
 

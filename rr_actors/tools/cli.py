@@ -1,4 +1,4 @@
-"""The command `rr-actors`. It prints an error as one line on the error output, without a traceback.
+"""The command `rr-actors`. It prints an error as one line on standard error, without a traceback.
 
 Exit codes: 0 success; 1 the answer is no (of `check` or `chaos`, or a tree of `run` that gave up); 2 the call was
 wrong, or names something that does not exist; 3 no running system was reached; 4 the system tried, and failed.

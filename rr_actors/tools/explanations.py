@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from rr_actors.actors.messaging.mailbox_looks import COUNTED, ON_START, MailboxInfo, MessageInfo
+from rr_actors.actors.messaging.mailbox_looks import COUNTED, ON_START, MailboxInfo
 from rr_actors.base.errors import NotFound, Unavailable, UnknownQuery, UsageError, few, shown
 from rr_actors.base.names import short_id, short_ids
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
@@ -55,7 +55,7 @@ def explain(client: ConsoleClient, id: str) -> list[str]:
     for waiting in line:
         holder = waiting.holders[0]
         said = f" ({waiting.message})" if waiting.message else ""
-        lines.append(f"{holder.origin} waits for it{_since(holder.query_id)}{_priority(holder.priority)}{said}.")
+        lines.append(f"{holder.origin} has waited for it{_since(holder.query_id)}{_priority(holder.priority)}{said}.")
     return [*lines, *(f"Not asked: {note}" for note in found.notes)]
 
 
@@ -106,6 +106,11 @@ def _since_time(at: float | None) -> str:
     return f" since {time.strftime('%H:%M:%S', time.localtime(at))} ({ago(max(0.0, time.time() - at))})"
 
 
+def _holds(what: str, query_id: str) -> str:
+    since = _since(query_id)
+    return f"has held {what}{since}" if since else f"holds {what}"
+
+
 def _of_query(client: ConsoleClient, query: QueryRow) -> Iterator[str]:
     whose = name_of_resource(client.ask, query.parent, query.origin) if query.parent else "itself"
     said = f"Query {short_id(query.id)}: {query.origin}"
@@ -115,7 +120,7 @@ def _of_query(client: ConsoleClient, query: QueryRow) -> Iterator[str]:
         case "owed":
             yield f"{said} has released {query.name}, and {query.server} does not know it yet."
         case _:
-            yield f"{said} holds {query.name}{_since(query.id)}, for {whose}{_priority(query.priority)}."
+            yield f"{said} {_holds(query.name, query.id)}, for {whose}{_priority(query.priority)}."
 
 
 def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
@@ -232,7 +237,8 @@ def _phase(resource: ResourceRow) -> str:
         case "resuming":
             return "is being resumed: its parts are, or its resume callback has not returned."
         case _:
-            return f"is loaded{_since(resource.id)}, and {resource.state}."
+            since = _since(resource.id)
+            return f"{f'has been loaded{since}' if since else 'is loaded'}; its state is {resource.state}."
 
 
 def _of_holder(client: ConsoleClient, holder: HolderRow, indent: str, below: set[str]) -> Iterator[str]:
@@ -241,11 +247,11 @@ def _of_holder(client: ConsoleClient, holder: HolderRow, indent: str, below: set
         yield f"{indent}{holder.origin} has not dealt with {holder.unheard} of its statuses."
     if not holder.parent:
         query = f"(query {short_id(holder.query_id)}){_priority(holder.priority)}"
-        yield f"{indent}{holder.origin} holds it{_since(holder.query_id)}, for itself {query}."
+        yield f"{indent}{holder.origin} {_holds('it', holder.query_id)}, for itself {query}."
         return
     above = client.ask(Find(holder.parent)).resources
     what = _named(above[0]) if above else f"its resource {short_id(holder.parent)}"
-    yield f"{indent}{holder.origin} holds it{_since(holder.query_id)}, for {what}{_priority(holder.priority)}."
+    yield f"{indent}{holder.origin} {_holds('it', holder.query_id)}, for {what}{_priority(holder.priority)}."
     if above and holder.parent not in below and len(below) < _DEEP:
         for other in above[0].holders:
             yield from _of_holder(client, other, indent + "  ", below | {holder.parent})
@@ -263,7 +269,7 @@ def _of_part(client: ConsoleClient, part: str, indent: str, above: set[str]) -> 
         return
     query = queries[0]
     if query.hold == "pending":
-        yield f"{indent}It waits for {query.name}{_since(query.id)} (query {short_id(query.id)})."
+        yield f"{indent}It has waited for {query.name}{_since(query.id)} (query {short_id(query.id)})."
     elif query.state in _WELL:
         yield f"{indent}It depends on {query.name} (query {short_id(query.id)})."
         return
@@ -295,7 +301,7 @@ def mailbox_lines(found: MailboxInfo) -> Iterator[str]:
         yield f"    oldest: {found.oldest}{_for(found.oldest.since_s)}"
         first = f" (of the first {COUNTED})" if found.length > COUNTED else ""
         yield f"    types: {_types(found)}{first}"
-    yield f"    handles: {'nothing' if found.handled is None else f'{found.handled}{_handled_for(found.handled)}'}"
+    yield f"    handles: {'nothing' if found.handled is None else f'{found.handled}{_for(found.handled.since_s)}'}"
     if found.waits_for:
         yield f"    waits for: {', '.join(found.waits_for)}"
 
@@ -352,7 +358,7 @@ def _doing(found: MailboxInfo) -> str:
         return f"{paused}has been in its on_start{_for(doing.since_s)}"
     kind = f"`{doing.type}`" if doing.type else "a message"
     sender = f" from {doing.sender}" if doing.sender else ""
-    return f"{paused}has handled {kind}{sender}{_handled_for(doing)}"
+    return f"{paused}has been handling {kind}{sender}{_for(doing.since_s)}"
 
 
 def _types(found: MailboxInfo) -> str:
@@ -361,10 +367,6 @@ def _types(found: MailboxInfo) -> str:
 
 def _count(count: int) -> str:
     return "no message waits" if not count else "1 message waits" if count == 1 else f"{count:,} messages wait"
-
-
-def _handled_for(message: MessageInfo) -> str:
-    return "" if message.since_s is None else f" since {seconds_text(message.since_s)}"
 
 
 def _for(seconds: float | None) -> str:

@@ -232,7 +232,7 @@ class RandomKills:
 def missing_after(path: str, pid: int, before: Mapping[str, ChildRow], now: Mapping[str, ChildRow]) -> Sequence[str]:
     """Return what is still missing after the child at `path`, with process `pid`, was killed, a sentence each.
 
-    A child that was stopped, or has left, has ended in order: only those count that are on their way.
+    A child that was stopped, or has left, has ended cleanly: only those count that are on their way.
     """
     killed = now.get(path)
     if killed is None:

@@ -1,4 +1,4 @@
-"""Run a system from the shell: its tree, its configuration and its log. SIGTERM and Ctrl-C end it in order."""
+"""Run a system from the shell: its tree, its configuration and its log. SIGTERM and Ctrl-C end it cleanly."""
 
 from __future__ import annotations
 

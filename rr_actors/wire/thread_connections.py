@@ -420,7 +420,7 @@ def _milliseconds_until(deadline: float) -> float | None:
 
 # -- spin, then park ---------------------------------------------------------------------------------------------------
 #
-# Waking a thread takes longer than a quick answer. Spinning instead occupies a core, and is in vain if the answer takes
+# Waking a thread takes longer than a quick answer. Spinning instead occupies a core, and is wasted if the answer takes
 # longer, or if other threads have the core or Python's lock. So the thread remembers how useful spinning was lately, as
 # adaptive mutexes do.
 
@@ -438,7 +438,7 @@ _BUDGET_MIN_S = -20e-3
 class AdaptiveSpin:
     """Decides for one thread at a time whether to spin for the next answer.
 
-    It keeps an account of time. Spinning in vain costs the time it took, including what other threads took meanwhile.
+    It keeps an account of time. Wasted spinning costs the time it took, including what other threads took meanwhile.
     An answer that comes while spinning earns 50 µs, a quick one to a parked thread 6 µs, a slow one nothing. With
     nothing left, a thread does not spin. So any number of slow answers cost SPIN_LIMIT_S twice in all. Answers that are
     always a little late, or always wait for other threads during the spinning, cost 6 µs each.

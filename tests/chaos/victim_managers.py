@@ -210,7 +210,7 @@ def cut_links() -> int:
 
 
 def log_to(directory: Path) -> None:
-    """Write this process's log to a file of the directory, and not to the error output."""
+    """Write this process's log to a file of the directory, and not to standard error."""
     logger = logging.getLogger("rr_actors")
     if logger.handlers:
         return

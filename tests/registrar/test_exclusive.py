@@ -232,8 +232,8 @@ def test_why_says_who_has_it_and_who_waits(system: rr.System, people: Any) -> No
     waiting.append(cara.load(Scopes.open_scope, "bench", block=False))
     assert eventually(lambda: _count(system) == 3)
     said = run_cli("why", 'scopes/scope "bench"', "--state", system.state_dir).stdout
-    assert "anna holds it since" in said
-    lines = [line for line in said.splitlines() if " waits for it since " in line]
+    assert "anna has held it since" in said
+    lines = [line for line in said.splitlines() if " has waited for it since " in line]
     assert [line.split()[0] for line in lines] == ["ben", "cara"]
     assert lines[0].endswith("(1st in line; anna has it).")
     first.unload()

@@ -245,7 +245,7 @@ def test_a_fork_server_that_is_frozen_is_replaced(monkeypatch: pytest.MonkeyPatc
         spawner.close()
 
 
-# -- what a failure is for want of ---------------------------------------------------------------------------------
+# -- what was missing when it failed ---------------------------------------------------------------------------------
 
 
 def _caused(error: BaseException, cause: BaseException) -> BaseException:

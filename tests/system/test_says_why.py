@@ -186,7 +186,7 @@ def test_a_load_that_kills_its_process_each_time_says_by_which_signal_or_exit_co
     assert app.load("one/thing", "harmless").response == "harmless"
 
 
-# -- for want of descriptors or threads ------------------------------------------------------------------------------
+# -- without descriptors or threads ------------------------------------------------------------------------------
 
 
 EMFILE = "EMFILE: the process has as many descriptors open as it may"

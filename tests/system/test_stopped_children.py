@@ -1,4 +1,4 @@
-"""A child that a signal has stopped is named as that in whatever waits for it in vain."""
+"""A child that a signal has stopped is named as that in whatever waits for it."""
 
 from __future__ import annotations
 

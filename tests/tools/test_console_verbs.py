@@ -375,7 +375,7 @@ def test_a_resource_is_named_and_every_command_takes_its_name_and_its_short_id(a
     assert [line.startswith(f'shop/thing {{"name":"lamp {number}"') for number, line in enumerate(lines)] == [True] * 3
     assert all(len(id) == 8 and query.resource_id.endswith(id) for id, query in zip(ids, queries, strict=True))
     assert _without_ids_and_times(said("why", ids[1])).endswith(_without_ids_and_times(said("why", name)))
-    assert f"{name} ({ids[1]}) is loaded" in said("why", ids[1])
+    assert f"{name} ({ids[1]}) has been loaded" in said("why", ids[1])
     assert not re.search(r"[0-9a-f]{32}", said("why", name))
     assert "told 1 holder" in said("status", name, "WARNING", "hot")
     assert "told 1 holder" in said("status", f"shop/thing/{ids[1]}", "OK")
@@ -411,7 +411,7 @@ def test_lists_are_chosen_sorted_and_printed_as_names_for_other_commands(app: rr
 def test_a_long_name_is_shortened_in_the_middle_and_taken_back_so(app: rr.Registrar) -> None:
     app.load("shop/thing", Order("begin" + "-" * 190 + "end"))
     (name,) = re.findall(
-        r"^(shop/thing .*) \(\w+\) is loaded", said("why", said("resources").split()[-1]), re.MULTILINE
+        r"^(shop/thing .*) \(\w+\) has been loaded", said("why", said("resources").split()[-1]), re.MULTILINE
     )
 
     assert len(name) == 60
@@ -642,12 +642,12 @@ def test_why_says_who_holds_it_for_whom_and_since_when(app: rr.Registrar, shop: 
 
     whole, below = said("why", query.id), said("why", part.id)
 
-    assert "app holds shop/thing" in whole
-    assert "app holds it since" in whole
+    assert "app has held shop/thing" in whole
+    assert "app has held it since" in whole
     assert "It depends on shop/thing" in whole
-    assert "shop holds it since" in below
+    assert "shop has held it since" in below
     assert "for shop/thing" in below
-    assert "\n  app holds it since" in below
+    assert "\n  app has held it since" in below
     assert said("why", query.id[:-1]).split(" since ")[0] == whole.split(" since ")[0]
 
 
@@ -804,7 +804,7 @@ def test_why_says_what_a_load_waits_for(system: rr.System, gate: Gate) -> None:
 
     assert "app has waited for provider/whole" in text
     assert "is being loaded" in text
-    assert 'It waits for provider/part "x"' in text
+    assert 'It has waited for provider/part "x"' in text
     gate.open()
     load.get(timeout=10)
 
@@ -1506,7 +1506,7 @@ def test_events_show_what_happened_to_resources_before_they_were_asked_for(app: 
 def test_why_says_since_when_a_resource_is_as_it_is_and_what_came_before(app: rr.Registrar, shop: rr.System) -> None:
     query = app.load("shop/thing", Order("lamp"))
     registrar = shop.registrar("shop")
-    assert "has been" not in said("why", query.resource_id)
+    assert "It has been" not in said("why", query.resource_id)
     registrar.send_status(query, rr.Status("WARNING", "dusty"))
     old = kill(shop, "shop")
     wait_respawned(shop, "shop", old)

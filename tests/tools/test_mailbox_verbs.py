@@ -89,11 +89,11 @@ def test_a_mailbox_is_shown_with_its_oldest_message_and_what_is_handled(busy: rr
         "root/b: 2 messages wait, at most 100,000",
         "    oldest: Reckon from root/c for N",
         "    types: 1 Reckon, 1 dict",
-        "    handles: Reckon from root/a since N",
+        "    handles: Reckon from root/a for N",
     ]
     assert said("mailbox", "root/a") == [
         "root/a: no message waits, at most 100,000",
-        "    handles: tuple from root (pid N) since N",
+        "    handles: tuple from root (pid N) for N",
         "    waits for: root/b",
     ]
     assert said("mailbox", "root") == ["root: no message waits, at most 100,000", "    handles: nothing"]
@@ -118,11 +118,11 @@ def test_a_mailbox_is_data_for_programs(busy: rr.System) -> None:
 
 def test_why_says_for_whom_an_actor_waits_and_what_that_one_does(busy: rr.System) -> None:
     assert said("why", "a") == [
-        "root/a has handled `tuple` from root (pid N) since N.",
-        "root/a waits for root/b, which has handled `Reckon` from root/a since N; in its mailbox 2 messages wait.",
+        "root/a has been handling `tuple` from root (pid N) for N.",
+        "root/a waits for root/b, which has been handling `Reckon` from root/a for N; in its mailbox 2 messages wait.",
     ]
     assert said("why", "root/b") == [
-        "root/b has handled `Reckon` from root/a since N.",
+        "root/b has been handling `Reckon` from root/a for N.",
         "In its mailbox 2 messages wait, the oldest for N: 1 Reckon, 1 dict.",
     ]
     assert said("why", "root") == ["root handles nothing."]
@@ -136,9 +136,10 @@ def test_a_ring_that_several_processes_close_together_is_named(workers: rr.Syste
     workshop.open("meet")
     eventually(lambda: workers.mailbox("a").look().waits_for and workers.mailbox("b").look().waits_for)
     assert said("why", "a") == [
-        "root/a has handled `tuple` from root (pid N) since N.",
+        "root/a has been handling `tuple` from root (pid N) for N.",
         "In its mailbox 1 message waits, the oldest for N: 1 str.",
-        "root/a waits for root/b, which has handled `tuple` from root (pid N) since N; in its mailbox 1 message waits.",
+        "root/a waits for root/b, which has been handling `tuple` from root (pid N) for N; "
+        "in its mailbox 1 message waits.",
         "root/b waits for root/a: that is a ring of asks, root/a → root/b → root/a. "
         "It lasts until the time limit of one of them.",
     ]
@@ -210,9 +211,9 @@ def asking(path: str, *others: str) -> MailboxInfo:
 def test_a_ring_of_asks_is_named() -> None:
     look = looks(asking("root/a", "root/b"), asking("root/b", "root/c"), asking("root/c", "root/b"))
     assert explain_actor(look, "root/a") == [
-        "root/a has handled `Go` since 2.0 s.",
-        "root/a waits for root/b, which has handled `Go` since 2.0 s.",
-        "root/b waits for root/c, which has handled `Go` since 2.0 s.",
+        "root/a has been handling `Go` for 2.0 s.",
+        "root/a waits for root/b, which has been handling `Go` for 2.0 s.",
+        "root/b waits for root/c, which has been handling `Go` for 2.0 s.",
         "root/c waits for root/b: that is a ring of asks, root/b → root/c → root/b. "
         "It lasts until the time limit of one of them.",
     ]

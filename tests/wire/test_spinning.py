@@ -1,4 +1,4 @@
-"""Spin, then park: when a thread that waits for answers spins, and what it costs when that is in vain."""
+"""Spin, then park: when a thread that waits for answers spins, and what it costs when that is wasted."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def plan(
     what runs. Then the lowest are shed, whatever the policy is. `capacity` includes every supply that is on.
 
     A reserve may fail to start. So as long as room for somebody depends on one that is starting, the steps after
-    "supply" revoke nobody for it: it could be in vain. Nor is anybody revoked for those who come after him. To shed,
+    "supply" revoke nobody for it: that might not help. Nor is anybody revoked for those who come after him. To shed,
     all is done at once.
     """
     planning = _Planning(capacity, running, reserves)

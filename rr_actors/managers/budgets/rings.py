@@ -58,7 +58,7 @@ def one_to_refuse(most: Mapping[str, float], holds: Sequence[Hold], waits: Seque
 
 
 def without_ground(holds: Sequence[Hold], waits: Sequence[Wait]) -> list[Wait]:
-    """Return the waits of resources that lose a share that they have: they wait for the rest in vain."""
+    """Return the waits of resources that lose a share that they have: they will never get the rest."""
     losing = {hold.whole for hold in holds if hold.leaving and hold.whole}
     return [wait for wait in waits if wait.whole in losing]
 

@@ -1,6 +1,6 @@
 """What an operator has fixed: which alternative a choice is to have until that is taken back.
 
-It is before all others, and otherwise a choice goes on as ever: another one serves while it fails, and it takes its
+It is before all others, and otherwise a choice goes on as before: another one serves while it fails, and it takes its
 place back when it is well again (decision 81).
 """
 

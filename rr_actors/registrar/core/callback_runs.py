@@ -113,7 +113,7 @@ def deaths_of(catalog: Catalog, role: str, resource_id: str) -> int:
 
 
 def deaths_of_load(catalog: Catalog, resource: Resource) -> int:
-    """Return how many processes have died in the attempts of this load, of which some may have ended in order."""
+    """Return how many processes have died in the attempts of this load, of which some may have ended cleanly."""
     run = catalog.callback_runs.get(run_id("load", resource.id))
     return resource.attempt - 1 if run is None else run.deaths
 

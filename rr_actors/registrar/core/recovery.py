@@ -134,7 +134,7 @@ def begin_again(decision: Decision) -> None:
 
 
 def end_process(decision: Decision) -> None:
-    """Prepare for the next process, as this one ends in order: no callback that runs now is to blame.
+    """Prepare for the next process, as this one ends cleanly: no callback that runs now is to blame.
 
     A load is prepared for its next attempt, so that the parts of this one are released. Else the number of its attempts
     says how many processes have died in it, so from now on a row does.

@@ -42,7 +42,7 @@ class EndClosing(Command, frozen=True):
 
 
 class EndProcess(Command, frozen=True):
-    """The process ends in order: no callback that runs now is to blame for that, and the next process runs it again."""
+    """The process ends cleanly: no callback that runs now is to blame for that, and the next process runs it again."""
 
 
 class SetRows(Command, frozen=True):

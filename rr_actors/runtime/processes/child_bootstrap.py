@@ -207,7 +207,7 @@ def serve(listener: int, alive: int, address: int, errors: int, preload: Sequenc
     forking = _Forking(listener, alive, family)
     garbage.share()
     forking.run()
-    leave(0)  # an orderly end of the interpreter would take 4 ms more, for which System.stop() waits
+    leave(0)  # a clean end of the interpreter would take 4 ms more, for which System.stop() waits
 
 
 def _preload(module: str) -> None:

@@ -100,7 +100,7 @@ def signal_if(pid: int, number: int, is_meant: Callable[[], bool]) -> bool:
 
 
 def _pidfd(pid: int) -> int:
-    """Return a descriptor of a process, or -1 without pidfds or for want of descriptors.
+    """Return a descriptor of a process, or -1 without pidfds or without free descriptors.
 
     Raises:
         ProcessLookupError: there is no such process.

@@ -34,7 +34,7 @@ from rr_actors.supervision.core.state import (
 from rr_actors.supervision.core.transition import Draft, within
 
 PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
-"""The least wait after a start that failed for want of something outside (base/scarcity.py).
+"""The least wait after a start that failed because something outside was missing (base/scarcity.py).
 
 More starts would make it worse. Such a failure does not count: the want ends no supervisor."""
 

@@ -184,7 +184,7 @@ class Supervisor:
             them for a branch that may end.
         placement: as in ChildSpec. Default: "thread", in the process of its own supervisor. Set "process" so that a
             branch survives the crash of its siblings.
-        shutdown_s: as in ChildSpec. Default: "infinity", so that its children stop in order. Lower it if the branch may
+        shutdown_s: as in ChildSpec. Default: "infinity", so that each child can stop. Lower it if the branch may
             be killed.
 
     Raises:

@@ -95,7 +95,7 @@ class SupervisedChild(Struct, frozen=True):
         attempts: restarts since it last ran for long enough (for the backoff).
         doubted: its last start failed while callbacks of resources ran, and did not count. The present start has to say
             whether one of them ended the process.
-        wanting: starts in a row that failed for want of resources (base/scarcity.py).
+        wanting: starts in a row that failed because resources were missing (base/scarcity.py).
         starters, stoppers: callers that get a Reply when it is up (or has failed), or down.
         waiting: calls to be made again when its start or stop has ended.
     """

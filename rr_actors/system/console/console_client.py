@@ -456,7 +456,7 @@ def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:
     running = running_systems()
     if not running:
         raise NotRunning(
-            "no running system of this user is listed: start one (rr-actors run TREE.toml), or name its state "
+            "no running system found for this user: start one (rr-actors run TREE.toml), or name its state "
             "directory with --state DIR or RR_STATE"
         )
     if len(running) > 1:

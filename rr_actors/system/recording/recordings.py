@@ -96,14 +96,14 @@ class Recordings:
         """End all recordings when the system has stopped, and wait for those that write to a disk.
 
         Raises:
-            Exception, ExceptionGroup: recordings did not end in order.
+            Exception, ExceptionGroup: recordings did not end cleanly.
         """
         steps = Steps()
         for sink, closed in self._sinks.items():
             self._end(sink)
             if closed is not None:
                 steps.take("ending a recording", closed)
-        steps.end("not all recordings have ended in order")
+        steps.end("not all recordings have ended cleanly")
 
     def leave_to_parent(self) -> None:
         """End all recordings in a forked child, without touching the parent's files."""

@@ -402,7 +402,7 @@ def _signal_number(text: str) -> int:
 def terminate(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
-    """Stop a child in order. It stays stopped until restart; a temporary child is forgotten."""
+    """Stop a child cleanly. It stays stopped until restart; a temporary child is forgotten."""
     carry_out(state, commands.Terminate(child, dry_run), as_json)
 
 
@@ -410,7 +410,7 @@ def terminate(
 def restart(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
-    """Start a child again. If it runs, it is stopped in order first."""
+    """Start a child again. If it runs, it is stopped cleanly first."""
     carry_out(state, commands.Restart(child, dry_run), as_json)
 
 
@@ -444,7 +444,7 @@ def shutdown(
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Stop the whole system in order, as its own stop() does. A program that waits for the system's end goes on."""
+    """Stop the whole system cleanly, as its own stop() does. A program that waits for the system's end goes on."""
     if not wait or dry_run:
         carry_out(state, commands.ShutDown(dry_run), as_json)
         return

@@ -164,7 +164,7 @@ def _most(limit: int | None, form: str) -> int:
 
 
 def _say_what_is_missing(left_out: int, notes: Sequence[str]) -> None:
-    """Say on the error output how many rows are left out, and who was not asked."""
+    """Say on standard error how many rows are left out, and who was not asked."""
     if left_out > 0:
         say(f"{left_out} more: choose with MATCH, or raise --limit", err=True)
     for note in notes:

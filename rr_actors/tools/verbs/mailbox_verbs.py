@@ -123,7 +123,7 @@ def wait(
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if in vain."""
+    """Wait until a child or a resource is in a state; before the system runs, for that, too; exit code 1 if late."""
     check_state(wanted, "--for")
     began = time.monotonic()
     until = began + (0 if wanted.lower() == GONE else timeout_s)

@@ -37,7 +37,7 @@ def run(
     watch: Annotated[bool, typer.Option("--watch", help="Restart a child whose module has changed.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Let rr-actors pause, step and resume its actors.")] = False,
 ) -> None:
-    """Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second one kills what is left.
+    """Run a system from files alone until SIGTERM or Ctrl-C, which end it cleanly; a second one kills what is left.
 
     Modules and files that a TOML file names are looked for beside it. Exit code 1 if the tree gave up by itself.
     """

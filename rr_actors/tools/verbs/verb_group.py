@@ -139,7 +139,7 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
             ),
             "wait": (
                 "Wait until a child or a resource is in a state; before the system runs, for that, too; "
-                "exit code 1 if in vain"
+                "exit code 1 if late"
             ),
         },
         _planner: {
@@ -192,10 +192,10 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
                 "methods there are"
             ),
             "kill": "Send a signal to a child's process; if the child ends, its supervisor handles that as any end",
-            "terminate": "Stop a child in order",
+            "terminate": "Stop a child cleanly",
             "restart": "Start a child again",
             "start": "Add a child to the running tree, and start it",
-            "shutdown": "Stop the whole system in order, as its own stop() does",
+            "shutdown": "Stop the whole system cleanly, as its own stop() does",
         },
         _mailboxes: {
             "pause": (
@@ -211,7 +211,7 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
         },
         _system: {
             "run": (
-                "Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second "
+                "Run a system from files alone until SIGTERM or Ctrl-C, which end it cleanly; a second "
                 "one kills what is left"
             ),
             "verify": (
