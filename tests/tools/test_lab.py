@@ -20,7 +20,7 @@ from support_browser import LAB, Tab, needs_chromium, web
 
 pytestmark = pytest.mark.timeout(180)
 
-EXPERIMENTS = read_lab(LAB).experiments
+EXPERIMENTS = read_lab([LAB]).experiments
 LONG_S = 60.0
 SHARING = LAB / "sharing_and_parts.py"
 AT_ONCE = 10  # experiments side by side: more of them make each too slow to show what it should
@@ -99,12 +99,16 @@ def test_an_experiment_imports_what_is_beside_it_also_when_its_code_was_changed(
 def test_the_page_names_a_file_that_is_broken_and_serves_the_others_also_one_that_is_mended(
     tab: Tab, tmp_path: Path
 ) -> None:
-    shutil.copy(SHARING, tmp_path)
-    broken = tmp_path / "broken.py"
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    shutil.copy(SHARING, mine)
+    broken = mine / "broken.py"
     broken.write_text("def main(:")
-    with web("--lab", tmp_path) as url:
+    with web("--lab", LAB, "--lab", mine) as url:
         tab.goes_to(url)
-        tab.sees("nav", "Sharing and dependencies", f"{broken}: expected a Python program")
+        tab.sees(
+            "nav", "Sharing and dependencies", f"{broken}: expected a Python program", "expected a name that no other"
+        )
         broken.write_text('"""Mended: now."""\ndef main(state_dir): ...')
         tab.do(tab.page.reload())
         tab.clicks("Mended")

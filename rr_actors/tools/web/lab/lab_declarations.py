@@ -122,6 +122,11 @@ class LabExperiment:
         return self.program.stem
 
     @property
+    def button(self) -> str:
+        """The words that the page shows in its list: the title up to its colon."""
+        return self.title.partition(":")[0]
+
+    @property
     def question(self) -> Question | None:
         """What is asked before it runs; None asks nothing."""
         return Question(self.declared.question, self.declared.answers) if self.declared.question else None
