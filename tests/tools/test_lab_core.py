@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -312,15 +315,36 @@ def test_a_notebook_has_the_same_code_and_the_chosen_levers(name: str) -> None:
     levers = {lever.name: lever.choices[-1] for lever in experiment.levers}
     notebook = nbformat.reads(notebook_of(experiment, levers), as_version=4)
     nbformat.validate(notebook)
-    asked, code, call, why = [cell.source for cell in notebook.cells]
+    asked, code, call, happened, picture, why = [cell.source for cell in notebook.cells]
     assert experiment.question is not None
-    assert asked.endswith(f"**{experiment.question.text}**")
+    assert f"**{experiment.question.text}**\n\n- " in asked
     assert experiment.why not in asked
     assert why == f"Why: {experiment.why}"
-    compile(code, "cell", "exec")
-    arguments = ast.parse(call, mode="eval").body
-    assert isinstance(arguments, ast.Call)
-    assert {one.arg: ast.literal_eval(one.value) for one in arguments.keywords} == levers
+    for source in (code, picture):
+        compile(source, "cell", "exec")
+    called = ast.parse(call).body[-1]
+    assert isinstance(called, ast.Expr)
+    assert isinstance(called.value, ast.Call)
+    assert {one.arg: ast.literal_eval(one.value) for one in called.value.keywords} == levers
+    words = re.findall(r"\b(?:box(?:es)?|buttons?|pages?|squares?|tabs?|clicks?)\b", f"{asked} {happened} {why}")
+    assert words == []
+
+
+def test_a_notebook_shows_what_has_happened(tmp_path: Path) -> None:
+    code = """
+import rr_actors as rr
+def main(state_dir, *, id="mine"):
+    with rr.System([rr.ChildSpec(rr.Actor, id=id)], state_dir=state_dir): ...
+"""
+    experiment = LabExperiment(tmp_path / "mine.py", "Mine", "", "", "", code, LabDeclaration())
+    cells = json.loads(notebook_of(experiment, {"id": "lidar"}))["cells"]
+    source = "\n".join(cell["source"] for cell in cells if cell["cell_type"] == "code")
+    program = written(tmp_path, f"{source}._repr_svg_()".replace("read_timeline(f", "print(read_timeline(f") + ")")
+
+    ran = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=50)
+
+    assert ran.stdout.startswith("<svg"), ran.stderr
+    assert "lidar" in ran.stdout
 
 
 # -- ten questions ---------------------------------------------------------------------------------------------------
