@@ -1,7 +1,7 @@
 """Trials of the lab's experiments: each is a run with some values of its levers, and what it is expected to show.
 
 A test says which answers are right under which levers. So an experiment does what its labels say, and a student who is
-right hears so. docs/lab.md has an example.
+right hears so. docs/console.md has an example.
 """
 
 from __future__ import annotations

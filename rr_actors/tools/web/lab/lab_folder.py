@@ -12,7 +12,8 @@ until its question is answered. A block of comments declares levers and a questi
     # "it stays away" = {}
     # ///
 
-Each lever is a parameter of main(). The run itself answers the question. docs/lab.md has the whole format.
+Each lever is a parameter of main(). The run itself answers the question. docs/console.md
+has more.
 """
 
 from __future__ import annotations
