@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
-from rr_actors.tools.web.lab.lab_declarations import Seen
+from rr_actors.base.errors import UsageError
+from rr_actors.testing.experiments import Seen, Trial, check_levers, check_trials
 from rr_actors.tools.web.lab.lab_folder import read_lab
 from rr_actors.tools.web.lab.lab_runs import Place, Run
 from support import eventually
@@ -20,7 +22,7 @@ from support_browser import LAB, Tab, needs_chromium, web
 
 pytestmark = pytest.mark.timeout(180)
 
-EXPERIMENTS = read_lab(LAB).experiments
+EXPERIMENTS = read_lab([LAB]).experiments
 LONG_S = 60.0
 SHARING = LAB / "sharing_and_parts.py"
 AT_ONCE = 10  # experiments side by side: more of them make each too slow to show what it should
@@ -99,12 +101,16 @@ def test_an_experiment_imports_what_is_beside_it_also_when_its_code_was_changed(
 def test_the_page_names_a_file_that_is_broken_and_serves_the_others_also_one_that_is_mended(
     tab: Tab, tmp_path: Path
 ) -> None:
-    shutil.copy(SHARING, tmp_path)
-    broken = tmp_path / "broken.py"
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    shutil.copy(SHARING, mine)
+    broken = mine / "broken.py"
     broken.write_text("def main(:")
-    with web("--lab", tmp_path) as url:
+    with web("--lab", LAB, "--lab", mine) as url:
         tab.goes_to(url)
-        tab.sees("nav", "Sharing and dependencies", f"{broken}: expected a Python program")
+        tab.sees(
+            "nav", "Sharing and dependencies", f"{broken}: expected a Python program", "expected a name that no other"
+        )
         broken.write_text('"""Mended: now."""\ndef main(state_dir): ...')
         tab.do(tab.page.reload())
         tab.clicks("Mended")
@@ -184,10 +190,6 @@ def test_a_run_that_fails_or_is_stopped_has_not_finished() -> None:
     assert "ZeroDivisionError" in failed.lines[-1]
 
 
-def happened(seen: Seen, event: str, path: str) -> int:
-    return sum((one.event, one.facts.get("path")) == (event, path) for one in seen.events)
-
-
 def watts_on(seen: Seen, step: str) -> int:
     on = next(line for line in seen.lines[list(seen.lines).index(step) :] if line.startswith("on:"))
     return sum(40 if device == "pump" else 20 for device in on.split()[1:])
@@ -198,133 +200,186 @@ def waits(seen: Seen, modem: str) -> list[str]:
 
 
 def restarts(count: int, path: str) -> Callable[[Seen], bool]:
-    return lambda seen: happened(seen, "restarted", path) == count
+    return lambda seen: seen.count("restarted", path) == count
 
 
 def prints(*texts: str) -> Callable[[Seen], bool]:
-    return lambda seen: all(any(text in line for line in seen.lines) for text in texts)
+    return lambda seen: all(map(seen.prints, texts))
 
 
-class Played(NamedTuple):
-    """A run with these values of its levers, and others as they begin.
-
-    Attributes:
-        right: the answers that it shows to be right.
-        shows: whether it has shown what the labels of the levers say. None where the answers themselves do.
-    """
-
-    name: str
-    levers: dict[str, Any]
-    right: set[str]
-    shows: Callable[[Seen], bool] | None = None
+def trial(name: str, levers: dict[str, Any], right: set[str], shows: Callable[[Seen], bool] | None = None) -> Trial:
+    return Trial(LAB / f"{name}.py", levers, right, shows)
 
 
-PLAYED = (
-    Played("four_strategies", {}, {"b", "c"}),
-    Played("four_strategies", {"child": "a"}, {"a", "b", "c"}),
-    Played("four_strategies", {"child": "c"}, {"c"}, restarts(1, "root/one_for_one/c")),
-    Played("your_own_tree", {}, {"restart b"}, restarts(1, "root/team/b")),
-    Played("your_own_tree", {"strategy": "one_for_all", "child": "a"}, {"restart a", "restart b", "restart c"}),
-    Played("your_own_tree", {"strategy": "rest_for_one", "kills": 2}, {"restart b", "restart c"}),
-    Played("your_own_tree", {"max_restarts": 0}, {"give up"}),
-    Played("your_own_tree", {"max_restarts": 1, "kills": 2, "child": "c"}, {"restart c", "give up"}),
-    Played("your_own_tree", {"kills": 3}, {"restart b", "give up"}, restarts(2, "root/team/b")),
-    Played("your_own_tree", {"max_restarts": 3, "kills": 3}, {"restart b"}, restarts(3, "root/team/b")),
-    Played("your_own_tree", {"max_restarts": 3, "kills": 4}, {"restart b", "give up"}, restarts(3, "root/team/b")),
-    Played("restart_storm", {}, {"branch", "root, too"}, restarts(6, "root/branch/broken")),
-    Played("restart_storm", {"max_restarts": 1}, {"branch", "root, too"}, restarts(2, "root/branch/broken")),
-    Played("restart_storm", {"max_restarts": 2}, {"branch", "root, too"}, restarts(4, "root/branch/broken")),
-    Played("escalation_levels", {}, {"wheel", "base"}, prints("kill 4")),
-    Played("escalation_levels", {"kills": 1}, {"none: the motor alone"}, restarts(1, "root/base/wheel/motor")),
-    Played("escalation_levels", {"kills": 2}, {"wheel"}, restarts(1, "root/base/wheel/motor")),
-    Played("escalation_levels", {"kills": 3}, {"wheel"}, restarts(2, "root/base/wheel/motor")),
-    Played("back_off", {}, {"over 3 s"}, lambda seen: waits(seen, "left") == waits(seen, "right")),
-    Played("back_off", {"factor": 1.0}, {"under 1.5 s"}, prints("wait 2: under 1.5 s (1.00 s)")),
-    Played(
+TRIALS = (
+    trial("four_strategies", {}, {"b", "c"}),
+    trial("four_strategies", {"child": "a"}, {"a", "b", "c"}),
+    trial("four_strategies", {"child": "c"}, {"c"}, restarts(1, "root/one_for_one/c")),
+    trial("your_own_tree", {}, {"restart b"}, restarts(1, "root/team/b")),
+    trial("your_own_tree", {"strategy": "one_for_all", "child": "a"}, {"restart a", "restart b", "restart c"}),
+    trial("your_own_tree", {"strategy": "rest_for_one", "kills": 2}, {"restart b", "restart c"}),
+    trial("your_own_tree", {"max_restarts": 0}, {"give up"}),
+    trial("your_own_tree", {"max_restarts": 1, "kills": 2, "child": "c"}, {"restart c", "give up"}),
+    trial("your_own_tree", {"kills": 3}, {"restart b", "give up"}, restarts(2, "root/team/b")),
+    trial("your_own_tree", {"max_restarts": 3, "kills": 3}, {"restart b"}, restarts(3, "root/team/b")),
+    trial("your_own_tree", {"max_restarts": 3, "kills": 4}, {"restart b", "give up"}, restarts(3, "root/team/b")),
+    trial("restart_storm", {}, {"branch", "root, too"}, restarts(6, "root/branch/broken")),
+    trial("restart_storm", {"max_restarts": 1}, {"branch", "root, too"}, restarts(2, "root/branch/broken")),
+    trial("restart_storm", {"max_restarts": 2}, {"branch", "root, too"}, restarts(4, "root/branch/broken")),
+    trial("escalation_levels", {}, {"wheel", "base"}, prints("kill 4")),
+    trial("escalation_levels", {"kills": 1}, {"none: the motor alone"}, restarts(1, "root/base/wheel/motor")),
+    trial("escalation_levels", {"kills": 2}, {"wheel"}, restarts(1, "root/base/wheel/motor")),
+    trial("escalation_levels", {"kills": 3}, {"wheel"}, restarts(2, "root/base/wheel/motor")),
+    trial("back_off", {}, {"over 3 s"}, lambda seen: waits(seen, "left") == waits(seen, "right")),
+    trial("back_off", {"factor": 1.0}, {"under 1.5 s"}, prints("wait 2: under 1.5 s (1.00 s)")),
+    trial(
         "back_off",
         {"factor": 1.0, "jitter": 0.5},
         {"under 1.5 s"},
         lambda seen: waits(seen, "left") != waits(seen, "right"),
     ),
-    Played("poisoned_actor", {}, {"never see it"}),
-    Played("frozen_child", {}, {"another process takes its place"}, prints("is no longer there")),
-    Played("frozen_child", {"heartbeat_s": 3.0}, {"another process takes its place"}, prints("is no longer there")),
-    Played("frozen_child", {"heartbeat_s": 0.0}, {"it goes on after that"}),
-    Played("sharing_and_parts", {}, {"one"}),
-    Played("kill_in_a_load", {}, {"the map, a little later"}),
-    Played("handled_status", {}, {"the cameras' manager"}),
-    Played("handled_status", {"handled": "no"}, {"the cameras' manager", "the consumer"}),
-    Played("refused_ring", {}, {"an error that names the ring"}),
-    Played("crash_in_unload", {}, {"its unload runs again"}),
-    Played("brownout", {}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 60 W") == 60),
-    Played("brownout", {"capacity": 80}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 80 W") == 80),
-    Played("brownout", {"capacity": 40}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 40 W") == 40),
-    Played("brownout", {"priority": 2}, {"nobody: the pump waits"}),
-    Played("generator", {}, {"the generator starts, and nobody is switched off"}),
-    Played("generator", {"fuel": "no"}, {"the radio and the lamp are switched off"}),
-    Played("tour_guide", {}, {"it is paused"}),
-    Played("tour_guide", {"idle": "unload"}, {"it has been ended"}),
-    Played("tour_guide", {"linger_s": 30.0}, {"it runs on"}),
-    Played("rebinding", {}, {"the lidar, and later the camera again"}),
-    Played("rebinding", {"settle_s": 30.0}, {"the lidar, to the end"}),
-    Played("rebinding", {"at_least_hz": 50}, {"nothing: it ends with an error"}),
-    Played("keep", {}, {"radio 0, radio 1 and radio 2"}, prints("radio 0 is killed", "1 wanted: radio 0")),
-    Played(
+    trial("poisoned_actor", {}, {"never see it"}),
+    trial("frozen_child", {}, {"another process takes its place"}, prints("is no longer there")),
+    trial("frozen_child", {"heartbeat_s": 3.0}, {"another process takes its place"}, prints("is no longer there")),
+    trial("frozen_child", {"heartbeat_s": 0.0}, {"it goes on after that"}),
+    trial("sharing_and_parts", {}, {"one"}),
+    trial("kill_in_a_load", {}, {"the map, a little later"}),
+    trial("handled_status", {}, {"the cameras' manager"}),
+    trial("handled_status", {"handled": "no"}, {"the cameras' manager", "the consumer"}),
+    trial("refused_ring", {}, {"an error that names the ring"}),
+    trial("crash_in_unload", {}, {"its unload runs again"}),
+    trial("brownout", {}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 60 W") == 60),
+    trial("brownout", {"capacity": 80}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 80 W") == 80),
+    trial("brownout", {"capacity": 40}, {"radio", "lamp"}, lambda seen: watts_on(seen, "for 40 W") == 40),
+    trial("brownout", {"priority": 2}, {"nobody: the pump waits"}),
+    trial("generator", {}, {"the generator starts, and nobody is switched off"}),
+    trial("generator", {"fuel": "no"}, {"the radio and the lamp are switched off"}),
+    trial("tour_guide", {}, {"it is paused"}),
+    trial("tour_guide", {"idle": "unload"}, {"it has been ended"}),
+    trial("tour_guide", {"linger_s": 30.0}, {"it runs on"}),
+    trial("rebinding", {}, {"the lidar, and later the camera again"}),
+    trial("rebinding", {"settle_s": 30.0}, {"the lidar, to the end"}),
+    trial("rebinding", {"at_least_hz": 50}, {"nothing: it ends with an error"}),
+    trial("keep", {}, {"radio 0, radio 1 and radio 2"}, prints("radio 0 is killed", "1 wanted: radio 0")),
+    trial(
         "keep",
         {"fault": "silent", "then_wanted": 5},
         {"radio 0, radio 1 and radio 2"},
         prints("radio 0 is silent", "5 wanted: radio 0, radio 1, radio 2, radio 3, radio 4"),
     ),
-    Played("keep", {"delay_s": 20.0}, {"radio 1 and radio 2"}),
-    Played("umrf", {}, {"the spare camera takes it"}),
-    Played("umrf", {"broken": "none"}, {"the arm's camera takes it"}),
-    Played("umrf", {"broken": "spare"}, {"the arm's camera takes it"}),
-    Played("umrf", {"killed": "actions"}, {"the spare camera takes it", "the spare camera begins again, as attempt 2"}),
-    Played("full_mailbox", {}, {"nothing: readings become dead letters"}),
-    Played("full_mailbox", {"way": "ask"}, {"each answer, as slow as the filter"}),
-    Played("full_mailbox", {"where": "its own process"}, {"MailboxFull"}),
-    Played("full_mailbox", {"limit": 1000}, {"nothing: all of them wait"}),
-    Played("philosophers", {}, {"one is refused at once, the others eat"}),
-    Played("philosophers", {"where": "processes of their own"}, {"all wait, until a time limit ends one"}),
-    Played("philosophers", {"first": "the fork with the lower number"}, {"all eat, one after another"}),
-    Played("philosophers", {"way": "tell"}, {"all wait for ever"}),
-    Played("lost_token", {}, {"it is gone, and the ring stands still"}),
-    Played("lost_token", {"watch": "the program, with a monitor"}, {"the one that watches makes a new one"}),
+    trial("keep", {"delay_s": 20.0}, {"radio 1 and radio 2"}),
+    trial("umrf", {}, {"the spare camera takes it"}),
+    trial("umrf", {"broken": "none"}, {"the arm's camera takes it"}),
+    trial("umrf", {"broken": "spare"}, {"the arm's camera takes it"}),
+    trial("umrf", {"killed": "actions"}, {"the spare camera takes it", "the spare camera begins again, as attempt 2"}),
+    trial("full_mailbox", {}, {"nothing: readings become dead letters"}),
+    trial("full_mailbox", {"way": "ask"}, {"each answer, as slow as the filter"}),
+    trial("full_mailbox", {"where": "its own process"}, {"MailboxFull"}),
+    trial("full_mailbox", {"limit": 1000}, {"nothing: all of them wait"}),
+    trial("philosophers", {}, {"one is refused at once, the others eat"}),
+    trial("philosophers", {"where": "processes of their own"}, {"all wait, until a time limit ends one"}),
+    trial("philosophers", {"first": "the fork with the lower number"}, {"all eat, one after another"}),
+    trial("philosophers", {"way": "tell"}, {"all wait for ever"}),
+    trial("lost_token", {}, {"it is gone, and the ring stands still"}),
+    trial("lost_token", {"watch": "the program, with a monitor"}, {"the one that watches makes a new one"}),
 )
 
 
 def test_each_lever_is_played_with_each_of_its_values() -> None:
-    assert {played.name for played in PLAYED} == set(EXPERIMENTS)
-    for experiment in EXPERIMENTS.values():
-        runs = [played for played in PLAYED if played.name == experiment.name]
-        for lever in experiment.levers:
-            played = {run.levers.get(lever.name, lever.choices[0]) for run in runs}
-            assert played == set(lever.choices), (experiment.name, lever.label)
+    assert {Path(one.file).stem for one in TRIALS} == set(EXPERIMENTS)
+    check_levers(TRIALS)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, len(PLAYED), AT_ONCE))
+@pytest.mark.parametrize("first", range(0, len(TRIALS), AT_ONCE))
 def test_each_run_does_what_its_levers_say_and_shows_which_answers_are_right(first: int) -> None:
     before = left_behind()
-    assert_right(PLAYED[first : first + AT_ONCE])
+    for seen in check_trials(TRIALS[first : first + AT_ONCE], at_once=AT_ONCE):
+        assert not any(one.event == "dead_letter" and "Question" in str(one.facts) for one in seen.events)
     assert left_behind() == before
 
 
-def assert_right(wanted: Sequence[Played]) -> None:
-    """Let these experiments run side by side, and look at what each has shown."""
-    runs = [(Run(LAB / f"{played.name}.py", played.levers), played) for played in wanted]
-    try:
-        for run, played in runs:
-            eventually(lambda run=run: not run.is_running, 2 * LONG_S, run.name)
-            question, seen = EXPERIMENTS[run.name].question, run.seen
-            assert question is not None
-            assert run.has_finished, run.lines
-            assert question.right(seen) == played.right, (run.name, played.levers, run.lines)
-            assert played.shows is None or played.shows(seen), (run.name, played.levers, run.lines)
-            assert not any(one.event == "dead_letter" and "Question" in str(one.facts) for one in seen.events)
-    finally:
-        for run, _ in runs:
-            run.stop()
+# -- trials of one's own ---------------------------------------------------------------------------------------------
+
+PRINTS = '''"""It prints: what its lever says."""
+
+# /// lab
+# question = "What will it print?"
+# levers = [{name = "times", label = "how many lines", choices = [1, 2, 3]}]
+# [answers]
+# "one line" = {}
+# "two lines" = {prints = "line 1"}
+# "three lines" = {prints = "line 2"}
+# ///
+
+def main(state_dir, times=1):
+    for number in range(times):
+        print("line", number)
+'''
+
+
+@pytest.fixture
+def printing(tmp_path: Path) -> Path:
+    file = tmp_path / "it_prints.py"
+    file.write_text(PRINTS)
+    return file
+
+
+def test_trials_that_are_right_return_what_each_has_shown(printing: Path) -> None:
+    before = left_behind()
+    trials = [
+        Trial(printing, {}, {"one line"}),
+        Trial(printing, {"times": 2}, {"two lines"}, lambda seen: seen.prints("1")),
+    ]
+
+    seen = check_trials(trials, at_once=1)
+
+    assert [one.lines for one in seen] == [["line 0"], ["line 0", "line 1"]]
+    assert left_behind() == before
+
+
+def test_trials_that_are_wrong_are_named_with_what_they_have_printed(printing: Path, tmp_path: Path) -> None:
+    raises = tmp_path / "raises.py"
+    raises.write_text('"""It raises."""\ndef main(state_dir):\n    raise ValueError("no such device")')
+    trials = [
+        Trial(printing, {"times": 2}, {"one line"}),
+        Trial(printing, {}, {"one line"}, lambda _: False),
+        Trial(raises),
+    ]
+
+    with pytest.raises(AssertionError) as error:
+        check_trials(trials)
+
+    text = str(error.value)
+    assert "it_prints(times=2): right: expected 'one line', got 'two lines'\n    line 0\n    line 1\n" in text
+    assert "it_prints(): shows: expected True of what the run has shown, got False\n    line 0\n" in text
+    assert "raises(): expected a run that comes to its end, got an error or the time limit\n" in text
+    assert text.endswith("ValueError: no such device")
+
+
+def test_values_of_levers_that_no_trial_has_are_named_by_their_labels(printing: Path) -> None:
+    check_levers([Trial(printing), Trial(printing, {"times": 2}), Trial(printing, {"times": 3})])
+    with pytest.raises(AssertionError) as error:
+        check_levers([Trial(printing, {"times": 2})])
+    assert str(error.value) == "\n".join(
+        f"{printing}: times (how many lines): expected a trial with {value}, got none" for value in (1, 3)
+    )
+
+
+@pytest.mark.parametrize(
+    ("levers", "right", "says"),
+    [
+        ({"time": 1}, [], "levers: expected one of times, got 'time'; did you mean 'times'?"),
+        ({"times": 4}, [], "levers.times: expected one of 1, 2, 3, got 4"),
+        ({}, ["one lines"], "right: expected one of one line, two lines, three lines, got 'one lines'; did you mean"),
+    ],
+)
+def test_a_trial_of_what_an_experiment_does_not_have_is_refused_before_anything_runs(
+    printing: Path, levers: dict[str, Any], right: list[str], says: str
+) -> None:
+    for check in (check_levers, check_trials):
+        with pytest.raises(UsageError, match=re.escape(says)):
+            check([Trial(printing, levers, right)])
 
 
 @needs_chromium
@@ -340,7 +395,7 @@ def test_the_lab_asks_runs_what_was_chosen_compares_and_plays_it_again(tab: Tab)
         href = tab.do(tab.page.get_by_role("link", name="the same as a notebook").get_attribute("href"))
         answer = tab.do(tab.page.request.get(url.partition("/lab")[0] + str(href)))
         notebook = json.loads(tab.do(answer.text()))
-        assert "strategy='rest_for_one', max_restarts=2" in notebook["cells"][-2]["source"]
+        assert "strategy='rest_for_one', max_restarts=2" in notebook["cells"][2]["source"]
         assert tab.do(tab.page.request.get(url.partition("/lab")[0] + "/lab/no.ipynb")).status == 404
         assert "Look for:" not in tab.text("body")
         tab.clicks("run it")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -13,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rr_actors.base.errors import ConfigError, UsageError
+from rr_actors.base.errors import ConfigError
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.timeline_lanes import Bar, Lane, Mark
 from rr_actors.system.recording.timelines import Timeline
@@ -26,7 +29,8 @@ from support_cli import run_cli
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROOT = DOCS.parent
-EXPERIMENTS = read_lab(ROOT / "examples" / "lab").experiments
+LAB = ROOT / "examples" / "lab"
+EXPERIMENTS = read_lab([LAB]).experiments
 ANSWERS = {"a": Sign(event="restarted", path="root/a"), "said": Sign(prints="hello"), "neither": Sign()}
 QUESTION = Question("Which?", ANSWERS)
 A = Event(1, 1.0, "restarted", {"path": "root/a"})
@@ -98,7 +102,7 @@ def test_what_is_read_before_a_question_does_not_answer_it(name: str) -> None:
 
 
 def test_every_program_of_the_examples_is_an_experiment() -> None:
-    assert read_lab(ROOT / "examples" / "lab").broken == []
+    assert read_lab([LAB]).broken == []
 
 
 # -- a folder of one's own -------------------------------------------------------------------------------------------
@@ -164,7 +168,10 @@ def test_a_docstring_and_a_main_are_enough(tmp_path: Path) -> None:
         (MINE.replace("place = 2", "place = first"), r"mine\.py: lab: not valid TOML"),
         (MINE.replace("question =", "asks ="), r"mine\.py: lab: asks: expected one of .*, got an unknown key"),
         (MINE.replace('1, 2.5, "never"', ""), r"mine\.py: lab: levers\[0\]\.choices"),
-        (MINE.replace('name = "kills"', 'name = "kill"'), r"mine\.py: lab: levers: expected a parameter of main\(\)"),
+        (
+            MINE.replace('name = "kills"', 'name = "kill"'),
+            r"mine\.py: lab: levers\[0\]\.name: expected a parameter of main\(\): kills, got 'kill' \(str\)",
+        ),
         (MINE.replace("prints", "print").replace("event", "evnt"), r"lab: answers\.it runs again\.evnt"),
     ],
 )
@@ -175,23 +182,121 @@ def test_a_file_that_is_no_experiment_is_named_with_what_is_wrong(text: str, say
 
 def test_a_folder_has_its_experiments_in_the_order_of_their_places_and_names_what_is_broken(tmp_path: Path) -> None:
     written(tmp_path, MINE, "b_last.py")
-    written(tmp_path, MINE.replace("place = 2", "place = 1"), "c_first.py")
-    written(tmp_path, '"""Mine."""\ndef main(state_dir): ...', "a_without_a_place.py")
+    written(tmp_path, MINE.replace("place = 2", "place = 1").replace("Mine:", "First:"), "c_first.py")
+    written(tmp_path, '"""No place."""\ndef main(state_dir): ...', "a_without_a_place.py")
     written(tmp_path, "not Python", "broken.py")
     written(tmp_path, MINE, "no-module.py")
     written(tmp_path, "not Python", "_helper.py")
     (tmp_path / "bytes.py").write_bytes(b"\xff\xfe")
 
-    lab = read_lab(tmp_path)
+    lab = read_lab([tmp_path])
 
     assert list(lab.experiments) == ["c_first", "b_last", "a_without_a_place"]
     assert [Path(text.partition(":")[0]).name for text in lab.broken] == ["broken.py", "bytes.py", "no-module.py"]
 
 
+WRONG = {
+    "a line that is no comment": (
+        MINE.replace("# place = 2", "place = 2"),
+        'expected lines from "# /// lab" to "# ///" that begin with "# ", got another form at line 11',
+    ),
+    "no end": (MINE.replace("# ///\n\nimport", "import"), "got another form at line 11"),
+    "a second block": (MINE + "# /// lab\n# place = 3\n# ///\n", "expected one block, got another at line 25"),
+    "TOML that is none": (MINE.replace("place = 2", "place ="), "not valid TOML: Invalid value (at line 12"),
+    "a truth value as a choice": (MINE.replace('2.5, "never"', "true"), "levers[0].choices[1]: expected"),
+    "no choices": (MINE.replace('1, 2.5, "never"', ""), "levers[0].choices: expected"),
+    "two levers of one name": (
+        MINE.replace("levers = [", 'levers = [{name = "kills", label = "", choices = [1]}, '),
+        "levers[1].name: expected a name that no other lever has, got 'kills' (str)",
+    ),
+    "two choices that look alike": (
+        MINE.replace('"never"', '"1"'),
+        "levers[0].choices[2]: expected a value that no other choice has, got '1' (str)",
+    ),
+    "a choice that the parameter cannot have": (
+        MINE.replace("kills=1", "kills: float = 1"),
+        "levers[0].choices[2]: expected `float`, as main() has it, got 'never' (str)",
+    ),
+    "another default": (
+        MINE.replace("kills=1", "kills=2"),
+        "levers[0].choices[0]: expected the default of main(), 2, got 1 (int)",
+    ),
+    "a parameter that nobody gives": (
+        MINE.replace("kills=1", "kills=1, *, child"),
+        "levers: expected a lever for child, a parameter without a default, got none",
+    ),
+    "answers without a question": (
+        MINE.replace('# question = "What becomes of it?"\n', ""),
+        "question: expected a text, as there are answers, got none",
+    ),
+    "a question without answers": (
+        "\n".join(line for line in MINE.splitlines() if not line.startswith(("# [answers", '# "it', "# neither"))),
+        "answers: expected a table, as there is a question, got none",
+    ),
+    "an event that is none": (MINE.replace('"restarted"', '"restart"'), "got 'restart'; did you mean 'restarted'?"),
+    "an event of nobody": (
+        MINE.replace(', path = "root/a"', ""),
+        "answers.it runs again.path: expected event and path together, got none",
+    ),
+    "two signs in one": (
+        MINE.replace("{event", '{prints = "a", event'),
+        "answers.it runs again: expected either prints, or event and path, got both",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_declaration_that_cannot_be_right_is_named_with_file_place_expected_and_got(
+    case: str, tmp_path: Path
+) -> None:
+    text, says = WRONG[case]
+    file = written(tmp_path, text)
+
+    with pytest.raises(ConfigError) as error:
+        read_experiment(file)
+
+    assert str(error.value).startswith(f"{file}: lab: ")
+    assert says in str(error.value)
+
+
+def test_all_that_is_wrong_in_a_file_is_named_at_once(tmp_path: Path) -> None:
+    text = MINE.replace("kills=1", "kills=2").replace('"restarted"', '"restart"')
+
+    with pytest.raises(ConfigError, match=r"2 faults:\n.*choices\[0\].*\n.*answers\.it runs again\.event"):
+        read_experiment(written(tmp_path, text))
+
+
+def test_a_file_that_would_hide_a_module_of_python_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"queue\.py: expected a name that Python can import, and no module"):
+        read_experiment(written(tmp_path, MINE, "queue.py"))
+
+
+def test_folders_are_read_one_after_another_and_a_second_experiment_of_a_name_or_title_is_named(tmp_path: Path) -> None:
+    ours, mine = tmp_path / "ours", tmp_path / "mine"
+    for folder in (ours, mine):
+        folder.mkdir()
+    written(ours, MINE, "first.py")
+    written(mine, MINE.replace("Mine:", "Another:"), "first.py")
+    written(mine, MINE, "second.py")
+    written(mine, MINE.replace("Mine:", "A third:").replace("place = 2", "place = 1"), "third.py")
+    written(mine, MINE, "test_second.py")
+
+    lab = read_lab([ours, tmp_path / "nowhere", mine])
+
+    assert list(lab.experiments) == ["first", "third"]
+    assert lab.broken == [
+        f"--lab: {tmp_path}/nowhere: expected a folder with experiments, as examples/lab of the repository, "
+        "got: No such file or directory",
+        f"{mine}/first.py: name: expected a name that no other experiment has, got 'first', as {ours}/first.py",
+        f"{mine}/second.py: title: expected a title that no other experiment has, got 'Mine', as {ours}/first.py",
+    ]
+
+
 def test_a_folder_that_is_not_there_or_has_none_is_refused_with_what_to_give(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(UsageError, match=r"--lab: .*expected .*experiments.*examples/lab"):
-            read_lab(folder)
+        ran = run_cli("web", "--lab", LAB, "--lab", folder)
+        assert ran.returncode == 2
+        assert f"--lab: {folder}: expected a folder with experiments, as examples/lab of the repository" in ran.stderr
 
 
 def test_without_a_folder_the_command_says_what_to_give() -> None:
@@ -199,8 +304,8 @@ def test_without_a_folder_the_command_says_what_to_give() -> None:
 
     assert (ran.returncode, ran.stdout) == (2, "")
     assert ran.stderr == (
-        "rr-actors: Option '--lab' requires an argument: A folder with experiments to serve in place of a system: "
-        "examples/lab, say.\n"
+        "rr-actors: Option '--lab' requires an argument: A folder with experiments to serve in place of a system; or "
+        "several of them.\n"
     )
 
 
@@ -210,15 +315,36 @@ def test_a_notebook_has_the_same_code_and_the_chosen_levers(name: str) -> None:
     levers = {lever.name: lever.choices[-1] for lever in experiment.levers}
     notebook = nbformat.reads(notebook_of(experiment, levers), as_version=4)
     nbformat.validate(notebook)
-    asked, code, call, why = [cell.source for cell in notebook.cells]
+    asked, code, call, happened, picture, why = [cell.source for cell in notebook.cells]
     assert experiment.question is not None
-    assert asked.endswith(f"**{experiment.question.text}**")
+    assert f"**{experiment.question.text}**\n\n- " in asked
     assert experiment.why not in asked
     assert why == f"Why: {experiment.why}"
-    compile(code, "cell", "exec")
-    arguments = ast.parse(call, mode="eval").body
-    assert isinstance(arguments, ast.Call)
-    assert {one.arg: ast.literal_eval(one.value) for one in arguments.keywords} == levers
+    for source in (code, picture):
+        compile(source, "cell", "exec")
+    called = ast.parse(call).body[-1]
+    assert isinstance(called, ast.Expr)
+    assert isinstance(called.value, ast.Call)
+    assert {one.arg: ast.literal_eval(one.value) for one in called.value.keywords} == levers
+    words = re.findall(r"\b(?:box(?:es)?|buttons?|pages?|squares?|tabs?|clicks?)\b", f"{asked} {happened} {why}")
+    assert words == []
+
+
+def test_a_notebook_shows_what_has_happened(tmp_path: Path) -> None:
+    code = """
+import rr_actors as rr
+def main(state_dir, *, id="mine"):
+    with rr.System([rr.ChildSpec(rr.Actor, id=id)], state_dir=state_dir): ...
+"""
+    experiment = LabExperiment(tmp_path / "mine.py", "Mine", "", "", "", code, LabDeclaration())
+    cells = json.loads(notebook_of(experiment, {"id": "lidar"}))["cells"]
+    source = "\n".join(cell["source"] for cell in cells if cell["cell_type"] == "code")
+    program = written(tmp_path, f"{source}._repr_svg_()".replace("read_timeline(f", "print(read_timeline(f") + ")")
+
+    ran = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=50)
+
+    assert ran.stdout.startswith("<svg"), ran.stderr
+    assert "lidar" in ran.stdout
 
 
 # -- ten questions ---------------------------------------------------------------------------------------------------

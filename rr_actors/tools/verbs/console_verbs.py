@@ -200,9 +200,9 @@ def web(
     prefix: Annotated[str, typer.Option(help="The path at which a proxy serves the page; {port} is its port.")] = "",
     host_name: Annotated[list[str] | None, typer.Option(help="A host at which a proxy serves the page.")] = None,
     lab: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
-            "--lab", metavar="DIR", help="A folder with experiments to serve in place of a system: examples/lab, say."
+            "--lab", metavar="DIR", help="A folder with experiments to serve in place of a system; or several of them."
         ),
     ] = None,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
@@ -211,7 +211,7 @@ def web(
     with needing("web", "web"):  # the other verbs work without it
         from rr_actors.tools.web.web_server import serve
     names = host_name or ()
-    serve(state, lab=lab, host=host, port=port, prefix=prefix, names=names, is_child=child, say=say)
+    serve(state, lab=lab or (), host=host, port=port, prefix=prefix, names=names, is_child=child, say=say)
 
 
 @app.command(epilog="Example: rr-actors why 01a2085d3f7c")

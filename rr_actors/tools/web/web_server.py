@@ -12,7 +12,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -51,7 +51,7 @@ A browser that is slow may leave a ping unanswered for 0.4 times as long. A run 
 def serve(
     state_dir: str | os.PathLike[str] | None,
     *,
-    lab: Path | None,
+    lab: Sequence[Path],
     host: str,
     port: int,
     prefix: str = "",
@@ -63,7 +63,7 @@ def serve(
 
     Args:
         state_dir: the directory of the system that is shown; None for the one that runs.
-        lab: serve the experiments of this folder in place of a system.
+        lab: serve the experiments of these folders in place of a system.
         port: the port, or 0 for a free one.
         prefix: the path before all paths, by which browsers reach this server through a proxy.
         names: of the hosts that they reach it at through a proxy.
@@ -73,7 +73,7 @@ def serve(
     Raises:
         NotRunning: no system runs in the directory, or none at all.
         UsageError: several systems run, and no state directory was given; or the address cannot be used, or the prefix
-            or a name is none; or the folder has no experiments.
+            or a name is none; or a folder has no experiments.
     """
     check_proxy("web", prefix, names)
     if is_child:
@@ -82,8 +82,9 @@ def serve(
     port = listening.getsockname()[1]
     prefix = prefix.replace("{port}", str(port)).rstrip("/")
     keys = Keys()
-    if lab is not None:
-        add_lab(lab.expanduser().absolute(), takes_code=is_loopback(host) and not names)
+    if lab:
+        folders = list(dict.fromkeys(folder.expanduser().absolute() for folder in lab))
+        add_lab(folders, takes_code=is_loopback(host) and not names)
     else:
         watch = Watch(state_dir)
         recorder = Recorder(watch)
@@ -107,7 +108,7 @@ def serve(
     shown = f"[{host}]" if ":" in host else host
     name = next(iter(names), f"{shown}:{port}")
     server = f"{'http' if is_loopback(name.partition(':')[0]) or not names else 'https'}://{name}"
-    app.on_startup(lambda: say(f"{server}{prefix}/{'' if lab is None else 'lab'}?token={keys.token}"))
+    app.on_startup(lambda: say(f"{server}{prefix}/{'lab' if lab else ''}?token={keys.token}"))
     served = FastAPI(openapi_url=None)
     binding.MAX_PROPAGATION_TIME = math.inf  # it prints a warning where the machine is busy
     ui.run_with(
@@ -117,7 +118,7 @@ def serve(
         dark=None,
         language="en-US",
         show_welcome_message=False,
-        reconnect_timeout=_AWAY_S if lab is None else _LAB_AWAY_S,
+        reconnect_timeout=_LAB_AWAY_S if lab else _AWAY_S,
     )
     config = uvicorn.Config(
         Access(served, keys, host, port, prefix, names),

@@ -31,10 +31,23 @@ class Lever(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Seen:
-    """What a run has shown: the events of its system, and the lines that its program has printed."""
+    """What a run has shown.
+
+    Attributes:
+        events: those of its system, oldest first: the newest 1,000.
+        lines: those that its program has printed: the last 100.
+    """
 
     events: Sequence[Event] = ()
     lines: Sequence[str] = ()
+
+    def count(self, event: str, path: str) -> int:
+        """Return how often something has happened to the child of a path: count("restarted", "root/team/b")."""
+        return sum(one.event == event and one.path == path for one in self.events)
+
+    def prints(self, text: str) -> bool:
+        """Return whether a text is in a line that was printed."""
+        return any(text in line for line in self.lines)
 
 
 class Sign(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,9 +64,7 @@ class Sign(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def is_in(self, seen: Seen) -> bool:
         """Return whether a run has shown it."""
-        if self.prints:
-            return any(self.prints in line for line in seen.lines)
-        return any(one.event == self.event and one.facts.get("path") == self.path for one in seen.events)
+        return seen.prints(self.prints) if self.prints else seen.count(self.event, self.path) > 0
 
 
 class LabDeclaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -120,6 +131,11 @@ class LabExperiment:
     def name(self) -> str:
         """The name of its file, without the ending."""
         return self.program.stem
+
+    @property
+    def button(self) -> str:
+        """The words that the page shows in its list: the title up to its colon."""
+        return self.title.partition(":")[0]
 
     @property
     def question(self) -> Question | None:

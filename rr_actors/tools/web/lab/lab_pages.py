@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlencode
@@ -17,7 +18,7 @@ from nicegui import app, ui
 from rr_actors.base.errors import RrError
 from rr_actors.system.console import console_commands as commands
 from rr_actors.tools.web.lab.lab_declarations import LabExperiment
-from rr_actors.tools.web.lab.lab_folder import Lab, read_lab
+from rr_actors.tools.web.lab.lab_folder import Lab, programs_in, read_lab
 from rr_actors.tools.web.lab.lab_notebook import notebook_of
 from rr_actors.tools.web.lab.lab_player import Player
 from rr_actors.tools.web.lab.lab_questions import QUESTIONS, Asked
@@ -31,6 +32,7 @@ _CSS = (
 .rr-lab { display: grid; grid-template-columns: 15rem minmax(0, 1fr); gap: 14px; width: 100%; padding: 8px 14px; }
 @media (max-width: 900px) { .rr-lab { grid-template-columns: minmax(0, 1fr); } }
 .rr-lab .q-btn__content { text-align: left; }
+.rr-broken { white-space: pre-line; overflow-wrap: anywhere; }
 .rr-verdict { width: 100%; padding: 6px 10px; border-left: 4px solid var(--rr-focus);
   background: var(--rr-unknown-paper); font-weight: 600; }
 .rr-lab-tree { min-height: 320px; } .rr-h1 { font: 600 18px/1.5 sans-serif; } .rr-h2 { font: 600 15px/1.5 sans-serif; }
@@ -40,17 +42,18 @@ _CSS = (
 )
 
 
-def add_lab(folder: Path, *, takes_code: bool) -> None:
+def add_lab(folders: Sequence[Path], *, takes_code: bool) -> None:
     """Add the pages of the lab to NiceGUI's application.
 
     Args:
-        folder: has the experiments; each page reads it anew.
+        folders: have the experiments; each page reads them anew.
         takes_code: the page's reader may change an experiment's code, and run that.
 
     Raises:
-        UsageError: the folder has no experiments.
+        UsageError: a folder is missing, or has no programs.
     """
-    read_lab(folder)
+    for folder in folders:
+        programs_in(folder)
     runs: set[Run] = set()
 
     def stop_all() -> None:
@@ -59,7 +62,7 @@ def add_lab(folder: Path, *, takes_code: bool) -> None:
 
     @app.get("/lab/{name}.ipynb")
     def _(name: str, request: Request) -> Response:
-        chosen = read_lab(folder).experiments.get(name)
+        chosen = read_lab(folders).experiments.get(name)
         levers = chosen.values(request.query_params) if chosen is not None else None
         if chosen is None or levers is None:
             return PlainTextResponse(f"{name}: no such experiment, or no such value of a lever\n", 404)
@@ -68,13 +71,13 @@ def add_lab(folder: Path, *, takes_code: bool) -> None:
 
     @ui.page("/lab", title="rr-actors: lab")
     async def _(experiment: str = "") -> None:
-        page = LabPage(lab := await asyncio.to_thread(read_lab, folder), runs, takes_code)
+        page = LabPage(lab := await asyncio.to_thread(read_lab, folders), runs, takes_code)
         if chosen := lab.experiments.get(experiment):
             await page.choose(chosen)
 
     @ui.page("/lab/questions", title="rr-actors: ten questions")
     async def _() -> None:
-        QuestionsPage(await asyncio.to_thread(read_lab, folder))
+        QuestionsPage(await asyncio.to_thread(read_lab, folders))
 
     ui.page("/", title="rr-actors: lab")(lambda: ui.navigate.to("/lab"))
     app.on_shutdown(lambda: asyncio.to_thread(stop_all))
@@ -116,7 +119,7 @@ class LabPage:
                 for one in lab.experiments.values():
                     self._button(one)
                 for text in lab.broken:
-                    ui.label(text).classes("rr-note").props('role="alert"')
+                    ui.label(text).classes("rr-note rr-broken").props('role="alert"')
             with ui.column().classes("gap-2").style("min-width: 0"):
                 self._build()
         ui.context.client.on_delete(self._place.leave)
@@ -156,10 +159,8 @@ class LabPage:
         return "/" in self._chosen and run is not None and run.is_running and self._player.is_live
 
     def _button(self, experiment: LabExperiment) -> None:
-        title = experiment.title.partition(":")[0]
-        ui.button(title, on_click=partial(self.choose, experiment)).props("outline no-caps align=left").classes(
-            "w-full"
-        )
+        button = ui.button(experiment.button, on_click=partial(self.choose, experiment))
+        button.props("outline no-caps align=left").classes("w-full")
 
     def _hide_answers(self) -> None:
         for part in (self._look_for, self._verdict, self._why):

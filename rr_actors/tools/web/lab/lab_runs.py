@@ -88,6 +88,10 @@ class Run:
         watch = self.watch
         return Seen(list(watch.events.copy()) if watch is not None else [], self.lines)
 
+    def wait(self) -> None:
+        """Wait until the run has come to its own end, after 90 s at the latest, and nothing is left of it."""
+        self._keeper.join()
+
     def stop(self) -> None:
         """End the run, and wait until nothing of it is left. A second call does nothing."""
         self._stopping.set()
