@@ -117,6 +117,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
 if TYPE_CHECKING:
     from rr_actors import managers as managers
     from rr_actors.managers import Action, GraphResult, run_graph
+    from rr_actors.testing.pytest_plugin import StartSystem
 
 __all__ = [
     "IGNORE",
@@ -195,6 +196,7 @@ __all__ = [
     "RestartIntensityExceeded",
     "RrError",
     "StartFailed",
+    "StartSystem",
     "State",
     "Status",
     "Stream",
@@ -277,6 +279,7 @@ if not TYPE_CHECKING:
         "rr_actors.system.recording.stream_recordings": "StreamRecording read_stream record_stream",
         "rr_actors.system.recording.traces": "Trace",
         "rr_actors.system.system": "System",
+        "rr_actors.testing.pytest_plugin": "StartSystem",
     }
     _MODULES = dict.fromkeys(__all__, "rr_actors.base.errors")  # but for these
     _MODULES |= {name: module for module, names in _NAMES.items() for name in names.split()}

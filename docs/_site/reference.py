@@ -20,7 +20,7 @@ from names import REFERENCE, own_names
 
 from rr_actors import Declared
 
-SHOWN = re.compile(r"^### `(rr_actors\.\S+)`\n(?:\n```text\n.*?^```\n)?\n*", re.MULTILINE | re.DOTALL)
+SHOWN = re.compile(r"^### `(rr_actors(?:_pytest)?\.\S+)`\n(?:\n```text\n.*?^```\n)?\n*", re.MULTILINE | re.DOTALL)
 WIDTH = 100  # characters of a signature; a longer one has a line for each parameter
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import rr_actors as rr
 
 
@@ -13,12 +11,12 @@ class Cameras(rr.Manager):
         return f"/images/{device}"
 
 
-def test_a_camera_has_a_topic(rr_system: Callable[..., rr.System]) -> None:
+def test_a_camera_has_a_topic(rr_system: rr.StartSystem) -> None:
     app = rr_system(rr.ChildSpec(Cameras, id="cameras")).open_registrar("app")
     assert app.load("cameras/camera", "front").response == "/images/front"
 
 
-def test_a_camera_is_fine_in_a_thread_too(rr_system: Callable[..., rr.System]) -> None:
+def test_a_camera_is_fine_in_a_thread_too(rr_system: rr.StartSystem) -> None:
     system = rr_system(rr.ChildSpec(Cameras, id="cameras", placement="thread"))
     with system.open_registrar("app").load("cameras/camera", "front") as camera:
         assert camera.state is rr.State.OK

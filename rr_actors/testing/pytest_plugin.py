@@ -1,7 +1,4 @@
-"""Plugin of pytest: the fixture `rr_system`, which starts systems for a test and checks that they leave nothing behind.
-
-pytest finds it wherever the package is installed. A test asks for it by the fixture's name.
-"""
+"""The systems that a test starts by the fixture `rr_system`, and what they leave behind."""
 
 from __future__ import annotations
 
@@ -9,14 +6,14 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
-import pytest
-
+from rr_actors.base.config import SystemConfig
 from rr_actors.base.steps import Steps
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+from rr_actors.system.registrar_lookup import left_behind
 from rr_actors.system.system import System
 
 LIMIT_S = 5.0
@@ -24,9 +21,36 @@ LIMIT_S = 5.0
 
 _VARIABLE = "RR_ACTORS_TEST"
 
-StartSystem = Callable[..., System]
-"""start(child, ..., **options): the children are ChildSpecs and Supervisors, or one list of them, or one Supervisor, as
-System takes them; the options are those of System."""
+
+class StartSystem(Protocol):
+    """The type of the fixture `rr_system` of pytest: a function that starts a system, and returns it::
+
+        def test_a_camera_has_a_topic(rr_system: rr.StartSystem) -> None:
+            system = rr_system(rr.ChildSpec(Cameras, id="cameras"))
+
+    After the test each system is stopped, which releases what the test holds. The test fails if a process, a thread, a
+    socket or a loaded resource is left then.
+    """
+
+    def __call__(
+        self,
+        *children: ChildSpec | Supervisor | Sequence[ChildSpec | Supervisor],
+        name: str = "system",
+        state_dir: str | os.PathLike[str] | None = None,
+        config: SystemConfig | None = None,
+        debug: bool = False,
+    ) -> System:
+        """Start a system for this test.
+
+        Args:
+            children: the ChildSpecs and Supervisors, or one list of them, or one Supervisor, as System takes them.
+            state_dir: None: a directory in the test's tmp_path.
+            name, config, debug: as System takes them.
+
+        Raises:
+            The errors of System() and System.start().
+        """
+        ...
 
 
 class _Left(NamedTuple):
@@ -45,24 +69,32 @@ class _Left(NamedTuple):
         ]
 
 
-@pytest.fixture
-def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StartSystem]:
-    """Start a system of rr_actors: rr_system(rr.ChildSpec(Cameras, id="cameras"), config=...).
+def started_systems(place: Path, setenv: Callable[[str, str], None]) -> Generator[StartSystem, None, list[str]]:
+    """Yield what starts systems for a test. Then stop them, and return a line for each thing that is left behind.
 
-    Its state is in the test's tmp_path, unless `state_dir` says otherwise. After the test each system is stopped. The
-    test fails if a process, a thread or a socket is left behind then.
+    Args:
+        place: the directory for their state directories.
+        setenv: gives an environment variable a value until the test ends.
     """
     mark = uuid.uuid4().hex
-    monkeypatch.setenv(_VARIABLE, mark)
+    setenv(_VARIABLE, mark)
     before = _look(mark)
     systems: list[System] = []
 
-    def start(*children: ChildSpec | Supervisor | Sequence[ChildSpec | Supervisor], **options: Any) -> System:
+    def start(
+        *children: ChildSpec | Supervisor | Sequence[ChildSpec | Supervisor],
+        name: str = "system",
+        state_dir: str | os.PathLike[str] | None = None,
+        config: SystemConfig | None = None,
+        debug: bool = False,
+    ) -> System:
         number = len(systems) + 1
-        options.setdefault("state_dir", tmp_path / ("rr_state" if number == 1 else f"rr_state{number}"))
-        is_root = len(children) == 1 and not isinstance(children[0], ChildSpec)
-        root: Any = children[0] if is_root else children
-        system = System(root, **options)
+        if state_dir is None:
+            state_dir = place / ("rr_state" if number == 1 else f"rr_state{number}")
+        first = children[0] if len(children) == 1 else None
+        specs = [child for child in children if isinstance(child, ChildSpec | Supervisor)]
+        root = specs if first is None or isinstance(first, ChildSpec) else first
+        system = System(root, name=name, state_dir=state_dir, config=config, debug=debug)
         systems.append(system)
         return system.start()
 
@@ -73,8 +105,11 @@ def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start
         for system in reversed(systems):
             steps.take(f"stopping {system.state_dir}", system.stop)
         steps.end("rr_system: several systems did not stop cleanly")
-    if left := _still_left(mark, before):
-        pytest.fail(f"rr_system: left behind: {'; '.join(left)}")
+    left = _still_left(mark, before)
+    for system in systems:
+        found = left_behind(system.config, system.state_dir, set()) if system.state_dir.is_dir() else {}
+        left += [f"registrar {name} of {system.state_dir}: {contents}" for name, contents in found.items()]
+    return left
 
 
 def _still_left(mark: str, before: _Left) -> list[str]:

@@ -48,7 +48,8 @@ def facts(wheel: Path) -> Message:
 
 
 def test_the_wheel_has_the_package_alone_with_all_its_files(wheel: Path) -> None:
-    there = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "rr_actors").rglob("*") if path.is_file()}
+    folders = [REPOSITORY / "rr_actors", REPOSITORY / "rr_actors_pytest"]
+    there = {str(path.relative_to(REPOSITORY)) for one in folders for path in one.rglob("*") if path.is_file()}
     there = {path for path in there if "__pycache__" not in path}
     packed = set(zipfile.ZipFile(wheel).namelist())
     assert {path for path in packed if ".dist-info/" not in path} == there
@@ -64,18 +65,27 @@ def dependencies(requirements: list[str]) -> set[str]:
     return found
 
 
-def test_the_wheel_alone_runs_the_first_program_of_the_readme_in_a_fresh_environment(
-    wheel: Path, tmp_path: Path
-) -> None:
-    run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "fresh", cwd=tmp_path)
-    python = tmp_path / "fresh" / "bin" / "python"
-    install = (sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps", "--no-index")
-    run(*install, wheel, cwd=tmp_path)
-    (libraries,) = (tmp_path / "fresh" / "lib").glob("python*/site-packages")
-    for name in dependencies(facts(wheel).get_all("Requires-Dist", [])):
+def environment(place: Path, *requirements: str) -> tuple[Path, Path]:
+    """The interpreter of a fresh environment that has what these distributions need; the folder of its libraries."""
+    run(sys.executable, "-m", "venv", "--without-pip", place / "fresh", cwd=place)
+    python = place / "fresh" / "bin" / "python"
+    (libraries,) = (place / "fresh" / "lib").glob("python*/site-packages")
+    for name in dependencies(list(requirements)):
         files = metadata.files(name) or []
         for top in {file.parts[0] for file in files if file.parts[0] not in ("..", "__pycache__")}:
             (libraries / top).symlink_to(str(metadata.distribution(name).locate_file(top)))  # not fetched
+    return python, libraries
+
+
+def pip(python: Path, *command: str | Path) -> None:
+    run("env", "-u", "PYTHONPATH", sys.executable, "-m", "pip", "--python", python, "-q", *command, cwd=python.parent)
+
+
+def test_the_wheel_alone_runs_the_first_program_of_the_readme_in_a_fresh_environment(
+    wheel: Path, tmp_path: Path
+) -> None:
+    python, libraries = environment(tmp_path, *facts(wheel).get_all("Requires-Dist", []))
+    pip(python, "install", "--no-deps", "--no-index", wheel)
     page = (REPOSITORY / "README.md").read_text()
     program, shown = re.findall(r"^```python\n(.*?)^```\n\n```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0]
     (tmp_path / "first.py").write_text(program + "print(rr.__file__)\n")
@@ -84,6 +94,37 @@ def test_the_wheel_alone_runs_the_first_program_of_the_readme_in_a_fresh_environ
 
     assert printed[:-1] == shown.splitlines()
     assert Path(printed[-1]) == libraries / "rr_actors" / "__init__.py"
+
+
+TESTS = """
+import sys, threading
+import pytest
+
+def test_of_another_project():
+    assert [name for name in sys.modules if name.partition(".")[0] == "rr_actors"] == []
+
+def test_that_uses_it(rr_system):
+    import rr_actors as rr
+    class Lamps(rr.Manager):
+        @rr.server("lamp")
+        def switch_on(self, room: str) -> str:
+            return f"{room} is lit"
+    system = rr_system(rr.ChildSpec(Lamps, id="lamps", placement="thread"))
+    assert system.open_registrar("app").load("lamps/lamp", "hall").response == "hall is lit"
+"""
+
+
+def test_pytest_imports_nothing_of_the_package_until_it_is_used_and_an_uninstall_leaves_nothing(
+    wheel: Path, tmp_path: Path
+) -> None:
+    python, libraries = environment(tmp_path, *facts(wheel).get_all("Requires-Dist", []), "pytest")
+    zipfile.ZipFile(wheel).extractall(libraries)  # as pip does, in less time
+    (tmp_path / "test_both.py").write_text(TESTS)
+    run(python, "-I", "-m", "pytest", "-p", "no:cacheprovider", "test_both.py", cwd=tmp_path)
+    assert list(libraries.rglob("rr_actors*/**/*-pytest-*.pyc")) == []  # what pytest has rewritten
+    pip(python, "uninstall", "--yes", "rr-actors")
+    assert list(libraries.glob("rr_actors*")) == []
+    assert list(libraries.glob("__pycache__/rr_actors*")) == []
 
 
 def test_the_changelog_has_the_form_of_keep_a_changelog() -> None:

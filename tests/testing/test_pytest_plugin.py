@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from pathlib import Path
 
@@ -23,7 +24,7 @@ class Lamps(rr.Manager):
 
 
 def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str) -> pytest.RunResult:
-    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))))
     pytester.makepyfile(HEAD + test)
     return pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:rerunfailures")  # that has a thread
 
@@ -107,6 +108,35 @@ def test_leaves(rr_system):
     result.stdout.fnmatch_lines([said])
 
 
+def test_what_a_test_holds_is_released_and_what_cannot_be_unloaded_fails_it(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = run(
+        pytester,
+        monkeypatch,
+        """
+class Doors(rr.Manager):
+    @rr.server("door")
+    def open_door(self, room: str) -> None: ...
+
+    @open_door.unload
+    def close_door(self, room: str, response: None) -> None:
+        if room == "stuck":
+            raise OSError("the door is stuck")
+
+def test_held(rr_system: rr.StartSystem):
+    system = rr_system(rr.ChildSpec(Doors, id="doors", placement="thread"))
+    system.open_registrar("app").load("doors/door", "hall")
+
+def test_stuck(rr_system: rr.StartSystem):
+    system = rr_system(rr.ChildSpec(Doors, id="doors", placement="thread"))
+    system.open_registrar("app").load("doors/door", "stuck")
+""",
+    )
+    result.assert_outcomes(passed=2, errors=1)
+    result.stdout.fnmatch_lines(["*left behind: registrar app of *: it holds 1 x doors/door; registrar doors of *"])
+
+
 def test_the_package_says_to_pytest_where_the_plugin_is() -> None:
     project = tomllib.loads(Path(REPOSITORY, "pyproject.toml").read_text())["project"]
-    assert project["entry-points"]["pytest11"] == {"rr_actors": "rr_actors.testing.pytest_plugin"}
+    assert project["entry-points"]["pytest11"] == {"rr_actors": "rr_actors_pytest.plugin"}
