@@ -205,7 +205,7 @@ def test_a_share_is_found_by_the_name_that_it_has_at_its_holder(house: House) ->
         return ran.stdout + ran.stderr
 
     name = 'budgets/share {"amount":5,"instance":"x","pool":"watts"}'
-    assert f"({query.resource_id[-8:]}) is loaded" in why(name)
+    assert f"({query.resource_id[-8:]}) has been loaded" in why(name)
     assert "no query and no resource has this id" in why(name.replace("5", "6"))
 
 
