@@ -205,7 +205,7 @@ def _faults_of_lever(
     if lever.name in before:
         yield wrong(name, f"{key}.name", "a name that no other lever has", lever.name)
     if (parameter := parameters.get(lever.name)) is None:
-        listed = ", ".join(parameters) or "it has none beside the first"
+        listed = ", ".join(parameters) or "it has only the first"
         yield wrong(name, f"{key}.name", f"a parameter of main(): {listed}", lever.name)
         return
     texts = [str(choice) for choice in lever.choices]
