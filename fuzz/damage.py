@@ -1,8 +1,8 @@
 """Damage: bits flipped, files cut off, removed and swapped, in every file of catalogs in every state; then opened.
 
 Each time one of three things must come of it: the right rows; an error that names the catalog; or a warning that says
-what is lost. Never silence, but for the newest journal (with durability "power", the -wal) cut off exactly at the end
-of a record, which nobody can tell from a commit that never was.
+what is lost. Never silence, but for the newest journal cut off exactly at the end of a record, which nobody can tell
+from a commit that never was.
 
     python -m fuzz.damage [--times 10000] [--seed 1]
 """
@@ -27,7 +27,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Phase, Put, Resource, Row, ServedQuery, State, rows_of
 from rr_actors.registrar.model.store import Store
 from rr_actors.storage.opening import Durability, open_store
-from rr_actors.storage.sqlite_store import SqliteStore, segments_among
+from rr_actors.storage.sqlite_store import SqliteTables, segments_among
 from rr_actors.storage.witness import Witness
 
 _NAME = "catalog.sqlite3"
@@ -96,12 +96,12 @@ def _killed_young(path: Path, registrar: str, witness: Witness, durability: Dura
 def _killed_while_folding(path: Path, registrar: str, witness: Witness, durability: Durability) -> Store:
     """Killed with several segments, as the SQLite file could not be written for a while."""
     store = _killed(path, registrar, witness, durability)
-    fold = SqliteStore.fold
+    fold = SqliteTables.fold
 
     def full(*_: Any) -> None:
         raise CatalogError("full", path="")
 
-    SqliteStore.fold = full  # type: ignore[method-assign]  # pyright: ignore[reportAttributeAccessIssue]
+    SqliteTables.fold = full  # type: ignore[method-assign]  # pyright: ignore[reportAttributeAccessIssue]
     try:
         for number in range(24, 30):
             store.commit(_changes(registrar, number))
@@ -111,7 +111,7 @@ def _killed_while_folding(path: Path, registrar: str, witness: Witness, durabili
                 except CatalogError:
                     _log.debug("as it should be")
     finally:
-        SqliteStore.fold = fold
+        SqliteTables.fold = fold
     return store
 
 
@@ -170,7 +170,7 @@ def _cut(file: Path, chance: random.Random, scene: Scene) -> Hurt:
     data = file.read_bytes()
     size = chance.randrange(len(data))
     file.write_bytes(data[:size])
-    return Hurt(f"{file.name} cut to {size} of {len(data)} bytes", _is_at_an_end(file, data, size, scene))
+    return Hurt(f"{file.name} cut to {size} of {len(data)} bytes", _is_at_an_end(file, data, size))
 
 
 def _remove(file: Path, _chance: random.Random, _scene: Scene) -> Hurt:
@@ -234,11 +234,8 @@ HURTS: Sequence[tuple[int, Callable[[Path, random.Random, Scene], Hurt]]] = (
 """How often each is done, of a hundred times."""
 
 
-def _is_at_an_end(file: Path, data: bytes, size: int, scene: Scene) -> bool:
+def _is_at_an_end(file: Path, data: bytes, size: int) -> bool:
     """Whether it is the newest journal, cut exactly at the end of a record."""
-    if scene.durability == "power" and file.name.endswith("-wal"):
-        page = struct.unpack_from(">I", data, 8)[0]
-        return size >= 32 and (size - 32) % (24 + page) == 0
     newest = segments_among(os.listdir(file.parent), file.with_name(_NAME))[-1:]
     return [file.name] == newest and size in _ends(data)
 

@@ -1,7 +1,7 @@
 """CatalogLock: one process at a time has a catalog open. The kernel releases the lock when that process dies.
 
-The lock's file has the holder's pid and the catalog's progress: the number of the opening, and the last commit, or the
-last segment of the journal that is begun. By this the next opening tells a file that is missing, older or cut off from
+The lock's file has the holder's pid and the catalog's progress: the number of the opening, and the last segment of the
+journal that is begun. By this the next opening tells a file that is missing, older or cut off from
 one that was never written. A clean end removes the progress, because the SQLite file has everything then.
 """
 
@@ -29,15 +29,14 @@ _log = Log(__name__)
 class Reached(msgspec.Struct, frozen=True, gc=False):
     """A catalog's progress: its id, how often it was opened, and the last segment of its journal that is begun.
 
-    `in_tables`: the catalog has no journal, and the number is that of the last commit in the tables. `is_made`: whether
-    it has its SQLite file; one that has committed nothing has none, nor one whose commits are all in its journal.
-    `folded`: the last segment, or commit, in the tables. `settled`: the last one in the SQLite file without its -wal.
+    `is_made`: whether it has its SQLite file; one that has committed nothing has none, nor one whose commits are all in
+    its journal. `folded`: the last segment in the tables; in a note of an earlier version's catalog without a journal,
+    the last commit, and the number is 0. `settled`: the last one in the SQLite file without its -wal.
     """
 
     id: str
     epoch: int
     number: int
-    in_tables: bool = False
     is_made: bool = True
     folded: int = 0
     settled: int = 0
@@ -155,7 +154,7 @@ class CatalogLock:
         if reached is None:
             text = "" if pid is None else str(pid)
         else:
-            kind = "tables" if reached.in_tables else "journal" if reached.is_made else "new"
+            kind = "journal" if reached.is_made else "new"
             numbers = f"{reached.number:020} {reached.folded:020} {reached.settled:020}"
             noted = f"{reached.id} {reached.epoch} {kind} {numbers}"
             text = f"{'' if pid is None else pid}\n{noted} {zlib.crc32(noted.encode()):08x}\n"
@@ -180,8 +179,9 @@ def _read(text: bytes) -> tuple[int | None, Reached | None]:
         return pid, None
     id_, epoch, kind, number, *others = noted.split(" ")
     folded, settled = map(int, others or (0, 0))  # an earlier version noted neither
-    made = kind != "new"
-    return pid, Reached(id_, int(epoch), int(number), kind == "tables", made, folded, settled)
+    if kind == "tables":  # of an earlier version, which had no journal for durability "power"
+        return pid, Reached(id_, int(epoch), 0, True, int(number), settled)
+    return pid, Reached(id_, int(epoch), int(number), kind != "new", folded, settled)
 
 
 _locks: weakref.WeakSet[CatalogLock] = weakref.WeakSet()  # weak: an interrupted caller may never get its lock

@@ -1,7 +1,8 @@
 """JournaledStore: commits go to a journal. Another thread folds many of them at a time into the SQLite file.
 
 SQLite's own commit takes six locks and two or three writes; a commit to the journal is one write, and as safe from
-SIGKILL. A row that is put and dropped again before the folding never gets into a table.
+SIGKILL. With durability "power" one fdatasync follows, and one fsync of the directory for each new segment. A row that
+is put and dropped again before the folding never gets into a table.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Put, apply
 from rr_actors.storage.damage import Damage
 from rr_actors.storage.sql_tables import Meta, check_lengths, check_numbers, decoded, net_of
-from rr_actors.storage.sqlite_store import SqliteStore, segments_among
+from rr_actors.storage.sqlite_store import SqliteTables, segments_among
 from rr_actors.storage.witness import segment_prefix
 
 _AT_MOST = 1_000_000  # changes in the journal: those of many seconds. The folding has failed all the time, or hangs
@@ -38,7 +39,9 @@ _log = Log(__name__)
 
 
 class JournaledStore:
-    """A Store (store.py) that survives SIGKILL; made by `open_store` (opening.py). Commits from any thread.
+    """A Store (store.py) that survives SIGKILL, and a power cut if its tables do; made by `open_store` (opening.py).
+
+    Any thread may commit.
 
     `upkeep` brings the SQLite file, with its -wal, up to date with the commits before it. A segment stays until the
     file has its changes without the -wal: so no single damaged file loses what was folded.
@@ -52,7 +55,7 @@ class JournaledStore:
         path: the catalog's SQLite file.
     """
 
-    def __init__(self, tables: SqliteStore, kept: Iterable[str] = (), end: End | None = None) -> None:
+    def __init__(self, tables: SqliteTables, kept: Iterable[str] = (), end: End | None = None) -> None:
         self.path = tables.path
         self.epoch = tables.epoch
         self._tables = tables
@@ -167,12 +170,14 @@ class JournaledStore:
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
-        number = self._last + 1
-        begins = number == 1 and not self._tables.is_made
-        segment = Segment(self._tables.folder, self.path, self._tables.meta, number, self._end, begins=begins)
-        self._tables.note(number)
+        tables, number = self._tables, self._last + 1
+        begins = number == 1 and not tables.is_made
+        segment = Segment(
+            tables.folder, self.path, tables.meta, number, self._end, begins=begins, synced=tables.is_synced
+        )
+        tables.note(number)
         if begins:
-            self._tables.note_outside()
+            tables.note_outside()
         return segment
 
     def _fold(self) -> None:
@@ -185,6 +190,7 @@ class JournaledStore:
                     self._begin_again()
                 segment = self._segment
                 if segment is not None and segment.end.records:
+                    self._settle_end(segment)
                     self._last, self._end = segment.number, segment.end
                     self._full.append(segment)
                     self._segment = None
@@ -204,6 +210,16 @@ class JournaledStore:
     def _note(self) -> None:
         with self._lock:
             self._tables.note(self._last if self._segment is None else self._segment.number)
+
+    def _settle_end(self, segment: Segment) -> None:
+        try:
+            segment.settle()
+        except OSError as error:
+            raise CatalogError(
+                f"{self.path}: expected to cut a record that was refused off {segment.name}, got: {error.strerror};"
+                " what was written before is safe there. Repair the disk, or move the catalog to another",
+                path=str(self.path),
+            ) from error
 
     def _settle(self) -> None:
         """Have the SQLite file take its -wal, and remove the segments that it has then."""
@@ -335,13 +351,22 @@ class Segment:
         number: the segment's number. A file of that name is from a failed attempt, and is written over.
         before: the end of the segment before; any value if that is folded.
         begins: whether the catalog has no SQLite file before this segment is folded.
+        synced: whether a power cut loses neither the segment nor a record that append() has written.
 
     Raises:
         OSError: the segment cannot be made; at most an empty file is left.
     """
 
     def __init__(
-        self, folder: Folder, catalog: Path, meta: Meta, number: int, before: End, *, begins: bool = False
+        self,
+        folder: Folder,
+        catalog: Path,
+        meta: Meta,
+        number: int,
+        before: End,
+        *,
+        begins: bool = False,
+        synced: bool = False,
     ) -> None:
         self.number = number
         self.name = f"{segment_prefix(catalog)}{number}"
@@ -352,11 +377,16 @@ class Segment:
         magic = _FIRST if begins else _MAGIC
         header = _HEADER.pack(magic, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
+        self._header = header + _CHECKSUM.pack(self._checksum)
         self._records = 0
+        self._synced = synced
+        self._is_in_doubt = False  # whether the disk may have a record that was refused
         self._file = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
         self._fd = self._file.fileno()
         try:
-            self._size = write_whole(self._fd, header + _CHECKSUM.pack(self._checksum), 0)
+            self._size = write_whole(self._fd, self._header, 0)
+            if synced:  # the first record's fdatasync is that of the header, too
+                os.fsync(folder.fd)
         except BaseException:
             self.remove()
             raise
@@ -374,9 +404,35 @@ class Segment:
         if _UINT64 in body and _TOO_LARGE.search(body):
             check_numbers(changes)
         data, checksum = record(body, self._checksum)
-        self._size = write_whole(self._fd, data, self._size)
+        self._size = self._write_synced(data) if self._synced else write_whole(self._fd, data, self._size)
         self._checksum = checksum
         self._records += 1
+
+    def _write_synced(self, data: bytes) -> int:
+        self.settle()
+        self._is_in_doubt = True
+        try:
+            end = write_whole(self._fd, data, self._size)
+            os.fdatasync(self._fd)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                self.settle()
+            raise
+        self._is_in_doubt = False
+        return end
+
+    def settle(self) -> None:
+        """Cut off what a failed append() may have left on the disk; raise an OSError if the disk does not do it.
+
+        After a failed fdatasync the kernel may take the pages for written. So the header, which no earlier fdatasync
+        covered if there are no records, is written again.
+        """
+        if self._is_in_doubt:
+            os.ftruncate(self._fd, self._size)
+            if not self._records:
+                write_whole(self._fd, self._header, 0)
+            os.fdatasync(self._fd)
+            self._is_in_doubt = False
 
     def remove(self) -> None:
         """Close the segment and remove its file. If that fails, the next opening ignores its changes and removes it."""

@@ -286,7 +286,8 @@ def _open_locked(
 ) -> Store:
     registrar = "" if witness is None else witness.registrar
     known, spent = (None, 0) if witness is None else witness.known_or_spent()
-    spare, settled = Spare(folder, path), 0
+    is_synced = durability == "power"
+    spare, settled = Spare(folder, path, synced=is_synced), 0
     try:
         settled = _mend(folder, path, lock.reached, spare)
         meta, content, left = _read_locked(folder, path, lock.reached, witness)
@@ -294,7 +295,8 @@ def _open_locked(
         if on_damage != "aside":
             raise
         meta, content = sqlite_store.NONE, content_of(())
-        left, spare, settled = _Left(epoch=0 if lock.reached is None else lock.reached.epoch), Spare(folder, path), 0
+        left = _Left(epoch=0 if lock.reached is None else lock.reached.epoch)
+        spare, settled = Spare(folder, path, synced=is_synced), 0
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(folder, path).name)
     else:
         if known is not None:
@@ -304,18 +306,19 @@ def _open_locked(
     place = (spent + 1, max(meta.folded, left.last), registrar or meta.registrar)
     if meta.id:
         if not sqlite_store.has_file(folder, path):  # all is in the journal; from here on as after any crash
-            sqlite_store.create(folder, path, durability, sql_tables.Meta(meta.id, meta.epoch, 0, registrar))
+            sqlite_store.create(folder, path, sql_tables.Meta(meta.id, meta.epoch, 0, registrar))
         meta = sql_tables.Meta(meta.id, *place)
     else:
         meta = sql_tables.Meta(os.urandom(8).hex(), *place)
-        if durability == "power" or known is not None or left.segments or meta.folded:
-            sqlite_store.create(folder, path, durability, meta)
-        if durability != "power":  # with it the first commit is SQLite's, and must not wait for the opening of the file
-            changes = None
-    tables = sqlite_store.SqliteStore(
+        if is_synced or known is not None or left.segments or meta.folded:
+            sqlite_store.create(folder, path, meta)
+        changes = None  # SQLite opens the file at the first folding
+    if is_synced:  # also where an opening that failed, or one without "power", has made the file
+        os.fsync(folder.fd)
+    tables = sqlite_store.SqliteTables(
         folder, path, lock, durability, meta, changes, content, witness, settled=settled, spare=spare
     )
-    if left.segments and (durability == "power" or not left.is_whole):
+    if left.segments and (is_synced or not left.is_whole):
         tables.tidy()
     kept: list[str] = []
     for number, segment in left.segments.items():
@@ -323,7 +326,7 @@ def _open_locked(
             kept.append(segment)
         else:
             folder.discard(segment)  # if that fails: it is folded, so it is ignored, and the next opening removes it
-    return tables if durability == "power" else JournaledStore(tables, kept, left.end)
+    return JournaledStore(tables, kept, left.end)
 
 
 class _Left(msgspec.Struct, frozen=True):
@@ -395,18 +398,16 @@ def _read(
                 "%s: another catalog than the one that was open here, and was not closed; that one is lost", path
             )
         reached = None
-    begun = 0
-    if reached is not None and not reached.in_tables:
-        begun = reached.number
+    begun = 0 if reached is None else reached.number
     settled = 0 if reached is None else reached.settled
     replay = found.since(meta, begun, settled=settled)
     apply(content, replay.changes)
-    if reached is not None and max(reached.folded, reached.number if reached.in_tables else 0) > meta.folded:
+    if reached is not None and reached.folded > meta.folded:
         _tell_of_older(path, meta, reached, is_whole=replay.is_whole)
     if lost := _lost(replay.ignored, content):
         more = f" and {len(lost) - _LISTED} more" if len(lost) > _LISTED else ""
         _log.warning("%s: lost with that: %s%s", path, ", ".join(lost[:_LISTED]), more)
-    last = max(found.last, begun, 0 if reached is None else reached.number)
+    last = max(found.last, begun)
     epoch = max(found.epoch_after(meta.folded), 0 if reached is None else reached.epoch)
     return meta, content, _Left(found.segments, last, epoch, replay.changes, replay.end, replay.is_whole)
 
@@ -414,8 +415,8 @@ def _read(
 def _tell_of_older(path: Path, meta: sql_tables.Meta, reached: Reached, *, is_whole: bool) -> None:
     """Warn that the SQLite file, or its -wal, has less than was written to it."""
     name = path.name if meta.folded < reached.settled else f"{path.name}-wal"
-    if reached.in_tables:
-        text = f"its last {reached.number - meta.folded} commit(s) are missing, and what they changed is lost"
+    if not reached.number:  # an earlier version's, without a journal
+        text = f"its last {reached.folded - meta.folded} commit(s) are missing, and what they changed is lost"
     elif meta.folded < reached.settled:
         text = "what was committed since then is lost"
     else:

@@ -1,4 +1,4 @@
-"""SqliteStore: a catalog in one SQLite file, in WAL mode, that any SQLite tool can read, also while it is open.
+"""SqliteTables: a catalog's SQLite file, in WAL mode, that any SQLite tool can read, also while it is open.
 
 `application_id` marks the file as a catalog, `user_version` is its schema's version (sql_tables.py). Beside it are
 its lock (catalog_lock.py), and SQLite's -wal and -shm while it is open: of a new one, from the first folding on.
@@ -24,7 +24,7 @@ import msgspec
 from rr_actors.base.errors import CatalogError, CatalogVersion
 from rr_actors.base.folder import Folder, make_directories
 from rr_actors.base.reporting.log import Log
-from rr_actors.registrar.model.rows import Change, Content, content_of
+from rr_actors.registrar.model.rows import Content, content_of
 from rr_actors.storage import sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.damage import Damage, damaged, errors_named
@@ -40,18 +40,20 @@ _TIDY_PAGES = 192  # after about so many written pages another thread copies the
 _EACH_A_PAGE = 4  # the estimate for a commit: its first 4 changes write a page each,
 _SOME_A_PAGE = 8  # and each 8 changes write one more
 _SHRINK = "VACUUM"
+_SYNCHRONOUS = "PRAGMA synchronous = NORMAL"  # the -wal is synced before it is copied; until then the journal has all
 _BUSY_S = 1.0  # the wait for a tool that has the file open; processes of this package never wait for each other
 
 _log = Log(__name__)
 
 
-class SqliteStore:
-    """A Store (store.py) on one SQLite file; made by `open_store` (opening.py). Usable from any thread, one at a time.
+class SqliteTables:
+    """The SQLite file that a journal is folded into, and the notes of it. Usable from any thread, one at a time.
 
     Args:
         folder, path: the catalog's directory, which close() closes, and its checked file there.
         lock: the lock, already held; close() releases it.
-        durability: "power": each commit waits for the disk.
+        durability: "power": a power cut loses neither the changes nor the opening. What is folded later is in the
+            journal, too, until the disk has it.
         meta, changes: committed at once; an older schema is migrated in the same commit. Without changes there is no
             file yet, or it has this meta row already; SQLite makes or opens it when it is used first.
         content: the file's content after that.
@@ -62,6 +64,7 @@ class SqliteStore:
     Attributes:
         folder, path, settled: as given; then as it is.
         meta: the meta row in the file.
+        is_synced: whether a power cut loses no commit.
         is_made: whether there is a file.
 
     Raises:
@@ -84,24 +87,26 @@ class SqliteStore:
     ) -> None:
         self.folder = folder
         self.settled = settled
-        self._spare = spare or Spare(folder, path)
         self.place = folder.place
         self.path = path
         self.meta = meta
         self.epoch = meta.epoch
         self.is_made = has_file(folder, path)
         self._witness = witness
-        self._durability: Literal["process", "power"] = durability
+        self.is_synced = durability == "power"
+        self._spare = spare or Spare(folder, path, synced=self.is_synced)
         self._lock = lock
         self._writing = threading.Lock()
-        self._synchronous = "FULL" if durability == "power" else "NORMAL"
         self._opened: sqlite3.Cursor | None = None
         self._closed = False
         self._wal = f"{path.name}-wal"
         if changes is not None:
             try:
                 version = sql_tables.version_of(self._connection)
+                if self.is_synced:
+                    self._cursor.execute("PRAGMA synchronous = FULL")
                 self._write(changes, meta, sql_tables.migration_from(version, content))
+                self._cursor.execute(_SYNCHRONOUS)
             except BaseException:
                 self._close_file()
                 raise
@@ -123,7 +128,7 @@ class SqliteStore:
             connection = sqlite3.connect(uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
             self._opened = cursor = connection.cursor()
             try:
-                cursor.execute(f"PRAGMA synchronous = {self._synchronous}")
+                cursor.execute(_SYNCHRONOUS)
                 cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
                 cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
                 cursor.execute("PRAGMA wal_autocheckpoint = 0")  # tidy() copies the -wal
@@ -138,7 +143,7 @@ class SqliteStore:
 
     def _make(self) -> None:
         if not has_file(self.folder, self.path):
-            create(self.folder, self.path, self._durability, self.meta)
+            create(self.folder, self.path, self.meta)
         elif not self._is_its_file():  # else an interrupt came just after it was made
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(self.path))
         self.is_made = True
@@ -153,7 +158,7 @@ class SqliteStore:
         """Record outside of its directory that the catalog has something, so that it is missed if it is removed."""
         if self._witness is not None:
             known = LastOpening(self.meta.id, self.epoch, str(self.path))
-            self._witness.note(known, synced=self._durability == "power")
+            self._witness.note(known, synced=self.is_synced)
 
     def forget_outside(self) -> None:
         """Remove that record, because the catalog has nothing, and no file."""
@@ -211,29 +216,10 @@ class SqliteStore:
         )
         return page * free > page * (pages - free) + _SPARE_BYTES
 
-    def commit(self, changes: Sequence[Change]) -> None:
-        unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
-        self.place.check()
-        number = self.meta.folded + 1  # each commit writes the meta row: so every -wal has the catalog's id
-        self._commit(sql_tables.net_of(changes), number, f"write {len(changes)} change(s)", unwritten)
-        self.note(number)
-
-    def _commit(self, changes: sql_tables.Net, number: int, expected: str, if_not: str) -> None:
-        self._content = None
-        self._pages += 1 + min(changes.count, _EACH_A_PAGE + changes.count // _SOME_A_PAGE)  # 1: of the meta row
-        meta = msgspec.structs.replace(self.meta, folded=number)
-        try:
-            self._write(changes, meta)
-        except (sqlite3.Error, OSError) as error:
-            text = f"{self.path}: expected to {expected}, got: {error}; {if_not}"
-            raise CatalogError(text, path=str(self.path)) from error
-        self.meta = meta
-
     def note(self, number: int, *, needed: bool = False) -> None:
-        """Have CatalogLock.note() note that a segment of the journal is begun, or that a commit is in the tables."""
-        in_tables = self._durability == "power"
+        """Have CatalogLock.note() note that a segment of the journal is begun."""
         folded = self.meta.folded if self.is_made else 0
-        reached = Reached(self.meta.id, self.epoch, number, in_tables, self.is_made, folded, self.settled)
+        reached = Reached(self.meta.id, self.epoch, number, self.is_made, folded, self.settled)
         self._lock.note(reached, needed=needed)
 
     def keep_lock(self) -> None:
@@ -242,9 +228,23 @@ class SqliteStore:
             self._lock.keep()
 
     def fold(self, changes: sql_tables.Net, segment: int) -> None:
-        """Write the changes of a journal as commit() does, atomically with the number of its last segment."""
-        unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
-        self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
+        """Write the changes of a journal, atomically with the number of its last segment.
+
+        Raises:
+            CatalogError: the file could not be written; nothing was.
+        """
+        self._content = None
+        self._pages += 1 + min(changes.count, _EACH_A_PAGE + changes.count // _SOME_A_PAGE)  # 1: of the meta row
+        meta = msgspec.structs.replace(self.meta, folded=segment)  # each folding writes it: so every -wal has the id
+        try:
+            self._write(changes, meta)
+        except (sqlite3.Error, OSError) as error:
+            raise CatalogError(
+                f"{self.path}: expected to take {changes.count} change(s) from its journal, got: {error}; they stay in"
+                " the journal, and are safe there. Make room on the disk, or repair it",
+                path=str(self.path),
+            ) from error
+        self.meta = meta
 
     def _settle(self, number: int) -> None:
         """Note that the file has all up to this commit without its -wal."""
@@ -277,10 +277,6 @@ class SqliteStore:
             return os.stat(self._wal, dir_fd=self.folder.fd, follow_symlinks=False).st_size
         except OSError:  # it is not there
             return 0
-
-    def upkeep(self) -> None:
-        """Do what tidy() does: there is no journal."""
-        self.tidy()
 
     def tidy(self) -> None:
         """Copy the -wal into the file and empty it, by a separate connection: the fsyncs delay no commit.
@@ -349,8 +345,14 @@ class SqliteStore:
 
     def _erase(self) -> None:
         self._lock.note(None)  # a noted catalog without its file would count as damaged
-        segments = segments_among(self.folder.names(), self.path)
-        for name in (*segments, *leftovers(self.path), *(file.name for file in files_of(self.path))):
+        first, *others = (file.name for file in files_of(self.path))
+        self._unlink(*segments_among(self.folder.names(), self.path), *leftovers(self.path), *others)
+        if self.is_synced:  # after a power cut, too, nothing outlives the file that belongs to it
+            os.fsync(self.folder.fd)
+        self._unlink(first)
+
+    def _unlink(self, *names: str) -> None:
+        for name in names:
             with contextlib.suppress(FileNotFoundError):
                 self.folder.unlink(name)
 
@@ -394,17 +396,14 @@ def write_copy(path: Path, meta: sql_tables.Meta, content: Content) -> None:
     with errors_named(path):
         make_directories(path.parent, synced=True)
         with Folder.at(path.parent) as folder:
-            create(folder, path, "power", meta, content)
+            create(folder, path, meta, content)
+            os.fsync(folder.fd)
 
 
-def create(
-    folder: Folder,
-    path: Path,
-    durability: Literal["process", "power"],
-    meta: sql_tables.Meta,
-    content: Content | None = None,
-) -> None:
+def create(folder: Folder, path: Path, meta: sql_tables.Meta, content: Content | None = None) -> None:
     """Make a catalog with this meta row, under another name, and rename it: a crash leaves all of it or nothing.
+
+    The caller syncs the directory, where a power cut must leave it.
 
     SQLite makes it in memory, and it is written at once.
 
@@ -435,8 +434,6 @@ def create(
     except BaseException:
         folder.discard(new.name)
         raise
-    if durability == "power":
-        os.fsync(folder.fd)
 
 
 @functools.cache

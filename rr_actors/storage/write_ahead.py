@@ -40,12 +40,18 @@ _log = Log(__name__)
 class Spare:
     """The second copy of a catalog's -wal. One thread at a time uses it.
 
+    Args:
+        folder, path: the catalog's directory, and its file there.
+        synced: whether a power cut, too, leaves a whole spare while SQLite copies the -wal, and no spare after that: an
+            earlier one would put old pages into the file.
+
     Attributes:
         is_made: whether there is one.
     """
 
-    def __init__(self, folder: Folder, path: Path) -> None:
+    def __init__(self, folder: Folder, path: Path, *, synced: bool = False) -> None:
         self.is_made = False
+        self._synced = synced
         self._folder = folder
         self._wal, self._shm = f"{path.name}-wal", f"{path.name}-shm"
         self._path = path
@@ -85,7 +91,12 @@ class Spare:
                     " not copied into the catalog's file. See whether the disk is good",
                     path=str(self._path),
                 )
+            if self._synced:
+                with self._folder.open(f"{self._copy}-wal") as file:
+                    os.fsync(file.fileno())
             self._folder.rename(f"{self._copy}-wal", self._name)
+            if self._synced:
+                os.fsync(self._folder.fd)
             self.is_made = True
         finally:
             self._tidy_up()
@@ -104,8 +115,11 @@ class Spare:
 
     def remove(self) -> bool:
         """Remove the spare if there is one; return whether there is none then."""
+        was_there = not self.is_gone()
         self._folder.discard(self._name)
         self.is_made = False
+        if self._synced and was_there:
+            os.fsync(self._folder.fd)
         return self.is_gone()
 
     def is_gone(self) -> bool:
@@ -146,7 +160,7 @@ class Spare:
         self.is_made = True
         if wal[: len(spare)] == spare:
             return
-        self._folder.write(self._wal, spare + wal[len(spare) :])
+        self._folder.write(self._wal, spare + wal[len(spare) :], synced=self._synced)
         self._folder.discard(self._shm)
         if wal:  # a crash may come between the end of the copying, when the -wal is emptied, and the spare's removal
             _log.warning(

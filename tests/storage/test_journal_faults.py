@@ -19,7 +19,7 @@ from rr_actors.registrar.model.store import Store
 from rr_actors.storage import catalog_lock
 from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.opening import open_store, read_rows
-from rr_actors.storage.sqlite_store import SqliteStore
+from rr_actors.storage.sqlite_store import SqliteTables
 from support_stores import Rows, after, in_order, part, query
 
 DISK = ("open", "pwrite", "ftruncate", "unlink", "rename", "replace")
@@ -234,7 +234,7 @@ def crashed(directory: Path, patch: pytest.MonkeyPatch) -> tuple[Path, Rows]:
     with patch.context() as full:
         full.setattr(os, "unlink", lambda *_, **__: _raise(OSError(errno.EIO, "broken")))
         run.play("tidy")
-        full.setattr(SqliteStore, "fold", lambda *_: _raise(CatalogError("full", path="")))
+        full.setattr(SqliteTables, "fold", lambda *_: _raise(CatalogError("full", path="")))
         for changes in (B, C, E):
             run.play(changes)
             with contextlib.suppress(CatalogError):
