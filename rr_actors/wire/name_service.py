@@ -30,6 +30,7 @@ import stat
 import threading
 from collections.abc import Generator, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import msgspec
 
@@ -43,7 +44,7 @@ from rr_actors.base.errors import (
     shown,
 )
 from rr_actors.base.folder import Folder, NotOurs, Place, make_directories
-from rr_actors.base.names import REGISTRAR, check_name, is_part
+from rr_actors.base.names import REGISTRAR, ServerId, check_name, check_registrar_name, is_part
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
@@ -52,6 +53,7 @@ _log = Log(__name__)
 
 _REGISTRAR = "r."  # the prefix of a registrar's entry
 _CLASSES = "c."  # the prefix of an entry with the classes of a manager
+_HOSTS = "h."  # the prefix of an entry with what is known of another host
 _LABELS = "l."  # the prefix of an entry with what a server provides
 _NOTES = "n."  # the prefix of an entry with what an operator should know of a manager
 _BELOW = "~"  # stands for "/" in the name of an actor's entry
@@ -84,7 +86,7 @@ class Presence(enum.StrEnum):
 
 class Turn(enum.StrEnum):
     """The place of a STARTING actor among its siblings, which start one after another: DUE ones start when the NOW one
-    is up."""
+    is up. A STOPPED one that is DUE starts when its supervisor, which stops as well, is started again."""
 
     NOW = "now"
     DUE = "due"
@@ -96,7 +98,8 @@ class NameEntry(msgspec.Struct, frozen=True):
     `why` is a text for people: the reason for STOPPED or GONE, or how the last processes died while STARTING; "" if
     the reason is not known.
     `once`: the actor is UP, and will not be started again when it ends.
-    `turn`: the actor is STARTING in its turn; None if it starts whatever its siblings do.
+    `turn`: the actor is STARTING in its turn, or STOPPED together with its supervisor; None if what it does depends on
+    no other.
     """
 
     status: Presence
@@ -111,10 +114,60 @@ class NameEntry(msgspec.Struct, frozen=True):
         return f": {self.why}" if self.why else ""
 
 
+class HostInfo(msgspec.Struct, frozen=True):
+    """Another host, as System.hosts() returns it.
+
+    Attributes:
+        name: the host's name.
+        state: "up"; "unreachable": it was lost, or has not been seen yet; "refused": it speaks another version, or
+            another system has this host's name.
+        since: when that began, in seconds since 1970.
+        why: the reason, for people. If it is up: that a second system has its name, or "".
+        exports: the statuses of the registrars that it lets this host use, by name.
+    """
+
+    name: str
+    state: str
+    since: float
+    why: str
+    exports: dict[str, str]
+
+
+class HostSettings(Protocol):
+    """What System(hosts=...) takes: rr.Hosts. Programs without other hosts do not import it."""
+
+    @property
+    def name(self) -> str:
+        """The name of this host."""
+        ...
+
+
+class OtherHosts(Protocol):
+    """What the processes of a system with hosts= know of other hosts; wire/hosts/host_names.py has it."""
+
+    @property
+    def host(self) -> str:
+        """The name of this host."""
+        ...
+
+    def provider(self, asked: ServerId, directory: Directory) -> ServerId:
+        """Return the server that is meant: behind a route, or without the own host's name."""
+        ...
+
+    def known(self, directory: Directory) -> list[HostInfo]:
+        """Return the other hosts that the directory knows, sorted by name."""
+        ...
+
+    def unreachable(self, directory: Directory, registrar: str) -> HostInfo | None:
+        """Return the host of a registrar if that is another one, and not reachable now."""
+        ...
+
+
 _AWAY = (Presence.GONE, Presence.DORMANT)
 _MARKS = {
     **{status.value: NameEntry(status, "") for status in Presence if status is not Presence.UP},
     **{f"{Presence.STARTING.value} {turn.value}": NameEntry(Presence.STARTING, "", turn=turn) for turn in Turn},
+    f"{Presence.STOPPED.value} {Turn.DUE.value}": NameEntry(Presence.STOPPED, "", turn=Turn.DUE),
 }
 _UP = Presence.UP.value + ":"
 _UP_ONCE = Presence.UP.value + " once:"
@@ -130,8 +183,13 @@ def _fitting(why: str) -> str:
 
 
 def registrar_key(name: str) -> str:
-    """Return the name of a registrar's entry."""
-    return _REGISTRAR + check_name(name, "registrar name")
+    """Return the name of a registrar's entry; that of another host is "host/registrar"."""
+    check_registrar_name(name)
+    return _key_of(name)
+
+
+def _key_of(name: str) -> str:
+    return _REGISTRAR + name.replace("/", _BELOW)
 
 
 @functools.lru_cache(1024)  # called for each message to an actor of another process
@@ -302,8 +360,34 @@ class Directory:
             return []
 
     def registrars(self) -> list[str]:
-        """Return the names of all registrars that have an entry, sorted."""
-        return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
+        """Return the names of this host's registrars that have an entry, sorted."""
+        return [name for name in self._all_registrars() if "/" not in name]
+
+    def other_hosts_registrars(self) -> list[str]:
+        """Return the registrars of other hosts that have an entry, as "host/registrar", sorted."""
+        return [name for name in self._all_registrars() if "/" in name]
+
+    def _all_registrars(self) -> list[str]:
+        keys = [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
+        return [key.replace(_BELOW, "/") for key in keys]
+
+    def put_host(self, host: str, text: str) -> None:
+        """Write what is known of another host, at most 900 bytes."""
+        self._put(_HOSTS + check_name(host, "host name"), text)
+
+    def host(self, host: str) -> str:
+        """Return what is known of another host; "" if nothing is. One system call."""
+        with contextlib.suppress(OSError):
+            return os.readlink(_HOSTS + host, dir_fd=self._names.fd)
+        return ""
+
+    def remove_host(self, host: str) -> None:
+        """Remove what is known of a host."""
+        self._put_or_remove(_HOSTS + host, "")
+
+    def hosts(self) -> list[str]:
+        """Return the names of the other hosts of which anything is known, sorted."""
+        return [name.removeprefix(_HOSTS) for name in self.names() if name.startswith(_HOSTS)]
 
     def put_classes(self, registrar: str, classes: Sequence[str]) -> None:
         """Write the names of the classes of the manager that has this registrar."""
@@ -375,8 +459,8 @@ class Directory:
 
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """Return the error for an unknown registrar; it names the known ones, and the one that was probably meant."""
-        entry = self.lookup(_REGISTRAR + name)
-        entries = {other: self.lookup(_REGISTRAR + other) for other in self.registrars()}
+        entry = self.lookup(_key_of(name))
+        entries = {other: self.lookup(_key_of(other)) for other in self._all_registrars()}
         known = [other for other, found in entries.items() if found and found.status not in _AWAY]
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
         what = "there is none of this name in the system"

@@ -197,8 +197,9 @@ def test_two_threads_that_miss_the_directory_at_once_make_it_once(
 
 def test_keys_of_registrars_and_actors_do_not_collide_and_are_checked() -> None:
     assert registrar_key("cameras") == "r.cameras"
+    assert registrar_key("hostb/cameras") == "r.hostb~cameras"
     assert actor_key("root/cameras") == "a.root~cameras"
-    for bad in ("", "a/b", "a~b", ".a", "x" * 65):
+    for bad in ("", "a/b/c", "/a", "a/", "a~b", ".a", "x" * 65):
         with pytest.raises(InvalidName):
             registrar_key(bad)
     for bad in ("", "/", "root/", "root//a", "root/a~b"):

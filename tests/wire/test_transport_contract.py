@@ -12,10 +12,13 @@ from typing import Any
 import pytest
 
 from rr_actors.base.errors import NameTaken, RrError, Unavailable, UnknownRegistrar, UsageError
+from rr_actors.wire.hosts.zenoh_link import ZenohTransport
 from rr_actors.wire.local_transport import LocalTransport
 from rr_actors.wire.transport import Accept, Link, Receiver, Transport, Welcome
 from rr_actors.wire.unix_transport import UnixTransport
-from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, loop_of
+from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, free_port, loop_of
+
+CODECS = {"registrar": Note}
 
 
 class World:
@@ -25,14 +28,21 @@ class World:
         self.kind = kind
         self._directory = directory
         self._local = LocalTransport()
+        self._endpoint = f"tcp/127.0.0.1:{free_port()}"  # of the first transport between hosts
         self._made: list[Transport] = [self._local]
 
     def transport(self) -> Transport:
         if self.kind == "local":
             return self._local
-        made = UnixTransport(self._directory, KEY, {"registrar": Note})
+        made = self._between_hosts() if self.kind == "zenoh" else UnixTransport(self._directory, KEY, CODECS)
         self._made.append(made)
         return made
+
+    def _between_hosts(self) -> Transport:
+        number = len(self._made)
+        endpoints = [self._endpoint]
+        here, there = (endpoints, []) if number == 1 else ([], endpoints)
+        return ZenohTransport("contract", f"host{number}", CODECS, listen=here, connect=there)
 
     async def pair(self, accept: Accept) -> tuple[Transport, Transport]:
         provider, consumer = self.transport(), self.transport()
@@ -54,7 +64,7 @@ def loop(request: pytest.FixtureRequest) -> Iterator[asyncio.AbstractEventLoop]:
         yield new_loop
 
 
-@pytest.fixture(params=["unix", "local"])
+@pytest.fixture(params=["unix", "local", "zenoh"])
 def run(request: pytest.FixtureRequest, loop: asyncio.AbstractEventLoop, tmp_path: Path) -> Run:
     """Run a scenario on the loop, with one of the transports; nothing may be left afterwards."""
 

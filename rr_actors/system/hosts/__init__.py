@@ -1,0 +1,1 @@
+"""The gateway to systems on other hosts: what System(hosts=...) starts."""

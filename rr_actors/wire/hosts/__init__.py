@@ -1,0 +1,1 @@
+"""Links between hosts, over Eclipse Zenoh; the extra "hosts" installs it."""
