@@ -59,6 +59,13 @@ class Question(SupervisorLook, frozen=True):
     id: str = ""
 
 
+class Foresee(SupervisorLook, frozen=True):
+    """A question that is answered at once: what would happen if the child `id` was killed, stopped or restarted?"""
+
+    id: str
+    what: Literal["kill", "stop", "restart"]
+
+
 class ChildUpdated(SupervisorCall, frozen=True):
     """The child supervisor `id` has been given a new specification."""
 

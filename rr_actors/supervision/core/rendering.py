@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, cast
 
-from rr_actors.base.errors import UsageError, shown
+from rr_actors.base.errors import UsageError, counted, shown
 from rr_actors.base.notebook import bundle
 from rr_actors.base.svg_pictures import Box, draw
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
@@ -81,7 +81,7 @@ class Tree:
         return bundle(self.render(), svg=self.svg(), mermaid=self.mermaid())
 
     def __repr__(self) -> str:
-        return f"<Tree of {self.data['path']}: {len(self.paths())} nodes>"
+        return f"<Tree of {self.data['path']}: {counted(len(self.paths()), 'node')}>"
 
 
 def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") -> str:
@@ -163,7 +163,7 @@ def _facts(node: Node) -> tuple[str, ...]:
         _settings(node) or node.get("what", ""),
         _state(node),
         "" if node.get("pid") is None else f"pid {node['pid']}",
-        f"{restarts} restart{'' if restarts == 1 else 's'}" if restarts else "",
+        counted(restarts, "restart") if restarts else "",
         " ".join(str(node[key]) for key in ("restart", "placement") if key in node),
         "significant" if node.get("significant") else "",
     )

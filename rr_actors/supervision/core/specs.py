@@ -1,4 +1,4 @@
-"""ChildSpec, Supervisor and Backoff: how to start, restart and stop children.
+"""ChildSpec, Supervisor and Backoff: how to start, restart and stop children. ChildModel: how a simulated one behaves.
 
 A specification is checked when it is made, so each one is valid. One check comes later, when the class is used: that
 it is a Manager, an Actor or a plain Pykka actor. Names and meanings are those of Erlang/OTP's supervisor. The
@@ -7,11 +7,15 @@ default intensity is Elixir's. docs/otp.md lists the differences.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args, get_origin
 
+from msgspec import Struct
+
 from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
+from rr_actors.base.errors import is_a
 from rr_actors.base.toml import FilePath, parse_child, read_supervisor
 
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one"]
@@ -260,6 +264,8 @@ class Supervisor:
     def from_toml(cls, path: FilePath) -> Supervisor:
         """Read a tree from a TOML file (docs/supervision.md shows one).
 
+        Hosts.from_toml() reads the table [hosts] of the same file.
+
         Raises:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
                 `.expected`, `.got`
@@ -344,3 +350,98 @@ def _check_as_child(who: str, restart: object, shutdown_s: object, significant: 
         expected = "False with restart='permanent': a child that is always restarted has no end of its own"
         raise invalid(who, "significant", expected, significant)
     check_one_of(placement, who, "placement", get_args(Placement))
+
+
+# -- children of simulations -------------------------------------------------------------------------------------------
+
+Chance = Callable[[], float]
+"""Returns a random number in [0, 1)."""
+
+EndReason = Literal["killed", "abnormal", "normal"]
+
+
+class Exponential(Struct, frozen=True):
+    """Times that are as likely to end in each second, however long they have lasted.
+
+    Args:
+        mean_s: their mean in seconds, above 0.
+
+    Raises:
+        InvalidSpec: naming the field.
+    """
+
+    mean_s: float
+
+    def __post_init__(self) -> None:
+        check_positive(self.mean_s, "Exponential", "mean_s")
+
+    def draw(self, chance: Chance) -> float:
+        """Return one of these times, in seconds."""
+        return -self.mean_s * math.log(1 - chance())
+
+
+class Uniform(Struct, frozen=True):
+    """Times between two limits, each as likely as the others.
+
+    Args:
+        least_s: the shortest, in seconds, at least 0.
+        most_s: the longest, at least `least_s`.
+
+    Raises:
+        InvalidSpec: naming the field.
+    """
+
+    least_s: float
+    most_s: float
+
+    def __post_init__(self) -> None:
+        check_number(self.least_s, "Uniform", "least_s", least=0)
+        check_number(self.most_s, "Uniform", "most_s", least=0)
+        if self.most_s < self.least_s:
+            raise invalid("Uniform", "most_s", f"at least least_s ({self.least_s:g})", self.most_s)
+
+    def draw(self, chance: Chance) -> float:
+        """Return one of these times, in seconds."""
+        return self.least_s + (self.most_s - self.least_s) * chance()
+
+
+Seconds = float | Exponential | Uniform
+"""A time that is always the same, or one that is drawn each time."""
+
+
+def draw(seconds: Seconds, chance: Chance) -> float:
+    """Return a time in seconds."""
+    return seconds.draw(chance) if isinstance(seconds, Exponential | Uniform) else seconds
+
+
+class ChildModel(Struct, frozen=True):
+    """How long a child needs to start, how long it lives, and how it ends. `Child.fails()` makes one, and says more.
+
+    Raises:
+        InvalidSpec: `.field`, `.expected`, `.got`.
+    """
+
+    every_s: Seconds | None = None
+    start_s: Seconds = 0.1
+    start_fails: float = 0.0
+    hangs: float = 0.0
+    stop_s: Seconds = 0.0
+    reason: EndReason = "killed"
+
+    def __post_init__(self) -> None:
+        who = "Child.fails"
+        with examined(who):
+            if self.every_s is not None:
+                _check_seconds(self.every_s, who, "every_s")
+                if is_a(self.every_s, (int, float)):
+                    check_positive(self.every_s, who, "every_s")
+            _check_seconds(self.start_s, who, "start_s")
+            _check_seconds(self.stop_s, who, "stop_s")
+            check_number(self.start_fails, who, "start_fails", least=0, most=1)
+            check_number(self.hangs, who, "hangs", least=0, most=1)
+            check_one_of(self.reason, who, "reason", get_args(EndReason))
+
+
+def _check_seconds(value: object, who: str, field: str) -> None:
+    if not isinstance(value, Exponential | Uniform):
+        check_number(value, who, field, least=0, also=" (seconds), an Exponential or a Uniform")

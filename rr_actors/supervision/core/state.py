@@ -89,7 +89,9 @@ class SupervisedChild(Struct, frozen=True):
         kept: whether it is a dynamic child that start_child() was given an id for. It is on disk, and comes back with
             its supervisor, until it has ended for good.
         lost: of a kept child, why it cannot be started from what is on disk.
-        run: number of its present or last start; 0 before the first. `previous`: of the start before.
+        run: number of its present or last start among those of all children; 0 before the first. `previous`: of the
+            start before.
+        starts: how often it has been started.
         why: the purpose of its present start; RESTART once it is up, since the next start will be a restart.
         up_at: when this run became ready, monotonic seconds; None before.
         attempts: restarts since it last ran for long enough (for the backoff).
@@ -109,6 +111,7 @@ class SupervisedChild(Struct, frozen=True):
     why: Why = Why.INIT
     run: int = 0
     previous: int = 0
+    starts: int = 0
     up_at: float | None = None
     attempts: int = 0
     wanting: int = 0
@@ -266,7 +269,7 @@ class Report(Struct, frozen=True):
         event: started, ignored (on_start returned IGNORE), start_failed, exited (by itself), stopped (on request),
             deleted (by hand), gave_up (restart intensity exceeded because of this child), auto_shutdown (because of
             this significant child).
-        id, run: the child and the start it is about.
+        id, run: the child and the start it is about. `starts`: how often the child had been started by then.
         state: the child's state from now on; None when its specification is gone, so that it never starts again.
         exit: how it ended, for exited and stopped (None if it only waited for a start, which is dropped).
         error: for start_failed and gave_up.
@@ -282,6 +285,7 @@ class Report(Struct, frozen=True):
     error: BaseException | None = None
     restarts: int = 0
     delay_s: float = 0.0
+    starts: int = 0
 
 
 class CallReply(Struct, frozen=True):

@@ -19,7 +19,15 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from rr_actors.base.errors import DescribedError, NotFound, RestartIntensityExceeded, RrError, StartFailed, text_of
+from rr_actors.base.errors import (
+    DescribedError,
+    NotFound,
+    RestartIntensityExceeded,
+    RrError,
+    StartFailed,
+    counted,
+    text_of,
+)
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.supervision.core.children import Children
 from rr_actors.supervision.core.state import (
@@ -77,7 +85,8 @@ class Draft:
     def start(self, child: SupervisedChild, delay_s: float = 0.0) -> None:
         """Start the child, as the next run."""
         self.tree = replace(self.tree, last_run=self.tree.last_run + 1)
-        child = self.put(child, phase=ChildPhase.STARTING, run=self.tree.last_run, previous=child.run, up_at=None)
+        run, starts = self.tree.last_run, child.starts + 1
+        child = self.put(child, phase=ChildPhase.STARTING, run=run, previous=child.run, starts=starts, up_at=None)
         self.actions.append(StartChild(child.id, child.run, child.start_spec, delay_s, child.why))
 
     def due(self, child: SupervisedChild, delay_s: float = 0.0) -> None:
@@ -120,7 +129,7 @@ class Draft:
 
     def report(self, event: Event, child: SupervisedChild, state: ChildState | None, **details: Any) -> None:
         """Add a report for the log and the history."""
-        self.actions.append(Report(event, child.id, child.run, state, **details))
+        self.actions.append(Report(event, child.id, child.run, state, starts=child.starts, **details))
 
     def reply(self, callers: Iterable[Hashable], id: str | None = None, error: RrError | None = None) -> None:
         """Give all these callers the same answer."""
@@ -161,7 +170,7 @@ class Draft:
         spec = self.tree.spec
         listed = [(restart.id, self.now - restart.at, restart.reason) for restart in self.tree.restarts]
         text = "; ".join(f"{id} {ago:.3g} s ago: {reason}" for id, ago, reason in listed)
-        needed = f"{len(listed)} restart{'s' if len(listed) > 1 else ''}"
+        needed = counted(len(listed), "restart")
         return RestartIntensityExceeded(
             f"supervisor {self.tree.path}: {needed} needed within {spec.max_seconds:g} s, {spec.max_restarts} allowed: "
             f"{text}",
