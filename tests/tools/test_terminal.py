@@ -6,8 +6,6 @@ import asyncio
 import logging
 import os
 import re
-import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -25,16 +23,20 @@ import rr_actors as rr
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
+from rr_actors.system.console.attention.attention_items import AttentionItem
+from rr_actors.system.console.attention.attention_questions import Attention
 from rr_actors.tools import process_usage
 from rr_actors.tools.process_usage import UsageWatch
 from rr_actors.tools.tables.sheets import SHEETS
 from rr_actors.tools.tables.table import tables_of
+from rr_actors.tools.terminal.attention_lines import attention_rows
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import Keys, Pane, Terminal
 from rr_actors.tools.terminal.terminal_rows import Served, Window
 from rr_actors.tools.terminal.terminal_tables import SheetRows
-from support import LIMIT_S, TEST_PATHS, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_respawned
+from support import LIMIT_S, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_respawned
 from support_managers import Order, Shop
+from support_tmux import Tmux, needs_tmux, terminal
 
 Start = Callable[..., rr.System]
 
@@ -63,6 +65,11 @@ class Person:
     @property
     def events(self) -> str:
         return "\n".join(self.lines(self.terminal.events))
+
+    @property
+    def attention(self) -> str:
+        shown = self.terminal.attention
+        return "\n".join(shown.render_line(y).text.rstrip() for y in range(shown.size.height))
 
     async def sees(self, predicate: Callable[[], bool]) -> None:
         deadline = time.monotonic() + LIMIT_S
@@ -154,6 +161,55 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_key_each(shop: rr.Syst
     sit_down(state_dir, scene)
 
     assert pid_of(shop, "shop") != pid
+
+
+def test_the_first_lines_say_what_needs_attention_and_are_gone_when_all_is_well(
+    shop: rr.System, state_dir: Path
+) -> None:
+    async def scene(person: Person) -> None:
+        await person.chooses("  shop")
+        assert not person.terminal.attention.display
+        await person.press("t", "y")
+        await person.sees(lambda: "WARNING root/shop was stopped, and stays stopped until restart" in person.attention)
+        assert person.terminal.attention.region.y == 1
+        await person.press("r")
+        await person.sees(lambda: not person.terminal.attention.display)
+
+    sit_down(state_dir, scene)
+
+
+@pytest.mark.parametrize(("total", "lines"), [(0, 0), (1, 1), (3, 3), (4, 3), (1000, 3)])
+def test_three_lines_say_what_is_worst_and_how_much_more_there_is(total: int, lines: int) -> None:
+    items = [AttentionItem(str(number), "ERROR", "disk", f"disk {number}", "") for number in range(total)]
+
+    rows = attention_rows(Attention(total, items[: c.PAGE_LIMIT]))
+
+    assert len(rows) == lines
+    assert [row.text for row in rows[:2]] == [f"ERROR   disk {number}" for number in range(min(lines, 2))]
+    assert [row.text for row in rows if "more" in row.text] == (
+        [f"and {total - 2:,} more: rr-actors attention"] if total > 3 else []
+    )
+
+
+def test_a_question_says_what_would_happen(start: Start, state_dir: Path) -> None:
+    system = start(
+        rr.Supervisor(
+            [rr.ChildSpec(Talker, id=id, placement="process") for id in ("one", "two")], strategy="rest_for_one"
+        )
+    )
+    pid = pid_of(system, "one")
+
+    async def scene(person: Person) -> None:
+        await person.chooses("  one")
+        await person.press("K")
+        await person.sees(lambda: "two would stop" in person.terminal.status)
+        assert "kill root/one? y: yes" in person.terminal.status
+        await person.press("escape")
+        await person.sees(lambda: "not done: kill root/one" in person.terminal.status)
+
+    sit_down(state_dir, scene)
+
+    assert pid_of(system, "one") == pid
 
 
 def test_the_keys_of_vi_move_and_a_kill_asks_first(shop: rr.System, state_dir: Path) -> None:
@@ -569,6 +625,25 @@ def test_only_what_is_visible_is_asked_for(start: Start, state_dir: Path) -> Non
     asyncio.run(play())
 
 
+class Jobs(rr.Manager):
+    """Declares a table of its own."""
+
+    @rr.table("jobs", rr.TableColumn("job"), rr.TableColumn("left", kind="bar", of="all"))
+    def jobs(self) -> list[dict[str, Any]]:
+        """Return the jobs."""
+        return [{"job": "sweep", "left": 1, "all": 2}]
+
+
+def test_the_tables_of_managers_are_a_list_of_their_own(start: Start, state_dir: Path) -> None:
+    start(rr.ChildSpec(Jobs, id="jobs"))
+
+    async def scene(person: Person) -> None:
+        await person.press("6")
+        await person.sees(lambda: "jobs sweep" in person.tree and "1 of 2" in person.tree)
+
+    sit_down(state_dir, scene)
+
+
 def test_a_window_goes_on_from_one_list_to_the_next(start: Start, state_dir: Path) -> None:
     start()
     crowd = Crowd(state_dir)
@@ -614,26 +689,11 @@ def test_without_the_extra_the_command_says_what_to_install(tmp_path: Path, shop
     assert len(ran.stderr.splitlines()) == 1
 
 
-needs_tmux = pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux: apt-get install tmux")
-Tmux = Callable[..., str]
-
-
 @pytest.fixture
 def tmux(state_dir: Path, tmp_path: Path) -> Iterator[Tmux]:
-    """`rr-actors top` in a real terminal: tmux("send-keys", "j")."""
-
-    def run(*arguments: str) -> str:
-        command = ["tmux", "-S", str(tmp_path / "tmux"), "-f", "/dev/null", *arguments]
-        environment = os.environ | {"PYTHONPATH": TEST_PATHS, "LC_ALL": "C.UTF-8"}
-        return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-
-    top = shlex.join([sys.executable, "-m", "rr_actors", "top", "--state", str(state_dir)])
-    run("new-session", "-d", "-x", "80", "-y", "24", f"{top}; echo exit code $?; read line")
-    try:
-        yield run
-    finally:
-        run("kill-server")
-        (tmp_path / "tmux").unlink(missing_ok=True)
+    """`rr-actors top` in a real terminal."""
+    with terminal(tmp_path, "top", "--state", str(state_dir), columns=80, lines=24) as tmux:
+        yield tmux
 
 
 @needs_tmux

@@ -26,11 +26,13 @@ from rr_actors.streams.stream import ReaderRow, StreamInfo, StreamRow
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
+from rr_actors.system.console.attention.attention_items import Known, needs_attention
+from rr_actors.system.console.attention.attention_questions import Attention, ListAttention
 from rr_actors.system.recording import event_texts
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.tools import explanations
 from rr_actors.tools.tables import load_tables
-from rr_actors.tools.terminal import event_lines, terminal_app, terminal_rows
+from rr_actors.tools.terminal import attention_lines, event_lines, terminal_app, terminal_rows
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import Terminal
 from support import LIMIT_S
@@ -139,6 +141,11 @@ class Stage(ConsoleLink):
             case questions.ListLoads(_, offset, limit, _, sort):
                 key = LOAD_ORDERS.get(sort, lambda row: 0.0)
                 return c.Loads(1, [WAITS][offset : offset + limit], sorted(LOADS, key=key, reverse=True))
+            case ListAttention():
+                troubled = [row for rows in SERVED.values() for row in rows if row.state != "OK"]
+                began = {BACK: NOW - 20}
+                items = needs_attention(Known(NOW, CHILDREN, HISTORY, troubled, len(troubled), began=began))
+                return Attention(len(items), items)
             case _:
                 return c.QueryPage(0, [])
 
@@ -158,7 +165,7 @@ def _it_is_always_now(monkeypatch: pytest.MonkeyPatch) -> None:
         return time.strftime(form, time.gmtime(NOW) if at is None else at)
 
     clock = types.SimpleNamespace(time=lambda: NOW, monotonic=time.monotonic, localtime=time.gmtime, strftime=strftime)
-    for module in (event_texts, event_lines, explanations, load_tables, terminal_app, terminal_rows):
+    for module in (attention_lines, event_texts, event_lines, explanations, load_tables, terminal_app, terminal_rows):
         monkeypatch.setattr(module, "time", clock)
 
 
@@ -193,7 +200,7 @@ async def shows(terminal: Terminal, pilot: Pilot[None], *texts: str) -> None:
 
 
 async def the_tree(terminal: Terminal, pilot: Pilot[None]) -> None:
-    await shows(terminal, pilot, "one_for_one", "dusty")
+    await shows(terminal, pilot, "one_for_one", "dusty", "is in FATAL")
 
 
 async def a_chosen_child(terminal: Terminal, pilot: Pilot[None]) -> None:

@@ -121,6 +121,11 @@ class EventMemory:
         self._is_cut = False  # whether the file may end within a line
         self._has_failed = False
 
+    @property
+    def directory(self) -> Path:
+        """The state directory."""
+        return self._folder.path
+
     def take(self, facts: dict[str, Any]) -> None:
         """Keep an event."""
         if traceback := facts.get("traceback"):

@@ -47,7 +47,7 @@ def subject_and_how(facts: Mapping[str, Any]) -> tuple[str, str]:
     if path := facts.get("path", ""):
         return path, child_text(facts)
     if server := facts.get("server", ""):
-        return named(server, facts.get("request", "")), facts.get("detail", "")
+        return named(server, facts.get("title") or facts.get("request", "")), facts.get("detail", "")
     return str(facts.get("to", "")), f"{facts.get('message', '')}: {facts.get('why', '')}".strip(": ")
 
 

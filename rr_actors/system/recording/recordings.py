@@ -1,7 +1,8 @@
 """Recordings: the events, exits and messages of a system while it is recorded, in memory or in a file.
 
 A file has one line of JSON for its header, and one for each entry. An entry "missed" says how many entries are missing
-at its place. If the recording process was killed, its file can be read to the last whole line.
+at its place. Entries "present" say what was there when the recording began. If the recording process was killed, its
+file can be read to the last whole line.
 """
 
 from __future__ import annotations
@@ -11,17 +12,19 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, UsageError, readable, shown, text_of
+from rr_actors.base.errors import ConfigError, UsageError, counted, readable, shortened, shown, text_of
+from rr_actors.base.names import time_in
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.links.recorder import RECORDED, entries_of
 from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.pages import ResourceRow
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.figures import Counters
@@ -37,7 +40,10 @@ LINE_LIMIT = 2**20
 WAITING = 50_000
 """How many entries may wait for a slow disk; further entries are counted and dropped."""
 _MISSED = "missed"  # the event of a line that says how many entries are missing
+_PRESENT = "present"  # the event of a line that says what was there when the recording began
+_TOGETHER = 200  # resources or children of such a line
 _LATE_S = 0.1  # how long a process may take to send its last entries
+_TOLD = 60  # bytes of a damaged line that an error shows
 _WRITTEN_S = 10.0  # how long the end of a recording waits for the disk
 
 Sink = Callable[[list[Entry], int], None]
@@ -156,6 +162,8 @@ class Recording:
         since: when it began, seconds since the epoch.
         missed: how many entries were dropped, as there was no room for them. A file keeps this number, too.
         path: the file that the entries are written to; None for a recording in memory.
+        present: what was there when it began, as plain data: mappings with "children", "resources", "left_out" (how
+            many resources are not among them), and "notes" (why others are not known).
     """
 
     def __init__(
@@ -167,6 +175,7 @@ class Recording:
         self.since = time.time()
         self.missed = 0
         self.path = path
+        self.present: list[dict[str, Any]] = []
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=limit)
         self._pid = os.getpid()
@@ -181,6 +190,13 @@ class Recording:
             elif self.path is None:
                 self.missed += max(0, len(self._entries) + len(entries) - (self._entries.maxlen or 0))
                 self._entries.extend(entries)
+
+    def _note_present(self, entries: list[Entry]) -> None:
+        """Keep what present_entries() returns: what is there as the recording begins."""
+        with self._lock:
+            self.present += [entry.facts for entry in entries]
+            if self._writer is not None:
+                self.missed += self._writer.put(entries, 0)
 
     def _closed(self) -> None:
         """Finish the file, as the system has stopped. stop() raises an error if not all of it was written."""
@@ -226,7 +242,8 @@ class Recording:
         Of a message between actors it is the message, its answer, and the messages that its handler sent.
 
         Args:
-            what: a query, a resource, or the id of either or of a message; its first four characters are enough.
+            what: a query, a resource, or the id of either or of a message; its first four characters are enough. A
+                name such as 'cameras/camera "front"' stands for all loads of it, and a server's id for all its loads.
 
         Raises:
             NotFound: the recording has no entry of it.
@@ -254,7 +271,7 @@ class Recording:
         entries = self.entries()
         file = RecordingFile(Path(path), self.system, self.since)
         try:
-            file.write(entries, self.missed)
+            file.write([*_lines_of(self.present, self.since), *entries], self.missed)
             file.close()
         except BaseException:
             file.remove()
@@ -270,13 +287,63 @@ class Recording:
         self.stop()
 
     def __repr__(self) -> str:
-        where = f"in {self.path}" if self.path is not None else f"{len(self._entries)} entries"
+        where = f"in {self.path}" if self.path is not None else counted(len(self._entries), "entry")
         return f"<Recording of {self.system}: {where}, {self.missed} missed>"
 
 
 def add(recording: Recording, entries: list[Entry], dropped: int = 0) -> None:
     """Add entries to a recording that is not connected to a running system."""
     recording._take(entries, dropped)  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def present_entries(
+    children: Iterable[Mapping[str, Any]],
+    resources: Iterable[ResourceRow],
+    left_out: int,
+    notes: Sequence[str],
+    now: float,
+) -> list[Entry]:
+    """Return entries that say what is there at the time `now`; few enough of it in each for a line of a file.
+
+    Args:
+        children: with the path, type, state, pid and up_s of each.
+        left_out: how many resources are there beside these.
+        notes: why more are not known.
+    """
+    tree = [
+        {
+            "path": child["path"],
+            "kind": child["type"],
+            "state": child["state"],
+            "pid": child["pid"],
+            "since": None if child["up_s"] is None else now - child["up_s"],
+        }
+        for child in children
+    ]
+    served = [
+        {
+            "id": row.id,
+            "server": row.server,
+            "text": row.text,
+            "phase": "revoked" if row.condition == "revoked" else row.phase,
+            "state": row.state or "OK",
+            "message": shortened(row.message),
+            "since": time_in(row.id),
+        }
+        for row in resources
+    ]
+    parts = [{"children": tree[at : at + _TOGETHER]} for at in range(0, len(tree), _TOGETHER)]
+    parts += [{"resources": served[at : at + _TOGETHER]} for at in range(0, len(served), _TOGETHER)]
+    return _lines_of([*parts, {"left_out": left_out, "notes": [shortened(note) for note in notes]}], now)
+
+
+def _lines_of(present: list[dict[str, Any]], at: float) -> list[Entry]:
+    return [Entry(at, _PRESENT, facts=facts) for facts in present]
+
+
+def note_present(recording: Recording, entries: list[Entry]) -> None:
+    """Have a recording keep what present_entries() returns."""
+    recording._note_present(entries)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 class RecordingFile:
@@ -427,9 +494,10 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
             lines = list(_lines(path, file))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
-    entries = [entry for entry in lines if entry.event != _MISSED]
+    entries = [entry for entry in lines if entry.event not in (_MISSED, _PRESENT)]
     recording = Recording(header.system, limit=max(1, len(entries)))
     recording.since = header.at
+    recording.present = [entry.facts for entry in lines if entry.event == _PRESENT]
     add(recording, entries, sum(entry.facts["count"] for entry in lines if entry.event == _MISSED))
     return recording
 
@@ -444,6 +512,7 @@ def _lines(path: Path, file: Any) -> Iterator[Entry]:
         count = entry.facts.get("count")
         if entry.event == _MISSED and not (type(count) is int and count >= 0):
             text = f'{path}: line {number}: "missed": expected a whole number as "count", got {shown(entry.facts)}'
+            text += _whole_part(path, number)
             raise ConfigError(text, file=str(path))
         yield entry
 
@@ -452,5 +521,14 @@ def _decoded(path: Path, number: int, line: bytes, kind: Any) -> Any:
     try:
         return msgspec.json.decode(line, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        text = f"{path}: line {number}: expected what rr-actors record writes: {error}"
-        raise ConfigError(text, file=str(path)) from error
+        text = f"{path}: line {number}: expected what rr-actors record writes, got {shown(line[:_TOLD])}: {error}"
+        raise ConfigError(text + _whole_part(path, number), file=str(path)) from error
+
+
+def _whole_part(path: Path, number: int) -> str:
+    """Say what can still be read of a file that is damaged in this line."""
+    if number < 3:
+        return ""
+    return (
+        f"; the {counted(number - 2, 'entry')} before it can still be read: head -n {number - 1} {path} > whole.jsonl"
+    )

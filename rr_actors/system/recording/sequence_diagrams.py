@@ -6,6 +6,7 @@ from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 
 from rr_actors.actors.messaging.message_notes import MESSAGES, REPLIES
+from rr_actors.base.errors import counted
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.timings import ANSWERS
 
@@ -33,7 +34,7 @@ def sequence_of(entries: Sequence[Entry]) -> str:
             drawn += 1
             if drawn > _MOST:
                 ends = dict.fromkeys(("p0", f"p{len(names) - 1}"))
-                lines.append(f"    Note over {','.join(ends)}: {len(entries) - number} entries more")
+                lines.append(f"    Note over {','.join(ends)}: {counted(len(entries) - number, 'more entry')}")
                 break
             lines.append(_arrow(entry, names, lost=number in lost, at=at))
         elif entry.event == "began":

@@ -9,19 +9,16 @@ import os
 import re
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError
+from rr_actors.base.errors import counted
 from rr_actors.base.names import in_short
 from rr_actors.base.notebook import escape
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.supervision.event_history import Record
-from rr_actors.system.recording.event_memory import event_in
+from rr_actors.system.recording.event_files import read_events
 from rr_actors.system.recording.event_texts import ago, clock
-from rr_actors.system.recording.recordings import LINE_LIMIT, entry_of, read_recording
 from rr_actors.system.recording.timeline_lanes import (
     BAD,
     KINDS,
@@ -136,7 +133,8 @@ class Timeline:
         return self.svg()
 
     def __repr__(self) -> str:
-        return f"<Timeline of {self.title or 'a system'}: {len(self.lanes)} lanes, {ago(self.until - self.since)}>"
+        lanes = counted(len(self.lanes), "lane")
+        return f"<Timeline of {self.title or 'a system'}: {lanes}, {ago(self.until - self.since)}>"
 
     @property
     def subject(self) -> str:
@@ -146,7 +144,12 @@ class Timeline:
         span_s = self.until - self.since
         span = ago(span_s) if span_s >= 10 else f"{span_s:.1f} s"
         text = f"{clock(self.since)[:-4]} to {clock(self.until)[:-4]} ({span})"
-        parts = (self.title, text, f"{len(self.lanes)} lanes", f"{self.missed} entries missed" if self.missed else "")
+        parts = (
+            self.title,
+            text,
+            counted(len(self.lanes), "lane"),
+            f"{counted(self.missed, 'entry')} missed" if self.missed else "",
+        )
         return ", ".join(filter(None, parts))
 
     def plain(self) -> dict[str, Any]:
@@ -194,58 +197,15 @@ def timeline_of(entries: Iterable[Entry], title: str = "", missed: int = 0) -> T
 
 
 def read_timeline(path: str | os.PathLike[str]) -> Timeline:
-    """Return the timeline of a file: of a recording, or of a state directory's history.jsonl.
+    """Return the timeline of a recording, of a state directory, or of the history.jsonl in one.
 
     A line of a history that is not whole is left out.
 
     Raises:
-        ConfigError: the file cannot be read, or is neither; the error names the line.
+        ConfigError: it cannot be read, or is none of these; the error names the line.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            first = file.readline(LINE_LIMIT)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
-    if first.startswith(b'{"event":'):
-        entries = _read_history(path)
-        return timeline_of(sorted(entries, key=lambda entry: entry.at), path.name)
-    recording = read_recording(path)
-    entries = recording.entries()
-    for entry in entries:
-        _check(path, entry)
-    return timeline_of(entries, recording.system, recording.missed)
-
-
-def _check(path: Path, entry: Entry) -> None:
-    """Raise ConfigError if an entry cannot be drawn."""
-    try:
-        time.localtime(entry.at)
-        if entry.process and not entry.server:
-            must_have = {"path": entry.process, "kind": "", "run": 0, "event": entry.event, "at": entry.at}
-            msgspec.convert(must_have | entry.facts, Record)
-    except (msgspec.MsgspecError, OverflowError, ValueError, OSError) as error:
-        text = f"{path}: {entry.event}, number {entry.seq}: expected what rr-actors record writes: {error}"
-        raise ConfigError(text, file=str(path)) from error
-
-
-def _read_history(path: Path) -> list[Entry]:
-    entries: list[Entry] = []
-    try:
-        lines = path.read_bytes().splitlines(keepends=True)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
-    for number, line in enumerate(lines, 1):
-        try:
-            event = event_in(line)
-            time.localtime(event.at)
-            entries.append(entry_of(event))
-        except (msgspec.MsgspecError, RecursionError, OverflowError, ValueError, OSError) as error:
-            if isinstance(error, msgspec.DecodeError) and not isinstance(error, msgspec.ValidationError):
-                continue  # a crash has cut it
-            text = f"{path}: line {number}: expected a recording, or a state directory's history.jsonl: {error}"
-            raise ConfigError(text, file=str(path)) from error
-    return entries
+    found = read_events(path)
+    return timeline_of(found.entries(), found.system, found.missed)
 
 
 # -- as SVG ------------------------------------------------------------------------------------------------------------
@@ -265,7 +225,7 @@ class _Drawing:
         bottom = _TOP + _ROW * len(self._lanes)
         legend, height = self._legend(bottom + 24)
         left_out = len(timeline.lanes) - len(self._lanes)
-        note = f", {left_out} lanes with less trouble are left out" if left_out else ""
+        note = f", left out: {counted(left_out, 'lane')} with less trouble" if left_out else ""
         parts = [f'<text x="10" y="19">{_text(timeline.subject + note)}</text>', self._axis(bottom)]
         parts += [self._lane(lane, _TOP + _ROW * number) for number, lane in enumerate(self._lanes)]
         return (

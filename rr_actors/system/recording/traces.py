@@ -13,19 +13,69 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.actors.messaging.message_notes import MESSAGES
+from rr_actors.actors.messaging.message_notes import ANSWER, MESSAGES
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import NotFound, UsageError, few, shown
+from rr_actors.base.errors import NotFound, UsageError, counted, did_you_mean, few, shown
+from rr_actors.base.names import named
 from rr_actors.base.notebook import bundle, table
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.sequence_diagrams import sequence_of
-from rr_actors.system.recording.timings import Timing, timings_of, trace_id_of
+from rr_actors.system.recording.timings import ANSWERS, Timing, timings_of, trace_id_of
 
 DEAD_LETTER = "dead_letter"
 """The event of a message that reached no actor. Its registrar is that actor."""
+BEGINNINGS = {"Load", "Unload", *MESSAGES}
+"""The names of the messages with which a trace can begin."""
 _PREFIX = 4  # an id can be given by its first characters, at least so many
 _STARTS = ("started", "restarted")
 _ENDS = ("exited", "stopped", "started", "restarted", "start_failed", "gave_up")
+
+
+class Beginning(msgspec.Struct, frozen=True):
+    """A load, or a message that is for nothing else: a trace that a recording has.
+
+    Attributes:
+        id: of its query, or of the message.
+        at: when it was sent, in seconds since the epoch.
+        by: the registrar or actor that sent it.
+        what: for people: its class, and the name that trace_of() takes, or the receiver and the message.
+        took_s: until its answer arrived, in seconds; None if the recording has no answer.
+        error: the error of its answer; "" if there was none.
+    """
+
+    id: str
+    at: float
+    by: str
+    what: str
+    took_s: float | None = None
+    error: str = ""
+
+
+def beginnings_of(entries: Sequence[Entry]) -> list[Beginning]:
+    """Return what the entries have traces of, in the order of time: loads and messages that are for nothing else.
+
+    Args:
+        entries: the entries of a recording, in the order of time.
+    """
+    found: dict[str, Beginning] = {}
+    for entry in entries:
+        if entry.event == "sent" and entry.name in BEGINNINGS and not entry.parent and entry.query not in found:
+            what = " ".join(filter(None, (entry.name.lower(), name_of_load(entry) or entry.peer, _said(entry))))
+            found[entry.query] = Beginning(entry.query, entry.at, entry.registrar, what)
+        elif entry.event == "received" and entry.name in ANSWERS and (first := found.get(entry.query)):
+            error = "" if entry.name in ("Loaded", "Unloaded", ANSWER) else entry.detail
+            answered = msgspec.structs.replace(first, took_s=entry.at - first.at, error=error)
+            found[entry.query] = answered if first.took_s is None else first
+    return list(found.values())
+
+
+def name_of_load(entry: Entry) -> str:
+    """Return the name of what a load asks for, as commands show it; "" of an entry of another kind."""
+    return named(entry.server, entry.detail) if entry.name == "Load" else ""
+
+
+def _said(entry: Entry) -> str:
+    return "" if entry.name == "Load" else entry.detail
 
 
 class Trace:
@@ -56,7 +106,7 @@ class Trace:
         that of the message; of a resource, or of several actors, it is made of the id or the names.
 
         Raises:
-            UsageError: the extra is not installed.
+            MissingDependency: the extra is not installed.
         """
         with needing("spans()", "otel"):  # even an installed extra is imported only here
             from rr_actors.system.recording.otel_export import span_of
@@ -67,7 +117,7 @@ class Trace:
         return "\n".join(f"{(entry.at - began) * 1000:10.2f} ms  {line_of(entry)}" for entry in self.entries)
 
     def __repr__(self) -> str:
-        return f"<Trace of {self.id}: {len(self.entries)} entries>"
+        return f"<Trace of {self.id}: {counted(len(self.entries), 'entry')}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         began = self.entries[0].at if self.entries else 0.0
@@ -119,19 +169,23 @@ def messages_of(entries: Sequence[Entry], actors: Sequence[str]) -> Trace:
 
 
 def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Trace:
-    """Return the trace of a query, a resource or a message.
+    """Return the trace of a query, a resource or a message; or that of all loads of a name.
 
     Args:
         entries: the entries of a recording, in the order of time.
-        id: an id, or its first characters.
+        id: an id, or its first characters; or a name such as 'cameras/camera "front"', or a server, 'cameras/camera'.
         of_query: prefer the query to the resource of this id: a resource has the id of the query that made it.
 
     Raises:
         NotFound, UsageError: see Recording.trace().
     """
     known = Index(entries)
-    id = known.whole(id)
-    chosen = known.below(id, of_query=of_query)
+    chosen: set[int] = set()
+    if (loads := known.of_name.get(id)) is None:
+        id = known.whole(id)
+        loads = {id: None}
+    for load in loads:
+        chosen |= known.below(load, of_query=of_query)
     found = [entries[number] for number in sorted(chosen)]
     return Trace(id, sorted([*found, *known.deaths(found, found)], key=lambda entry: (entry.at, entry.seq)))
 
@@ -146,10 +200,14 @@ class Index:
         self.resource_of: dict[str, str] = {}
         self.loads_for: dict[str, dict[str, None]] = defaultdict(dict)  # resource -> the queries of its parts
         self.queries_on: dict[str, dict[str, None]] = defaultdict(dict)
+        self.of_name: dict[str, dict[str, None]] = defaultdict(dict)  # a name, or a server -> the queries of its loads
         self.messages: set[str] = set()  # the ids of messages between actors
         for number, entry in enumerate(entries):
             if entry.name in MESSAGES:
                 self.messages.add(entry.query)
+            if name := name_of_load(entry):
+                for one in (entry.server, name, f"{entry.server} {entry.detail}"):
+                    self.of_name[one][entry.query] = None
             if entry.query:
                 self.of_query[entry.query].append(number)
                 if entry.resource:
@@ -174,7 +232,9 @@ class Index:
             several = ", ".join(found[:5]) + (", ..." if len(found) > 5 else "")
             raise UsageError(f"{shown(id)}: several ids begin so: {several}; give more of the id")
         if not found:
-            raise NotFound(f"{shown(id)}: the recording has no query, resource or message of this id", id=id)
+            hint = did_you_mean(id, self.of_name) if "/" in id else ""
+            text = f"{shown(id)}: the recording has no query, resource or message of this id, and no load of this name"
+            raise NotFound(text + hint, id=id)
         return found[0]
 
     def below(self, id: str, *, of_query: bool) -> set[int]:

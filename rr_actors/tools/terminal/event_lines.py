@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from rr_actors.base.errors import UsageError, few, shown
+from rr_actors.base.errors import UsageError, counted, few, shown
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.system.console.console_messages import Missed
 from rr_actors.system.event_subscribers import kinds_for_all
@@ -135,9 +135,7 @@ class EventLine:
         others = len(self.names) - 1
         managers = len({server.partition("/")[0] for server in list(self.servers)})
         parts = (
-            f"{others} resource{'' if others == 1 else 's'} in {managers} manager{'' if managers == 1 else 's'}"
-            if others
-            else "",
+            f"{counted(others, 'resource')} in {counted(managers, 'manager')}" if others else "",
             f"heard by {few(list(self.heard_by))}" if self.heard_by else "",
         )
         return ", ".join(filter(None, parts))
@@ -249,4 +247,4 @@ def event_line(event: Event, above: str = "") -> str:
 
 def missed_line(missed: Missed) -> str:
     """Return a sentence that says how many events a reader of the feed has missed."""
-    return f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow"
+    return f"missed {counted(missed.count, 'event')}, up to number {missed.seq}: this reader was too slow"

@@ -1,4 +1,4 @@
-"""The live terminal: panes with the tree, the chosen child or registrar, and events; and keys that drive the system.
+"""The live terminal: what needs attention, panes with the tree, the chosen thing and events, and keys that act.
 
 Textual's loop draws and reads keys. Calls that wait for the system run in threads. Each pane asks for the rows that it
 shows, one question at a time; the slower the system answers, the less often.
@@ -27,6 +27,7 @@ from rr_actors.base.errors import RrError, UsageError
 from rr_actors.base.names import short_id
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.attention.attention_questions import ListAttention
 from rr_actors.system.console.console_client import NotRunning
 from rr_actors.system.console.console_questions import ListEvents
 from rr_actors.system.console.console_view import Command
@@ -40,10 +41,21 @@ from rr_actors.tools.tables.row_commands import (
 )
 from rr_actors.tools.tables.sheets import SHEETS
 from rr_actors.tools.tables.table import Row, tables_of
+from rr_actors.tools.terminal.attention_lines import AttentionLines
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.event_lines import EventLines, missed_line
 from rr_actors.tools.terminal.terminal_pane import Pane, plain
-from rr_actors.tools.terminal.terminal_rows import Happenings, Listed, Neighbours, Nothing, Past, Rows, Served, Window
+from rr_actors.tools.terminal.terminal_rows import (
+    LOOK_S,
+    Happenings,
+    Listed,
+    Neighbours,
+    Nothing,
+    Past,
+    Rows,
+    Served,
+    Window,
+)
 from rr_actors.tools.terminal.terminal_tables import SheetRows
 
 _T = TypeVar("_T")
@@ -109,6 +121,7 @@ class Terminal(App[None]):
 
     Attributes:
         left, right, events: the panes: the tree, the thing that is chosen in it, the events.
+        attention: the lines above them, with what needs attention.
     """
 
     ENABLE_COMMAND_PALETTE = False
@@ -161,6 +174,7 @@ class Terminal(App[None]):
         self.left = Pane("tree", next(iter(self._sheets.values())), self._look)
         self.right = Pane("chosen", Nothing(), self._look)
         self.events = Pane("events", Happenings(self._happened), self._look)
+        self.attention = AttentionLines(lambda: self._in_thread(self._link.ask, ListAttention(), LOOK_S))
         self._sides = Horizontal(id="panes")
         self._alone: Pane | None = None
         self._headline = Static(id="title", markup=False)
@@ -186,6 +200,7 @@ class Terminal(App[None]):
     def compose(self) -> ComposeResult:
         """Put the panes on the screen."""
         yield self._headline
+        yield self.attention
         with self._sides:
             yield self.left
             yield self.right
@@ -352,11 +367,23 @@ class Terminal(App[None]):
         if one is None:
             self._say(f"{several[0].label or several[0].name}: {several[0].obstacle(row)}", bad=True)
         elif one.warning:
-            self._say(f"{one.said_of(row)}? y: yes, Esc: no. {one.warning}")
-            self._asked, self._declined = (one.said_of(row), one.command(row)), f"not done: {one.said_of(row)}"
-            self._question = self._said
+            self._put_question(one, row)
         else:
             self._begin(one.said_of(row), one.command(row))
+
+    def _put_question(self, one: RowCommand, row: Row) -> None:
+        """Ask whether to do something, and add what would happen as soon as the system says it."""
+        self._say(f"{one.said_of(row)}? y: yes, Esc: no. {one.warning}")
+        self._asked, self._declined = (one.said_of(row), one.command(row)), f"not done: {one.said_of(row)}"
+        self._question = self._said
+        self.run_worker(self._foretell(self._question, one.dry_run(row)), group="commands")
+
+    async def _foretell(self, question: str, command: Command[c.Done]) -> None:
+        with contextlib.suppress(RrError):  # the command itself will say it
+            would = (await self._in_thread(self._link.ask, command, LOOK_S)).text
+            if self._question == question == self.status:
+                self._question = self._said = f"{question} It {would}."
+                self._show_status()
 
     def _chosen(self, command: RowCommand) -> Row:
         """Return the row that a command is for: a child in the tree, or what is chosen in the pane with the focus."""

@@ -75,6 +75,7 @@ class Pane(Widget, can_focus=True):
         self.rows = rows
         self._look = look
         self._listed = Listed(0, [])
+        self._is_listed = False  # whether the list has been asked for its rows
         self._offset = 0  # of the first known row
         self._top = 0
         self.cursor = 0
@@ -93,7 +94,7 @@ class Pane(Widget, can_focus=True):
         if (rows, match) == (self.rows, self.match):
             return
         self.rows, self.match = rows, match
-        self._listed, self._offset = Listed(0, []), 0
+        self._listed, self._is_listed, self._offset = Listed(0, []), False, 0
         self.cursor = cursor
         self._top = max(0, cursor - self._room // 2)
         self.ask()
@@ -106,7 +107,7 @@ class Pane(Widget, can_focus=True):
     def ask_again(self, is_news: bool) -> None:
         """Ask for the visible rows, if the known ones are old enough."""
         age_s = _OFTEN_S if is_news else _SELDOM_S
-        if time.monotonic() > self._asked_at + max(age_s, min(_SHARE * self._took_s, _LONGEST_S)):
+        if time.monotonic() > self._asked_at + pause_s(self._took_s, age_s):
             self._wanted.set()
 
     def on_mount(self) -> None:
@@ -145,10 +146,13 @@ class Pane(Widget, can_focus=True):
             self.post_message(self.Opened(self, row))
 
     def _go(self, to: int) -> None:
+        if not self._is_listed:  # the cursor stays where show() has put it, until there are rows
+            return
         before = self.cursor, self._top
         height = max(1, self._room)
         self.cursor = max(0, min(to, self._listed.total - 1))
-        self._top = max(min(self._top, self.cursor), self.cursor - height + 1, 0)
+        top = max(min(self._top, self.cursor), self.cursor - height + 1, 0)
+        self._top = min(top, max(0, self._listed.total - height))  # no empty lines below while rows above are left out
         if (self.cursor, self._top) != before:
             if self._top != before[1] or self.row is None:
                 self._wanted.set()
@@ -184,7 +188,7 @@ class Pane(Widget, can_focus=True):
     def _take(self, listed: Listed, offset: int) -> None:
         """Show the rows of an answer. The cursor stays on its row, if that is still visible."""
         before = self.row
-        self._listed, self._offset = listed, offset
+        self._listed, self._is_listed, self._offset = listed, True, offset
         if before is not None and before.key and (now := self.row) is not None and now.key != before.key:
             places = [offset + at for at, row in enumerate(listed.rows) if row.key == before.key]
             self.cursor = places[0] if places else self.cursor
@@ -224,14 +228,24 @@ class Pane(Widget, can_focus=True):
         style = base + Style.parse(row.style)
         if number == self.cursor:
             style += Style(reverse=True, bold=self.has_focus)
-        columns = plain(row.columns)
-        width_left = width - cell_len(columns)
-        note = _fitted(plain(row.note), width_left // 2)
-        room = width_left - cell_len(note) - (1 if note else 0)
-        text = Strip([Segment(_fitted(plain(row.text), room), style)]).adjust_cell_length(
-            width_left - cell_len(note), style
-        )
-        return Strip([*text, Segment(note, style), Segment(columns, style)]).adjust_cell_length(width, style)
+        return drawn(row, width, style)
+
+
+def pause_s(took_s: float, age_s: float = _SELDOM_S) -> float:
+    """Return after how many seconds rows are asked for again if the last answer took `took_s`: `age_s` at least."""
+    return max(age_s, min(_SHARE * took_s, _LONGEST_S))
+
+
+def drawn(row: Row, width: int, style: Style) -> Strip:
+    """Return a row as a line of the screen: its text on the left, cut if need be, and its note and columns right."""
+    columns = plain(row.columns)
+    width_left = width - cell_len(columns)
+    note = _fitted(plain(row.note), width_left // 2)
+    room = width_left - cell_len(note) - (1 if note else 0)
+    text = Strip([Segment(_fitted(plain(row.text), room), style)]).adjust_cell_length(
+        width_left - cell_len(note), style
+    )
+    return Strip([*text, Segment(note, style), Segment(columns, style)]).adjust_cell_length(width, style)
 
 
 def plain(text: str) -> str:

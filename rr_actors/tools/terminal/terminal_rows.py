@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol, TypeAlias, TypeVar
 
-from rr_actors.base.errors import NotFound, RrError, UnknownQuery
-from rr_actors.base.names import named, short_id
+from rr_actors.base.errors import NotFound, RrError, UnknownQuery, counted
+from rr_actors.base.names import named, short_id, time_in
 from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.managers.actions.graph_pictures import ShownGraph, shown_graph
 from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
@@ -21,7 +21,7 @@ from rr_actors.system.console.console_client import read_pages
 from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.event_texts import ago
-from rr_actors.tools.explanations import bytes_text, name_of_resource, rate_text, since
+from rr_actors.tools.explanations import bytes_text, name_of_resource, rate_text
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.tables.table import STATE_STYLES, Asks, Row
 from rr_actors.tools.terminal.child_logs import line_texts
@@ -147,7 +147,12 @@ class Past:
         for _, shown in sorted(happened, key=lambda one: one[0])[::-1]:
             rows += shown
         if found.left_out or len(found.events) == _HISTORY:
-            rows.append(Row("", f"the newest {len(found.events)} events: rr-actors history {self.path} has older ones"))
+            rows.append(
+                Row(
+                    "",
+                    f"the newest {counted(len(found.events), 'event')}: rr-actors history {self.path} has older ones",
+                )
+            )
         if more:
             rows.append(Row("", f"the newest {len(log)} of {len(log) + more} log lines: rr-actors logs {self.path}"))
         return _cut(rows, window)
@@ -313,7 +318,7 @@ def _as_it_is(row: c.ChildRow) -> str:
         row.state,
         "" if row.pid is None else f"pid {row.pid}",
         "" if row.up_s is None else f"up {ago(row.up_s)}",
-        f"{row.restarts} restart{'' if row.restarts == 1 else 's'}",
+        counted(row.restarts, "restart"),
         "" if usage is None else f"{usage.cpu_percent:.1f} % CPU, {usage.memory_bytes / 2**20:.0f} MiB",
         row.strategy,
         row.error,
@@ -323,7 +328,7 @@ def _as_it_is(row: c.ChildRow) -> str:
 
 
 def _age(id: str) -> str:
-    at = since(id)
+    at = time_in(id)
     return "" if at is None else ago(max(0.0, time.time() - at))
 
 
@@ -332,9 +337,9 @@ _BAD = frozenset(("load_failed", "unload_failed", "pause_failed", "start_failed"
 
 def _resource(row: ResourceRow) -> Row:
     state = row.condition
-    held = row.holders[0].origin if row.holder_count == 1 else f"{row.holder_count} holders"
+    held = row.holders[0].origin if row.holder_count == 1 else counted(row.holder_count, "holder")
     only = row.holders[0].query_id if row.holder_count == 1 else ""
-    text = named(row.server.partition("/")[2], row.request)
+    text = named(row.server.partition("/")[2], row.text)
     note = f"{'' if state == 'OK' else state + ' '}{held}{_priority(row.priority) if row.holder_count else ''}"
     return Row(row.id, text, note, STATE_STYLES.get(state, ""), resource=row.id, query=only, name=row.name)
 

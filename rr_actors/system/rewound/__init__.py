@@ -1,0 +1,1 @@
+"""Rewound: the state of a system at any moment of a recording, folded from what was recorded."""
