@@ -39,7 +39,7 @@ class Cameras(rr.Manager):
 
     @open_camera.unload
     def close_camera(self, device: str, response: rr.Stream) -> None:
-        self.off.pop(rr.current().resource_id).set()
+        self.off.pop(rr.current().resource_id, threading.Event()).set()  # after a crash in this callback there is none
 
 
 def main() -> None:

@@ -34,6 +34,19 @@ class _AsWritten(MetaPathFinder):
 
 
 sys.meta_path.insert(0, _AsWritten())
+_HOME = Path(__file__).parents[1]  # of a checkout, where the package's own tests run
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
+    """Show the user's own lines of a failing test: without --full-trace pytest hides the package's frames.
+
+    The package's own tests show all frames.
+    """
+    if call.excinfo is not None and item.config.rootpath != _HOME:
+        for name, module in list(sys.modules.items()):
+            if name.partition(".")[0] == "rr_actors":
+                vars(module)["__tracebackhide__"] = True  # which pytest looks for in a frame's globals
 
 
 @pytest.fixture
@@ -43,7 +56,7 @@ def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[rr.St
     Its state is in the test's tmp_path, unless `state_dir` says otherwise. After the test each system is stopped, which
     releases what the test holds. The test fails if a process, a thread, a socket or a loaded resource is left then.
     """
-    from rr_actors.testing.pytest_plugin import started_systems
+    from rr_actors.testing.started_systems import started_systems
 
     left = yield from started_systems(tmp_path, monkeypatch.setenv)
     if left:

@@ -31,7 +31,9 @@ class Instruments(rr.Manager):
 
     @open_line.unload
     def close_line(self, device: str, name: str) -> None:
-        os.close(self.lines.pop(rr.current().resource_id))
+        line = self.lines.pop(rr.current().resource_id, None)
+        if line is not None:  # after a crash in this callback the kernel has closed it
+            os.close(line)
 
     def on_receive(self, message: tuple[str, str]) -> str:
         return self.ask(*message)

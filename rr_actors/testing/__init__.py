@@ -1,1 +1,41 @@
-"""What an application tests itself with: the plugin of pytest."""
+"""What an application tests itself with: the plugin of pytest, and the crash-test of a manager."""
+
+from __future__ import annotations
+
+from rr_actors.testing.callback_notes import closed, opened
+from rr_actors.testing.manager_checks import ManagerCheck, ManagerFault, check_manager, play_steps
+from rr_actors.testing.scenario_steps import (
+    AskUsage,
+    Fatal,
+    Kill,
+    Load,
+    Pause,
+    Reload,
+    Resume,
+    SendStatus,
+    Step,
+    Unload,
+    Update,
+    Wrong,
+)
+
+__all__ = [
+    "AskUsage",
+    "Fatal",
+    "Kill",
+    "Load",
+    "ManagerCheck",
+    "ManagerFault",
+    "Pause",
+    "Reload",
+    "Resume",
+    "SendStatus",
+    "Step",
+    "Unload",
+    "Update",
+    "Wrong",
+    "check_manager",
+    "closed",
+    "opened",
+    "play_steps",
+]

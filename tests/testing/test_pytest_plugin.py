@@ -140,3 +140,19 @@ def test_stuck(rr_system: rr.StartSystem):
 def test_the_package_says_to_pytest_where_the_plugin_is() -> None:
     project = tomllib.loads(Path(REPOSITORY, "pyproject.toml").read_text())["project"]
     assert project["entry-points"]["pytest11"] == {"rr_actors": "rr_actors_pytest.plugin"}
+
+
+def test_a_failing_test_shows_its_own_lines_and_all_frames_on_request(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    test = """
+def test_nobody(rr_system):
+    app = rr_system(rr.ChildSpec(Lamps, id="lamps")).open_registrar("app")
+    app.load("lamps/lamp", 3)  # the line that fails
+"""
+    shown = run(pytester, monkeypatch, test).stdout.str()
+    assert '>       app.load("lamps/lamp", 3)  # the line that fails' in shown
+    assert "InvalidRequest: " in shown
+    assert "rr_actors/" not in shown.partition("FAILURES")[2]
+    monkeypatch.setenv("PYTEST_ADDOPTS", "--full-trace")
+    assert "rr_actors/registrar/registrar.py" in run(pytester, monkeypatch, test).stdout.str()

@@ -19,7 +19,7 @@ from rr_actors.system.system import System
 LIMIT_S = 5.0
 """How long the processes and threads of a stopped system may take to end."""
 
-_VARIABLE = "RR_ACTORS_TEST"
+VARIABLE = "RR_ACTORS_TEST"
 
 
 class StartSystem(Protocol):
@@ -77,7 +77,7 @@ def started_systems(place: Path, setenv: Callable[[str, str], None]) -> Generato
         setenv: gives an environment variable a value until the test ends.
     """
     mark = uuid.uuid4().hex
-    setenv(_VARIABLE, mark)
+    setenv(VARIABLE, mark)
     before = _look(mark)
     systems: list[System] = []
 
@@ -120,11 +120,12 @@ def _still_left(mark: str, before: _Left) -> list[str]:
 
 
 def _look(mark: str) -> _Left:
-    return _Left(frozenset(_marked(mark)), frozenset(threading.enumerate()), frozenset(_sockets()))
+    return _Left(frozenset(marked(mark)), frozenset(threading.enumerate()), frozenset(_sockets()))
 
 
-def _marked(mark: str) -> Iterator[str]:
-    wanted = f"{_VARIABLE}={mark}".encode()
+def marked(mark: str) -> Iterator[str]:
+    """Yield a line for each process that carries a mark, but this one."""
+    wanted = f"{VARIABLE}={mark}".encode()
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             if entry.name != str(os.getpid()) and wanted in (entry / "environ").read_bytes().split(b"\0"):
