@@ -137,9 +137,7 @@ def link_lost(decision: Decision, command: LinkLost) -> None:
     decision.forget(catalog.up, command.registrar)
     if catalog.closings:
         provider_lost(decision, command.registrar)
-    unsettled = catalog.unsettled_at(command.registrar)
-    waited_for = any(held.hold is Hold.PENDING and held.id not in catalog.direct for held in unsettled)
-    if command.registrar in catalog.outbound and not waited_for:
+    if command.registrar in catalog.outbound and not catalog.waits_for(command.registrar):
         decision.cause(Connect(command.registrar))  # rows of direct lines may have been added only since the loss
 
 

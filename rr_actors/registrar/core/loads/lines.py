@@ -35,6 +35,7 @@ from rr_actors.registrar.model.rows import (
     UNLOADING,
     Resource,
     Revocation,
+    ServedQuery,
     State,
     shown_priority,
 )
@@ -223,13 +224,14 @@ def _look_for_rings(decision: Decision, line: list[Resource]) -> None:
 def _say_places(decision: Decision, line: list[Resource], used: list[Resource]) -> None:
     catalog = decision.catalog
     has = _who_has_it(catalog, used)
+    holder, since = failures.holder_since(_query_on(catalog, used))
     before = ""
     for place, resource in enumerate(line, 1):
         if place <= _TOLD or resource.id not in catalog.said:
             text = f"{_ordinal(place)} in line{before}; {has}"
             if catalog.said.get(resource.id) != text:
                 decision.note(catalog.said, resource.id, text)
-                decision.cause(InLine(resource.id, text))
+                decision.cause(InLine(resource.id, text, holder, since))
         before = f", behind {catalog.holder_of(resource.id)}"
 
 
@@ -249,6 +251,10 @@ def _ordinal(number: int) -> str:
 
 def _busy(catalog: Catalog, key: RequestKey, own: Resource | None = None) -> failures.Failure:
     used = _in_use(catalog, key)
-    holders = [query for resource in used for query in catalog.queries_of(resource.id)]
     others = [resource for resource in line_of(catalog, key) if resource is not own]
-    return failures.busy(catalog, *key, holders[0] if holders else None, len(others))
+    return failures.busy(catalog, *key, _query_on(catalog, used), len(others))
+
+
+def _query_on(catalog: Catalog, used: list[Resource]) -> ServedQuery | None:
+    """Return the oldest query on what keeps others waiting; None while nobody holds that."""
+    return next((query for resource in used for query in catalog.queries_of(resource.id)), None)
